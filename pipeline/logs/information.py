@@ -90,7 +90,7 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
                 bound[name] = bind_model(name, topics, parameters, model=model, method=method)
             except BadInput as error:
                 lacks.append(str(error).removeprefix(f"estimator {name}: "))
-    used = (topic for each in bound.values() for one in each for topic in (*one.whole, *one.streams))
+    used = (topic for each in bound.values() for one in each for topic in (*one.static, *one.streams))
     return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
 
 

@@ -121,7 +121,7 @@ def _carried_by_motion(stage: Stage) -> Function:
 def _added_by_sensor(stage: Stage, number: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     m, t = len(sensor.measured), model.tangent
-    read_state, read_about = tuple_of(model.size), reading(sensor).about
+    read_state, read_reference = tuple_of(model.size), reading(sensor).reference
     linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
 
     def update(
@@ -136,7 +136,7 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
     ) -> int:
         along, innovation = work.samples[0], work.innovations[number]
         cross = innovation.cross_covariance
-        linearise(read_state(along.mean[along.node[event]]), read_about(data), parameters, work)
+        linearise(read_state(along.mean[along.node[event]]), read_reference(data), parameters, work)
         innovation.covariance[:] = 0.0
         add_noise(innovation.covariance, data, parameters, work)
         for i in range(m):

@@ -54,7 +54,7 @@ class Watch:
         runs: how many there are.
         seconds: how long the estimator worked.
         usage: what became of its measurements.
-        whole: the streams that it begins with.
+        static: the streams that it begins with.
         refused: what all runs of a part of an ensemble raised.
     """
 
@@ -63,7 +63,7 @@ class Watch:
     ) -> None:
         self.seconds = 0.0
         self.usage = Usage(name)
-        self.whole: Mapping[str, Ragged] = {}
+        self.static: Mapping[str, Ragged] = {}
         self.refused: BadInput | None = None
         self.name = name
         self.runs = runs
@@ -93,7 +93,7 @@ class Watch:
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
-        self.usage.note_given(streams, self.whole)
+        self.usage.note_given(streams, self.static)
         began = time.perf_counter()
         try:
             try:

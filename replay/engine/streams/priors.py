@@ -65,8 +65,8 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
             )
         time_ns[present] = stream.publish_time_ns[first]
         mean[present] = stream["mean"][first][:, layout.columns]
-        whole = stream["covariance"][first].reshape(-1, size, size)
-        covariance[present] = whole[:, layout.rows][:, :, layout.rows]
+        static = stream["covariance"][first].reshape(-1, size, size)
+        covariance[present] = static[:, layout.rows][:, :, layout.rows]
     finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
     usable = finite & is_positive_definite(covariance)
     if not usable.all():
@@ -112,21 +112,21 @@ def no_priors(runs: int, components: Components, reason: str) -> Priors:
 
 
 def start_of_runs(
-    whole: Mapping[str, Ragged], priors: Mapping[str, Components]
+    static: Mapping[str, Ragged], priors: Mapping[str, Components]
 ) -> tuple[dict[str, Ragged], dict[int, str]]:
     """What an estimator starts from, and why some runs cannot start.
 
     Args:
-        whole: whole topics of all runs.
+        static: static topics of all runs.
         priors: which of them are priors, and the components that are wanted of each.
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their
     order, NaN where the run cannot start; and the reasons by run, which may be all of them.
     Raises BadInput where a topic is no such prior, see `priors_of`.
     """
-    found, failed = dict(whole), dict[int, str]()
+    found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():
-        read = priors_of(whole[topic], components)
+        read = priors_of(static[topic], components)
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)

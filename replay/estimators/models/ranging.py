@@ -102,16 +102,16 @@ def see(state: Components, anchor: Components, parameters: Any) -> Components:
     return (distance(here, anchor) + parameters.bias_range_m,)
 
 
-def see_by_tag(state: Components, about: Components, parameters: Any) -> Components:
-    """The range of an anchor from a tag on the body, which `about` has behind the anchor."""
+def see_by_tag(state: Components, reference: Components, parameters: Any) -> Components:
+    """The range of an anchor from a tag on the body, which `reference` has behind the anchor."""
     cosine, sine = np.cos(state[2]), np.sin(state[2])
-    ahead, left, up = about[3], about[4], about[5]
+    ahead, left, up = reference[3], reference[4], reference[5]
     tag = (
         state[0] + cosine * ahead - sine * left,
         state[1] + sine * ahead + cosine * left,
         parameters.height_m + up,
     )
-    return (distance(tag, about) + parameters.bias_range_m,)
+    return (distance(tag, reference) + parameters.bias_range_m,)
 
 
 def see_noise(parameters: Any) -> Components:
@@ -231,12 +231,18 @@ RANGING_POSITION = Model(
     RangingParameters,
     (
         Sensor(
-            "ranges", schemas.ANCHOR_RANGE, RANGE, see, see_noise, about=ANCHORS, delay="range_delay_s"
+            "ranges",
+            schemas.ANCHOR_RANGE,
+            RANGE,
+            see,
+            see_noise,
+            reference=ANCHORS,
+            delay="range_delay_s",
         ),
     ),
     Motion(move, move_noise, linear=True),
     start=Start({}, ASSUMED, find=find_position),
-    estimable=ERRORS,
+    augmentable=ERRORS,
     takes_fixes=False,
 )
 RANGING_POSE = Model(
@@ -250,12 +256,12 @@ RANGING_POSE = Model(
             RANGE,
             see_by_tag,
             see_noise,
-            about=(ANCHORS, TAGS),
+            reference=(ANCHORS, TAGS),
             delay="range_delay_s",
         ),
     ),
     Motion(move_pose, move_pose_noise, linear=True),
     start=Start({}, {**ASSUMED, "turn_acceleration_density": 1.0}, find=find_pose),
-    estimable=ERRORS,
+    augmentable=ERRORS,
     takes_fixes=False,
 )

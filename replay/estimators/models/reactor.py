@@ -56,7 +56,7 @@ def moments(
             covariance[row, column] += mixed + gain[row] * gain[column] * variance
 
 
-def read(pressures: Components, about: Any, parameters: Any) -> Components:
+def read(pressures: Components, reference: Any, parameters: Any) -> Components:
     """What the sensor reads."""
     return total_pressure(pressures)
 

@@ -138,11 +138,11 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
     places = dict(zip(sensors["landmark_id"].tolist(), sensors["position_m"][:, :2], strict=True))
     known = reports.take(np.isin(reports["sensor_id"], sensors["landmark_id"]))
     heard = np.stack([known[name] for name in HEARD], axis=1)
-    about = np.array([places[sensor] for sensor in known["sensor_id"].tolist()]).reshape(-1, 2)
+    reference = np.array([places[sensor] for sensor in known["sensor_id"].tolist()]).reshape(-1, 2)
     time_ns = known.publish_time_ns
     ends = np.searchsorted(time_ns, time_ns + round(parameters.start_s / _NS), side="right")
     for begin, end in enumerate(ends.tolist()):
-        shot = _best_shot(heard[begin:end], about[begin:end], parameters)
+        shot = _best_shot(heard[begin:end], reference[begin:end], parameters)
         if shot is not None:
             sigma = np.repeat(
                 [parameters.start_sigma_m, parameters.start_sigma_rad, parameters.start_sigma_mps],
@@ -214,12 +214,12 @@ MOVING_SHOOTER = Model(
             HEARD,
             hear,
             hear_noise,
-            about=SENSORS,
+            reference=SENSORS,
             log_likelihood=log_likelihood,
         ),
     ),
     Motion(move, move_noise, linear=True),
     start=Start({}, ASSUMED, find=find_shooter),
-    estimable={"speed_of_sound_mps": "linear"},
+    augmentable={"speed_of_sound_mps": "linear"},
     takes_fixes=False,
 )

@@ -80,7 +80,7 @@ def mode_rates(parameters: Any) -> Components:
     )
 
 
-def position(state: Components, about: Any, parameters: Any) -> Components:
+def position(state: Components, reference: Any, parameters: Any) -> Components:
     """Where the vehicle is."""
     return state[0], state[2]
 

@@ -142,7 +142,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     return Started(start_ns, mean, covariance, how)
 
 
-def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
+def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
     """What looks wrong in the first samples of a body whose start is known.
 
     It is what `align` refuses, and only said here: the body may begin in motion.

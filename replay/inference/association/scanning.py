@@ -211,8 +211,8 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
     """What of a kind of sensors is as a model's sensor is, which may read parameters of these names."""
     target, inner = target_of(model), kind.measure
 
-    def measure(state: Any, about: Any, parameters: Any) -> Any:
-        return inner(target(state), about, parameters)
+    def measure(state: Any, reference: Any, parameters: Any) -> Any:
+        return inner(target(state), reference, parameters)
 
     own = Sensor(kind.leaf, kind.schema, kind.measured, measure, fields={"origin": 2})
     return traced_sensor(model, own, names)

@@ -13,7 +13,13 @@ import numpy as np
 from replay.engine.arrays import Floats, Integers
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import Estimates
-from replay.inference.smoothing.backward_pass import FOREVER_NS, Nodes, back_memory, going_back, no_later
+from replay.inference.smoothing.backward_pass import (
+    FOREVER_NS,
+    Nodes,
+    back_memory,
+    no_later,
+    reprocessing,
+)
 
 
 def smooth_tracks(
@@ -36,7 +42,7 @@ def smooth_tracks(
         np.empty(covariance.shape),
     )
     arguments = (nodes, offsets, offsets[1:], FOREVER_NS, no_later(runs, n, n), offsets[:-1], smoothed)
-    going_back(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
+    reprocessing(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
     back = np.argsort(order)
     return smoothed.mean[back], smoothed.covariance[back]
 

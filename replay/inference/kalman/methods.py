@@ -143,7 +143,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
-    read_state, read_about = tuple_of(n), reading(sensor).about
+    read_state, read_reference = tuple_of(n), reading(sensor).reference
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
     write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
@@ -155,7 +155,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
         """The innovation by the Jacobian at mean (+) step, as one about the mean."""
         innovation, step, rows = work.innovations[number], work.step, work.rows
         step_to(mean, work)
-        linearise(read_state(work.state), read_about(data), parameters, work)
+        linearise(read_state(work.state), read_reference(data), parameters, work)
         chain(rows[:m], work)
         compare(covariance, data, parameters, work)
         for i in range(m):
@@ -281,7 +281,7 @@ def _exact_motion(stage: Stage) -> Function:
 def _exact_sensor(stage: Stage, number: int) -> Function:
 
     sensor = stage.sensors[number]
-    moments, read_about = sensor.moments, reading(sensor).about
+    moments, read_reference = sensor.moments, reading(sensor).reference
     assert moments is not None
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
 
@@ -295,7 +295,7 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
     ) -> bool:
         difference, spread, cross = work.innovations[number]
         predicted = work.predicted
-        moments(mean, covariance, read_about(data), parameters, predicted, spread, cross)
+        moments(mean, covariance, read_reference(data), parameters, predicted, spread, cross)
         for i in range(m):
             difference[i] = wrap(data[i] - predicted[i], angular[i])
         return True
@@ -311,12 +311,12 @@ def _lacks_slopes(model: Model) -> str:
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if sensor.noises and sensor.jacobian is None:
-            m, about = len(sensor.measured), (0.7,) * sensor.about_size
+            m, reference = len(sensor.measured), (0.7,) * sensor.reference_size
             rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
             work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
             try:
                 own = traced_sensor(model, sensor, number_fields(model.parameters))
-                sensor_derivative(model, own)(trial_state(model.kinds), about, parameters, work)
+                sensor_derivative(model, own)(trial_state(model.kinds), reference, parameters, work)
             except Exception:  # is said when the model is bound, see `model.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:

@@ -224,7 +224,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(_measured(sensor), model.kinds, sensor.noises, kinds)
-    read_about, m = reading(sensor).about, len(kinds)
+    read_reference, m = reading(sensor).reference, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
     entering = sensor.noise if sensor.noises else None
     variances_of = entering or _no_variances
@@ -240,7 +240,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     ) -> bool:
         memory = work.samples[samples]
         difference, spread, cross = work.innovations[number]
-        arguments, variances = (read_about(data), parameters), variances_of(parameters)
+        arguments, variances = (read_reference(data), parameters), variances_of(parameters)
         if not regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory):
             return False
         for i in range(m):

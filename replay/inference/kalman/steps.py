@@ -51,7 +51,8 @@ class Steps(NamedTuple):
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
-        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
+        resumes_after_gap: whether it goes on after a gap of the control: `predict` then takes NaN for a
+            control.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -59,7 +60,7 @@ class Steps(NamedTuple):
     updates: tuple[Function, ...]
     estimate: Function
     sampled: tuple[int, ...] = ()
-    resumes: bool = False
+    resumes_after_gap: bool = False
 
 
 class InnovationRecord(NamedTuple):
@@ -143,9 +144,9 @@ def gaussian_filter(
     `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` and the updates
     alike take one run's mean and covariance.
     """
-    lost = stage.motion.lost
-    if lost is not None:
-        predict = _predicting_lost(stage.model, lost, predict)
+    gap_noise = stage.motion.gap_noise
+    if gap_noise is not None:
+        predict = _predicting_gap(stage.model, gap_noise, predict)
 
     def predict_run(
         run: int,
@@ -169,11 +170,11 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
-        resumes=lost is not None,
+        resumes_after_gap=gap_noise is not None,
     )
 
 
-def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
+def _predicting_gap(model: Model, gap_noise: Function, predict_driven: Function) -> Function:
     """The prediction that, where the control is NaN, keeps the mean and adds to the covariance."""
     read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
 
@@ -191,7 +192,7 @@ def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> 
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
-        add(covariance, lost(read_state(mean), duration_s, parameters))
+        add(covariance, gap_noise(read_state(mean), duration_s, parameters))
         return True
 
     return predict

@@ -37,15 +37,17 @@ class Reading(NamedTuple):
 
     width: int
     measured: Function
-    about: Function
+    reference: Function
     noise: Function
 
 
 def reading(sensor: Sensor) -> Reading:
     """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
-    m, about = len(sensor.measured), sensor.about_size
+    m, reference = len(sensor.measured), sensor.reference_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
-    return Reading(m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about))
+    return Reading(
+        m + reference + triangle, tuple_of(m), tuple_of(reference, m), tuple_of(triangle, m + reference)
+    )
 
 
 def sensor_noise(sensor: Sensor) -> Function:
@@ -77,13 +79,13 @@ def sensor_noise(sensor: Sensor) -> Function:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> Function:
-    """`linearise(state, about, parameters, work)`: fills `predicted`, `rows` and `noise_gain`."""
+    """`linearise(state, reference, parameters, work)`: fills `predicted`, `rows` and `noise_gain`."""
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
 
-        def by_hand(state: Any, about: Any, parameters: Any, work: Any) -> None:
-            jacobian(state, about, parameters, work.rows)
-            fill(work.predicted, measure(state, about, parameters))
+        def by_hand(state: Any, reference: Any, parameters: Any, work: Any) -> None:
+            jacobian(state, reference, parameters, work.rows)
+            fill(work.predicted, measure(state, reference, parameters))
 
         return by_hand
     inputs = [Input("state", model.kinds, "rows")]
@@ -101,7 +103,7 @@ def linear_sensor(stage: Stage, number: int) -> Function:
     """
     sensor = stage.sensors[number]
     read_state, read = tuple_of(stage.model.size), reading(sensor)
-    read_about = read.about
+    read_reference = read.reference
     linearise, compare = sensor_derivative(stage.model, sensor), linear_innovation(sensor, number)
 
     def innovate(
@@ -112,7 +114,7 @@ def linear_sensor(stage: Stage, number: int) -> Function:
         sample_index: int,
         work: Workspace,
     ) -> bool:
-        linearise(read_state(mean), read_about(data), parameters, work)
+        linearise(read_state(mean), read_reference(data), parameters, work)
         compare(covariance, data, parameters, work)
         return True
 

@@ -54,10 +54,10 @@ class Added(NamedTuple):
 def estimated(label: str, model: Model, parameters: Any) -> Added:
     """What is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where what the model lists as `estimable` is none of its parameters, it does not list
-    one that is asked for, one stands twice, or has no sigma.
+    Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
+    list one that is asked for, one stands twice, or has no sigma.
     """
-    check_estimable(f"estimator {label}", model)
+    check_augmentable(f"estimator {label}", model)
     asked = parameters.estimate or []
     options = {
         "estimate_sigma": parameters.estimate_sigma or {},
@@ -72,8 +72,8 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
     for asks in asked:
         where = f"estimator {label}: estimate = {asks}"
         own = point_errors(where, model, asks)
-        if not own and asks not in model.estimable:
-            known = choices(asks, model.estimable)
+        if not own and asks not in model.augmentable:
+            known = choices(asks, model.augmentable)
             raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
         if asks in named or not errors.keys().isdisjoint(own):
             raise BadInput(f"{where}: is named twice; name it once")
@@ -83,7 +83,7 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
                 f"{where}: its uncertainty at the start is missing; give its standard deviation, "
                 f"estimate_sigma.{asks}=..."
             )
-        if time_s is not None and model.estimable.get(asks) == "angle":
+        if time_s is not None and model.augmentable.get(asks) == "angle":
             raise BadInput(
                 f"{where}: is an angle, which cannot return to a mean; give "
                 f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
@@ -96,21 +96,23 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
     return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
 
 
-def check_estimable(where: str, model: Model) -> None:
-    """Raise BadInput where `estimable` is no mapping from parameters of the model to linear or angle."""
-    if not isinstance(model.estimable, Mapping):
+def check_augmentable(where: str, model: Model) -> None:
+    """Raise BadInput where `augmentable` does not map parameters of the model to linear or angle."""
+    if not isinstance(model.augmentable, Mapping):
         raise BadInput(
-            f"{where}: estimable is a {type(model.estimable).__name__}; it is a mapping from parameter "
-            'to kind, such as {"length_m": "linear"}'
+            f"{where}: augmentable is a {type(model.augmentable).__name__}; it is a mapping from "
+            'parameter to kind, such as {"length_m": "linear"}'
         )
     known = number_fields(model.parameters)
-    for name, kind in model.estimable.items():
+    for name, kind in model.augmentable.items():
         if name not in known:
             raise BadInput(
-                f"{where}: estimable: '{name}' is no parameter of the model; {choices(name, known)}"
+                f"{where}: augmentable: '{name}' is no parameter of the model; {choices(name, known)}"
             )
         if kind not in ("linear", "angle"):
-            raise BadInput(f"{where}: estimable: {name} is of kind '{kind}'; known are linear and angle")
+            raise BadInput(
+                f"{where}: augmentable: {name} is of kind '{kind}'; known are linear and angle"
+            )
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
@@ -176,7 +178,9 @@ def begin(
         return Ragged(gaussian_stream(topic, time_ns, longer, wider, {}), prior.offsets)
 
     def begun(start: Start) -> Start:
-        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if added.walks else start
+        return (
+            (lambda static: start({**static, topic: extended(static[topic])})) if added.walks else start
+        )
 
     return begun
 
@@ -188,13 +192,13 @@ def _augmented(model: Model, names: Names) -> Model:
     }
     return replace(
         model,
-        state={**model.state, **{name: model.estimable[name] for name in names}},
+        state={**model.state, **{name: model.augmentable[name] for name in names}},
         parameters=with_walk_parameters(model.parameters, names),
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
         modes=modes,
         correct=correcting_more(model, len(names)),
-        estimable={},
+        augmentable={},
     )
 
 
@@ -210,7 +214,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, parameters)
     reads_none = not parameters.read & set(names)
     move_own = _reading(model, names, motion.move)
-    angular = tuple(model.estimable[name] == "angle" for name in names)
+    angular = tuple(model.augmentable[name] == "angle" for name in names)
 
     def move(state: Any, control: Any, *others: Any) -> Any:
         *entering, duration_s, parameters = others
@@ -240,7 +244,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         motion,
         move=move,
         noise=with_spreads(given, is_triangle=is_triangle),
-        lost=motion.lost and with_spreads(motion.lost),
+        gap_noise=motion.gap_noise and with_spreads(motion.gap_noise),
         noises=noises + len(names) if noises else 0,
         linear=motion.linear and reads_none,
         jacobians=None,
@@ -251,8 +255,8 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
 @lru_cache(maxsize=256)
 def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    parameters, about = _traced(model), (1.0,) * sensor.about_size
-    sensor.measure(trial_state(model.kinds), *entering, about, parameters)
+    parameters, reference = _traced(model), (1.0,) * sensor.reference_size
+    sensor.measure(trial_state(model.kinds), *entering, reference, parameters)
     return replace(
         sensor,
         measure=_reading(model, names, sensor.measure),

@@ -19,7 +19,7 @@ from replay.engine.vectors.tangent import WIDTHS, tangent_components
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.manifold import boxminus, boxplus, manifold_blocks, tangent_size
 from replay.inference.linear_algebra.tuples import adding_noise
-from replay.inference.model.augmentation import check_estimable
+from replay.inference.model.augmentation import check_augmentable
 from replay.inference.model.model import (
     Correction,
     Model,
@@ -95,7 +95,7 @@ def check_model(
     motions = {"motion": model.motion, **(model.modes or {})}
     try:
         check_state("check_model", model)
-        check_estimable("check_model", model)
+        check_augmentable("check_model", model)
         check_correction("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)
@@ -144,9 +144,9 @@ def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
 
 
 def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
-    about = tuple(rng.normal(size=sensor.about_size))
+    reference = tuple(rng.normal(size=sensor.reference_size))
     inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
-    rest = (about, numbers)
+    rest = (reference, numbers)
     return _Call(place_of(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)
 
 

@@ -44,5 +44,5 @@ def kept(name: str, duration_s: Any, parameters: Any) -> Any:
 def spread(name: str, duration_s: Any, parameters: Any) -> Any:
     """The variance that a step adds to it."""
     walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
-    lost = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
-    return walked + lost * getattr(parameters, f"sigma_{name}") ** 2
+    returned = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
+    return walked + returned * getattr(parameters, f"sigma_{name}") ** 2

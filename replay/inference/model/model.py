@@ -17,6 +17,7 @@ from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
+from replay.engine.renamed import renamed
 from replay.engine.vectors.components import Components
 from replay.engine.vectors.tangent import are_kinds
 from replay.inference.linear_algebra.manifold import tangent_size
@@ -74,6 +75,7 @@ class Map:
         return len(self.components)
 
 
+@renamed(instead="fallbacks")
 @dataclass(frozen=True, eq=False)
 class Control:
     """What drives the motion.
@@ -87,10 +89,10 @@ class Control:
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
         gap: the parameter that says how long, in s, an interpolated control may be silent: what is
-            estimated ends there, or is unknown until it speaks again, see `Motion.lost`.
+            estimated ends there, or is unknown until it speaks again, see `Motion.gap_noise`.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
-        instead: other topics that the components of these names are taken from where the log has them,
+        fallbacks: other topics that the components of these names are taken from where the log has them,
             such as a gyro's turn rate in place of the wheels'.
     """
 
@@ -103,9 +105,10 @@ class Control:
     gap: str = ""
     delay: str = ""
     estimates: bool = False
-    instead: tuple["Control", ...] = ()
+    fallbacks: tuple["Control", ...] = ()
 
 
+@renamed(lost="gap_noise")
 @dataclass(frozen=True, eq=False)
 class Motion:
     """How the state moves.
@@ -119,9 +122,9 @@ class Motion:
             all of them for zero.
         control_noise: (duration_s, parameters) -> the variances of the control's error over the
             duration; it enters the state through the derivative by the control.
-        lost: (state, duration_s, parameters) -> the variances in the tangent space that are added where
-            the control was silent for longer than its `gap`. The state stays, so that they cover what it
-            may have moved meanwhile; there are no estimates between.
+        gap_noise: (state, duration_s, parameters) -> the variances in the tangent space that are added
+            where the control was silent for longer than its `gap`. The state stays, so that they cover
+            what it may have moved meanwhile; there are no estimates between.
         linear: whether `move` is linear in the state: sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
             they are written by hand, the graph of `move` gives them else.
@@ -134,7 +137,7 @@ class Motion:
     noises: int = 0
     noise_block: int = 0
     control_noise: Function | None = None
-    lost: Function | None = None
+    gap_noise: Function | None = None
     linear: bool = False
     jacobians: Function | None = None
     moments: Function | None = None
@@ -159,6 +162,7 @@ class Switching:
     initial: Function | None = None
 
 
+@renamed(about="reference")
 @dataclass(frozen=True, eq=False)
 class Sensor:
     """What a sensor measures of the state.
@@ -167,9 +171,9 @@ class Sensor:
         topic: its name, under the prefix of what is estimated; a slash in front makes it everybody's.
         schema: of its messages. A GeodeticFix serves for a PositionFix, through the log's origin.
         measured: the components by name, with their kinds ("linear" or "angle").
-        measure: (state, about, parameters) -> what it measures; `about` is the point of the map, or
-            empty. With `noises`, (state, noise, about, parameters). A component that says nothing of
-            this state, or has no derivative there, is NaN: as if the message lacked it.
+        measure: (state, reference, parameters) -> what it measures; `reference` is the point of the map,
+            or empty. With `noises`, (state, noise, reference, parameters). A component that says nothing
+            of this state, or has no derivative there, is NaN: as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
             with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
             has neither is passed over, and counted.
@@ -177,21 +181,22 @@ class Sensor:
             every component is a field of its own.
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
-        about: what the message is about: a point of a map, or one of each of several maps.
+        reference: what the message is about: a point of a map, or one of each of several maps.
         fields: numbers that a message states beside what it measures, such as the pose of a sensor that
-            moves: fields of the schema, and how many components each has. `about` has them behind the
+            moves: fields of the schema, and how many components each has. `reference` has them behind
+                the
             points and the control.
-        is_numbered: whether `about` ends with the numbers of these points.
+        is_numbered: whether `reference` ends with the numbers of these points.
         control: the model's, which has to be interpolated, where what is measured depends on it:
-            `about` then ends with its numbers at the stamp.
+            `reference` then ends with its numbers at the stamp.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
             message: a pseudo-measurement.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
-        linear, jacobian, moments: as for `Motion`: jacobian(state, about, parameters, by_state);
-            moments(mean, covariance, about, parameters, predicted, spread, cross) fills the mean of the
-            measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
-        log_likelihood: (state, measured, about, parameters) -> log p(measured | state), for methods that
-            can use it.
+        linear, jacobian, moments: as for `Motion`: jacobian(state, reference, parameters, by_state);
+            moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of
+            the measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
+        log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
+            that can use it.
     """
 
     topic: str
@@ -202,7 +207,7 @@ class Sensor:
     noises: int = 0
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
-    about: Map | tuple[Map, ...] | None = None
+    reference: Map | tuple[Map, ...] | None = None
     fields: Mapping[str, int] = field(default_factory=dict)
     is_numbered: bool = False
     control: Control | None = None
@@ -216,16 +221,22 @@ class Sensor:
     @property
     def maps(self) -> tuple[Map, ...]:
         """The maps of the points that a message is about."""
-        return self.about if isinstance(self.about, tuple) else (self.about,) if self.about else ()
+        return (
+            self.reference
+            if isinstance(self.reference, tuple)
+            else (self.reference,)
+            if self.reference
+            else ()
+        )
 
     @property
     def control_start(self) -> int:
-        """How many numbers of `about` come before those of the control: the points' components."""
+        """How many numbers of `reference` come before those of the control: the points' components."""
         return sum(each.size for each in self.maps)
 
     @property
-    def about_size(self) -> int:
-        """How many numbers `measure` gets as `about`: points, control, fields, the points' numbers."""
+    def reference_size(self) -> int:
+        """How many numbers `measure` gets as `reference`: points, control, fields, points' numbers."""
         controls = len(self.control.components) if self.control else 0
         numbers = len(self.maps) if self.is_numbered else 0
         return self.control_start + controls + sum(self.fields.values()) + numbers
@@ -235,7 +246,7 @@ class Sensor:
 def fix_sensor(places: tuple[int, ...]) -> Sensor:
     """The sensor of position fixes, of a state that has x, y and perhaps z in these places."""
 
-    def position(state: Any, about: Any, parameters: Any) -> Any:
+    def position(state: Any, reference: Any, parameters: Any) -> Any:
         return tuple(state[place] for place in places)
 
     def fix_noise(parameters: Any) -> Any:
@@ -253,6 +264,7 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
     )
 
 
+@renamed(suspect="check_prior")
 @dataclass(frozen=True, eq=False)
 class Start:
     """What is assumed of a log that has no prior: it was not made for the model.
@@ -273,15 +285,15 @@ class Start:
         find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
             the model's names for their topics, and the maps; for a state that is found from several
             messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
-        suspect: (streams, parameters) -> sentences: what looks wrong in these messages where the log has
-            a prior. It is only said.
+        check_prior: (streams, parameters) -> sentences: what looks wrong in these messages where the log
+            has a prior. It is only said.
     """
 
     sigmas: Mapping[str, float]
     parameters: Mapping[str, float] = field(default_factory=dict)
     align: Callable[..., tuple[Floats, Floats] | None] | None = None
     find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
-    suspect: Callable[[Mapping[str, Stream], Any], list[str]] | None = None
+    check_prior: Callable[[Mapping[str, Stream], Any], list[str]] | None = None
 
 
 class Started(NamedTuple):
@@ -315,6 +327,7 @@ class Correction:
     back: Function
 
 
+@renamed(estimable="augmentable")
 @dataclass(frozen=True, eq=False)
 class Model:
     """A model of one kind of thing; a log may hold several of them, each under its own prefix.
@@ -337,7 +350,7 @@ class Model:
         takes_fixes: whether position fixes are sensors of it.
         correct: how an update moves the state where not every component moves by itself.
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
-        estimable: the parameters that may become part of the state, linear or angles, see
+        augmentable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
 
     A thing on a line, whose range from the origin is measured:
@@ -349,7 +362,7 @@ class Model:
     ...     return state[0] + duration_s * state[1], state[1]
     >>> def move_noise(state, duration_s, parameters):
     ...     return 0.0, 0.01 * duration_s
-    >>> def measure(state, about, parameters):
+    >>> def measure(state, reference, parameters):
     ...     return (np.abs(state[0]),)
     >>> def measure_noise(parameters):
     ...     return (parameters.sigma_m**2,)
@@ -382,7 +395,7 @@ class Model:
     output: str = "state"
     system: str = ""
     needs_sensor: bool = True
-    estimable: Components = field(default_factory=dict)
+    augmentable: Components = field(default_factory=dict)
     start: Start | None = None
     correct: Correction | None = None
     takes_fixes: bool = True
@@ -452,8 +465,8 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
     if motion.noise is not None:
         wanted = (motion.noises,) if motion.noises else sizes
         _check(where, motion.noise, (state, 1.0, parameters), wanted)
-    if motion.lost is not None:
-        _check(where, motion.lost, (state, 1.0, parameters), (model.tangent,))
+    if motion.gap_noise is not None:
+        _check(where, motion.gap_noise, (state, 1.0, parameters), (model.tangent,))
     if motion.control_noise is not None:
         _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
 
@@ -511,9 +524,9 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
         raise BadInput(f"{where}: measures a component of kind {unknown[0]}; give linear or angle")
-    state, about = trial_state(model.kinds), (1.0,) * sensor.about_size
+    state, reference = trial_state(model.kinds), (1.0,) * sensor.reference_size
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
+    _check(where, sensor.measure, (state, *entering, reference, parameters), (size,))
     if sensor.noise is None and (sensor.noises or not sensor.covariance):
         raise BadInput(f"{where}: states no noise; give `noise`, or `covariance`, the field that has it")
     if isinstance(sensor.covariance, str) and sensor.covariance and not sensor.vector:

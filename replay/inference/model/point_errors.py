@@ -116,13 +116,13 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
         for index, each in enumerate(errors)
         if each.measured in sensor.measured
     ]
-    n, size, inner = model.size, sensor.about_size, sensor.measure
+    n, size, inner = model.size, sensor.reference_size, sensor.measure
 
     def measure(state: Any, *others: Any) -> Any:
-        *entering, about, parameters = others
-        seen = list(inner(state[:n], *entering, about[:size], parameters))
+        *entering, reference, parameters = others
+        seen = list(inner(state[:n], *entering, reference[:size], parameters))
         for place, row, numbers in own:
-            seen[row] = seen[row] + _same(about[size:], numbers) * state[place]
+            seen[row] = seen[row] + _same(reference[size:], numbers) * state[place]
         return tuple(seen)
 
     return replace(
@@ -135,11 +135,11 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
     )
 
 
-def _same(about: Any, numbers: Sequence[int]) -> Any:
+def _same(reference: Any, numbers: Sequence[int]) -> Any:
     """1 where a message is about these points, 0 where not."""
     found: Any = 1.0
     for index, number in enumerate(numbers):
-        found = found * (about[index] == number)
+        found = found * (reference[index] == number)
     return found
 
 

@@ -109,8 +109,8 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
 def _stating(found: Found) -> list[Topic]:
     """The topics whose channels state numbers, in the order in which they are asked."""
     control = [] if found.control is None else [found.control]
-    instead, sensors = ([topic for _, topic in each] for each in (found.instead, found.sensors))
-    return [*instead, *control, found.prior, *sensors]
+    fallbacks, sensors = ([topic for _, topic in each] for each in (found.fallbacks, found.sensors))
+    return [*fallbacks, *control, found.prior, *sensors]
 
 
 def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:

@@ -216,7 +216,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     updates = (
         of_run(mixture_update(stage, number, update)) for number, update in enumerate(inner.updates)
     )
-    return Steps(memory, predict, tuple(updates), estimate, inner.sampled, inner.resumes)
+    return Steps(memory, predict, tuple(updates), estimate, inner.sampled, inner.resumes_after_gap)
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
@@ -270,9 +270,9 @@ class GaussianSumFilter(MixtureFilter):
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, which is split; see `Filter.start`."""
-        state, members = super().start(whole), self.parameters.members
+        state, members = super().start(static), self.parameters.members
         mean, covariance = state.carried.belief
         runs = len(mean)
         belief = GaussianSumBelief(

@@ -220,8 +220,8 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         of_run(mixture_update(stage, number, update)) for number, update in enumerate(filters[0].updates)
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
-    resumes = all(each.resumes for each in filters)
-    return Steps(memory, predict, updates, estimate, sampled, resumes)
+    resumes_after_gap = all(each.resumes_after_gap for each in filters)
+    return Steps(memory, predict, updates, estimate, sampled, resumes_after_gap)
 
 
 def predicting(filters: Sequence[Steps]) -> Function:
@@ -595,9 +595,9 @@ class InteractingFilter(MixtureFilter):
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         return switching_of(f"estimator {self.name}", model, parameters)
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, the same in all modes; see `Filter.start`."""
-        state, (_, initial) = super().start(whole), self.chain
+        state, (_, initial) = super().start(static), self.chain
         mean, covariance = (
             np.repeat(each[:, None], len(initial), axis=1) for each in state.carried.belief
         )
@@ -607,11 +607,11 @@ class InteractingFilter(MixtureFilter):
         return state._replace(carried=state.carried._replace(belief=belief), kept=())
 
     @property
-    def cannot_rewind(self) -> str:
-        """See `Filter.cannot_rewind`."""
+    def why_in_sequence(self) -> str:
+        """See `Filter.why_in_sequence`."""
         if self.parameters.smoothed_modes:
             return "smoothed modes use what came later in any case (smoothed_modes)"
-        return super().cannot_rewind
+        return super().why_in_sequence
 
     def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
         """Filter events."""

@@ -103,9 +103,9 @@ _draw_normals = compiled(fill_normals, allocates=False)
 class ParticleFilter(Filter):
     """A filter whose runs begin when their first measurement, which seeds them, is there."""
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+        state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
         runs, n = prior.mean.shape
         t = self.stage.model.tangent
@@ -121,8 +121,8 @@ class ParticleFilter(Filter):
         return state._replace(carried=state.carried._replace(belief=cloud))
 
     @property
-    def cannot_rewind(self) -> str:
-        """See `Filter.cannot_rewind`."""
+    def why_in_sequence(self) -> str:
+        """See `Filter.why_in_sequence`."""
         return "all particles would have to be kept for every message of the window"
 
     def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
@@ -263,13 +263,13 @@ def _lacks_likelihood(model: Model) -> str:
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:
             continue
-        about = (0.7,) * sensor.about_size
+        reference = (0.7,) * sensor.reference_size
         steps = np.linspace(0.3, 0.7, sensor.noises)
         with np.errstate(all="ignore"):
             try:
                 at = [
                     np.array(
-                        sensor.measure(trial_state(model.kinds), tuple(k * steps), about, parameters)
+                        sensor.measure(trial_state(model.kinds), tuple(k * steps), reference, parameters)
                     )
                     for k in range(3)
                 ]

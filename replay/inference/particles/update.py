@@ -81,13 +81,13 @@ def _comparing(stage: Stage, number: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     m, measure = len(sensor.measured), sensor.measure
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
-    read_state, read_about, fill = tuple_of(model.size), reading(sensor).about, filling(m)
+    read_state, read_reference, fill = tuple_of(model.size), reading(sensor).reference, filling(m)
     add_noise = sensor_noise(sensor)
 
     def predict_alike(
         states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
     ) -> None:
-        fill(memory.work.predicted, measure(read_state(states[i]), read_about(data), parameters))
+        fill(memory.work.predicted, measure(read_state(states[i]), read_reference(data), parameters))
 
     predict = predict_alike
     if sensor.noises:
@@ -99,7 +99,7 @@ def _comparing(stage: Stage, number: int) -> Function:
         def predict_with_noise(
             states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
         ) -> None:
-            linearise(read_state(states[i]), read_about(data), parameters, memory.work)
+            linearise(read_state(states[i]), read_reference(data), parameters, memory.work)
             no_covariance(memory.sensors[number].noise[i])
             add_noise(memory.sensors[number].noise[i], data, parameters, memory.work)
 
@@ -210,12 +210,12 @@ def _likelihood(stage: Stage, number: int) -> Function:
     if sensor.log_likelihood is None:
         return gaussian_likelihood
     stated, read_state, read = sensor.log_likelihood, tuple_of(stage.model.size), reading(sensor)
-    read_measured, read_about = read.measured, read.about
+    read_measured, read_reference = read.measured, read.reference
 
     def likelihood(
         states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
     ) -> float:
-        return stated(read_state(states[i]), read_measured(data), read_about(data), parameters)
+        return stated(read_state(states[i]), read_measured(data), read_reference(data), parameters)
 
     return likelihood
 

@@ -85,11 +85,11 @@ def filter_events(
     uses: list[tuple[str, Table]] = []
     if control is not None and found.control is not None:
         columns = {name: start + index for index, name in enumerate(control.components)}
-        replaced = {name for each, _ in found.instead for name in each.components}
+        replaced = {name for each, _ in found.fallbacks for name in each.components}
         own = {name: column for name, column in columns.items() if name not in replaced}
         name = found.control.name
         uses.append((name, _control_table(control, block.streams[name], width, own)))
-        for each, topic in found.instead:
+        for each, topic in found.fallbacks:
             uses.append((topic.name, _control_table(each, block.streams[topic.name], width, columns)))
     for number, (_, topic) in enumerate(found.sensors):
         ragged = block.streams[topic.name]
@@ -242,7 +242,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
         parts = [read_vectors(stream, sensor.vector, sensor.measured)]
     else:
         parts = [_fields(stream, tuple(sensor.measured))]
-    about: list[Floats] = []
+    reference: list[Floats] = []
     if sensor.maps:
         target = stream[sensor.maps[0].of].astype(np.int64)
         run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
@@ -250,13 +250,13 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
         places = context.points[each.topic]
         rows = places.rows(run, stream[each.of].astype(np.int64))
         source[rows < 0] = NOTHING
-        about.append(places.at(rows))
+        reference.append(places.at(rows))
     if sensor.control is not None:  # see `fill_control`
-        about.append(np.full((len(stream), len(sensor.control.components)), np.nan))
-    about += [_field(stream, name, size) for name, size in sensor.fields.items()]
+        reference.append(np.full((len(stream), len(sensor.control.components)), np.nan))
+    reference += [_field(stream, name, size) for name, size in sensor.fields.items()]
     if sensor.is_numbered:
-        about.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
-    parts[1:1] = about
+        reference.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
+    parts[1:1] = reference
     source[without_covariance] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
@@ -311,8 +311,8 @@ def output_times(
     """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
     count = len(time_ns)
     nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
-    about, arrival = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
-    return FilterEvents(offsets, time_ns, *nothing, np.full(count, wants_estimate), about, arrival)
+    reference, arrival = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
+    return FilterEvents(offsets, time_ns, *nothing, np.full(count, wants_estimate), reference, arrival)
 
 
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:

@@ -118,34 +118,34 @@ class Filter:
     settings: Floats
     samplers: tuple[Sampler, ...]
 
-    def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
+    def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
         """The topics of a log that it starts from: the prior, where there is one, and the maps."""
         maps = (each.topic for sensor in self.stage.sensors for each in sensor.maps)
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> State:
         """The state at every run's prior; a run whose prior cannot be used takes no part."""
         model = self.stage.model
-        time_ns, mean, covariance = gaussians(whole[self.found.prior.name])
+        time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
         accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
         carried = Carried(Gaussian(mean, covariance), control, time_ns, accepted_ns, started)
         maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
-        points = {topic: points_of(whole[topic], asked) for topic, asked in maps.items()}
+        points = {topic: points_of(static[topic], asked) for topic, asked in maps.items()}
         waiting = None
         if model.control is not None and model.control.interpolated:  # what drives from there on
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
             waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
-        context = Context(points, self.origins(whole, len(mean)))
+        context = Context(points, self.origins(static, len(mean)))
         return State(carried, context, (), waiting, np.zeros(len(mean), np.int64))
 
-    def origins(self, whole: Mapping[str, Ragged], runs: int) -> Floats | None:
+    def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
         """The origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
-        return next((origins_of(whole[topic.name]) for topic in self.found.geodetic), None)
+        return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
 
     def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
         """Filter a block."""
@@ -180,9 +180,9 @@ class Filter:
     def not_driven(self, events: FilterEvents) -> list[Ragged]:
         """What was not used since it was measured in a gap of the control, where that may have some."""
         control = self.stage.model.control
-        if control is None or not control.gap or not _steps(self.stage, self.method).resumes:
+        if control is None or not control.gap or not _steps(self.stage, self.method).resumes_after_gap:
             return []
-        lost = (events.source >= 0) & np.isnan(events.data[:, -1])
+        in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
         reasons = [
             f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
             f"{control.gap}"
@@ -191,11 +191,11 @@ class Filter:
         stream = reason_stream(
             f"/estimates/{self.name}/skipped",
             schemas.SKIPPED,
-            events.time_ns[lost],
-            events.source[lost],
+            events.time_ns[in_gap],
+            events.source[in_gap],
             reasons,
         )
-        return [Ragged(stream, ragged_rows(lost, events.offsets))]
+        return [Ragged(stream, ragged_rows(in_gap, events.offsets))]
 
     def passed_over(self, block: Block, without_covariance: Booleans) -> list[Ragged]:
         """What was not used since it lacks a covariance, if any topic may."""
@@ -257,7 +257,7 @@ class Filter:
         return (control.initial or (0.0,) * len(control.components)) if control else ()
 
     @property
-    def cannot_rewind(self) -> str:
+    def why_in_sequence(self) -> str:
         """Why it cannot go back for late messages; empty where it can."""
         control = self.stage.model.control
         if self.parameters.every_s is not None:

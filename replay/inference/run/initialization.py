@@ -15,7 +15,7 @@ import numpy as np
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.replaying.estimator import Opened, Opening
+from replay.engine.replaying.estimator import Initialization, Initialized
 from replay.engine.streams.blocks import Block, Ragged, merge_events
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
@@ -35,7 +35,7 @@ CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows whe
 
 
 @dataclass(frozen=True)
-class Beginning:
+class Initializer:
     """What a filter looks for in the first messages of a log.
 
     Attributes:
@@ -53,18 +53,18 @@ class Beginning:
     assumed: Mapping[str, float]
 
     @property
-    def opening(self) -> Opening | None:
+    def initialization(self) -> Initialization | None:
         """How it is found; None where the log states all."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
-        needs_messages = not self.found.has_prior or self._suspect is not None
+        needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        return Opening(topics, self.find) if topics else None
+        return Initialization(topics, self.find) if topics else None
 
     @property
-    def _suspect(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
+    def _prior_check(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
         start = self.stage.model.start
-        return start.suspect if start is not None else None
+        return start.check_prior if start is not None else None
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
@@ -79,7 +79,7 @@ class Beginning:
     def _starting(self) -> list[Topic]:
         """The topics whose first message is where to begin."""
         control = [] if self.found.control is None else [self.found.control]
-        drives = [*control, *(topic for _, topic in self.found.instead)]
+        drives = [*control, *(topic for _, topic in self.found.fallbacks)]
         if self.stage.model.finds_start:
             return [*drives, *(topic for _, topic in self.found.sensors)]
         needs_drives = self._aligns or not self._measuring
@@ -92,7 +92,9 @@ class Beginning:
         sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
         return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
 
-    def find(self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], clock: Clock) -> Opened:
+    def find(
+        self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock
+    ) -> Initialized:
         """What is found in the first messages; raises BadInput where none of them can be used."""
         found: dict[str, Ragged] = {}
         told: list[Ragged] = []
@@ -107,17 +109,17 @@ class Beginning:
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
             facts.append(_Fact(what, time_ns, has_one))
         if not self.found.has_prior:
-            prior, begun = self._prior(first, whole, clock, origins)
+            prior, begun = self._prior(first, static, clock, origins)
             found[self.found.prior.name] = prior
             facts += begun
-        elif self._suspect is not None:
-            facts += self._suspected(self._suspect, first, whole, origins)
-        return Opened(found, [*told, *self._told(facts)])
+        elif self._prior_check is not None:
+            facts += self._checked_prior(self._prior_check, first, static, origins)
+        return Initialized(found, [*told, *self._told(facts)])
 
     def _prior(
         self,
         first: Mapping[str, Ragged],
-        whole: Mapping[str, Ragged],
+        static: Mapping[str, Ragged],
         clock: Clock,
         origins: Floats | None,
     ) -> tuple[Ragged, list["_Fact"]]:
@@ -127,7 +129,7 @@ class Beginning:
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
         begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
         if model.finds_start:
-            facts = self._found(first, whole, origins, begun)
+            facts = self._found(first, static, origins, begun)
         elif self._measuring:
             facts = self._at_first(first, clock, origins, begun)
         else:
@@ -182,7 +184,7 @@ class Beginning:
     def _found(
         self,
         first: Mapping[str, Ragged],
-        whole: Mapping[str, Ragged],
+        static: Mapping[str, Ragged],
         origins: Floats | None,
         begun: "_Begun",
     ) -> list["_Fact"]:
@@ -190,7 +192,7 @@ class Beginning:
         model = self.stage.model
         assert model.start is not None
         assert model.start.find is not None
-        given, parameters = self._given(first, whole, origins)
+        given, parameters = self._given(first, static, origins)
         how = [""] * len(begun.time_ns)
         for run in range(len(how)):
             try:
@@ -208,7 +210,7 @@ class Beginning:
         ]
 
     def _given(
-        self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], origins: Floats | None
+        self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Any]:
         """The first messages and the maps, by the model's names for their topics, and the parameters."""
         model, control = self.stage.model, self.found.control
@@ -220,20 +222,20 @@ class Beginning:
             if origins is not None and topic in self.found.geodetic:
                 ragged = in_plane(ragged, origins)
             given[sensor.topic] = ragged
-            given |= {each.topic: whole[each.topic] for each in sensor.maps}
+            given |= {each.topic: static[each.topic] for each in sensor.maps}
         return given, reading_settings(number_fields(model.parameters))(self.settings, 0)
 
-    def _suspected(
+    def _checked_prior(
         self,
-        suspect: Callable[[Mapping[str, Stream], Any], list[str]],
+        check_prior: Callable[[Mapping[str, Stream], Any], list[str]],
         first: Mapping[str, Ragged],
-        whole: Mapping[str, Ragged],
+        static: Mapping[str, Ragged],
         origins: Floats | None,
     ) -> list["_Fact"]:
         """What the model suspects of the first messages of runs whose prior is known."""
-        given, parameters = self._given(first, whole, origins)
+        given, parameters = self._given(first, static, origins)
         said = [
-            suspect({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
+            check_prior({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
             for run in range(_runs(first))
         ]
         time_ns, _, _ = _first_of(next(iter(given.values())), "publish_time", None)
@@ -253,7 +255,7 @@ class Beginning:
             found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
                 begun.time_ns[run], chosen[run] = found_ns[run], number
-                begun.mean[run], sigma = self._about(number, table.data[rows[run]])
+                begun.mean[run], sigma = self._reference(number, table.data[rows[run]])
                 begun.covariance[run] = sigma**2 * np.eye(len(sigma))
         if (chosen < 0).all():
             raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
@@ -264,7 +266,7 @@ class Beginning:
             for number, _, topic in self._measuring
         ]
 
-    def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
+    def _reference(self, number: int, data: Floats) -> tuple[Floats, Floats]:
         """The mean and the much wider sigmas of a state that one message tells of."""
         model, sensor = self.stage.model, self.stage.sensors[number]
         mean, sigma = unknown(model.state, model.start)

@@ -157,12 +157,12 @@ def _most_within(history: History, events: FilterEvents, window_ns: int) -> int:
 def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Function, Steps]:
     steps = method.steps(stage)
     reads = reading_settings(number_fields(stage.model.parameters))
-    loop = going_back(stage.model, processing(stage, steps, reads), steps.estimate, structure)
+    loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
     title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
     return compile_over_runs(loop, allocates=False, title=title), steps
 
 
-def going_back(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
+def reprocessing(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
     """The loop over the events of one run in the order in which they came; see `recursion.recursion`.
 
     `structure` is that of `Kept`.
@@ -191,7 +191,7 @@ def going_back(model: Model, process: Function, estimate: Function, structure: S
         history.counts[run] += 1
         return row
 
-    def take_again(
+    def process_again(
         run: int,
         row: int,
         events: FilterEvents,
@@ -275,7 +275,9 @@ def going_back(model: Model, process: Function, estimate: Function, structure: S
             restore(kept.after, begin - 1, carried, run)
             failure = ALL_WELL
             for row in range(begin, last + 1):
-                failure = take_again(run, row, events, settings[run], gates, carried, kept, at, memory)
+                failure = process_again(
+                    run, row, events, settings[run], gates, carried, kept, at, memory
+                )
                 if failure != ALL_WELL:
                     break
             if failure == ALL_WELL and events.wants_estimate[event]:
@@ -323,7 +325,7 @@ def copying_rows(structure: Structure) -> Function:
 
 
 @dataclass(frozen=True)
-class Rewinding:
+class OutOfSequenceFilter:
     """A filter that goes back by up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
 
     `inner` is an `estimators.Filter`, and the states are of its type.
@@ -332,9 +334,9 @@ class Rewinding:
     inner: Any
     window_ns: int
 
-    def start(self, whole: Mapping[str, Ragged]) -> Any:
+    def start(self, static: Mapping[str, Ragged]) -> Any:
         """The state at every run's prior."""
-        state = self.inner.start(whole)
+        state = self.inner.start(static)
         return state._replace(kept=_no_history(self.inner.stage, state.carried))
 
     def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
@@ -375,7 +377,7 @@ class Rewinding:
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
-        made += [self.rewound(events, repeated), *inner.passed_over(block, without_covariance)]
+        made += [self.reprocessed(events, repeated), *inner.passed_over(block, without_covariance)]
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:
@@ -390,7 +392,7 @@ class Rewinding:
         innovations = Innovations(offsets[1:], *(column[rows] for column in columns))
         return [self.inner.innovations(innovations, offsets)]
 
-    def rewound(self, events: FilterEvents, repeated: Integers) -> Ragged:
+    def reprocessed(self, events: FilterEvents, repeated: Integers) -> Ragged:
         """The late messages, and how many updates each had repeated."""
         is_late = repeated > 0
         stream = make_stream(

@@ -124,9 +124,9 @@ def no_results(
         for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
     )
     estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
-    about = target_id.view(np.uint32)[: len(target_id)]
+    reference = target_id.view(np.uint32)[: len(target_id)]
     innovations = Innovations(
-        recorded[:-1].copy(), noted_ns.view(np.int64), about, difference, spread, numbers
+        recorded[:-1].copy(), noted_ns.view(np.int64), reference, difference, spread, numbers
     )
     return estimates, innovations
 
@@ -147,7 +147,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
     has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
-    resumes = steps.resumes
+    resumes_after_gap = steps.resumes_after_gap
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: Carried) -> None:
@@ -193,7 +193,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
             if has_gaps and np.isnan(data[len(data) - 1]):
-                if not resumes:
+                if not resumes_after_gap:
                     return NOT_DRIVEN
                 carried.control[run, :] = np.nan
                 return UNKNOWN

@@ -280,7 +280,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
 def affine_sensor(stage: Stage, number: int) -> Function:
     """The update of the tangent vector by sensor `number`, one component after the other."""
     model, sensor = stage.model, stage.sensors[number]
-    read_state, read_about = tuple_of(model.size), reading(sensor).about
+    read_state, read_reference = tuple_of(model.size), reading(sensor).reference
     linearise, whiten_residual = sensor_derivative(model, sensor), whitening(sensor, number)
     noise_enters = sensor.noises > 0
 
@@ -295,12 +295,12 @@ def affine_sensor(stage: Stage, number: int) -> Function:
         record: InnovationRecord,
     ) -> int:
         trajectory, innovation = work.samples[0], work.innovations[number]
-        node, about, column = trajectory.node[event], read_about(data), trajectory.column
+        node, reference, column = trajectory.node[event], read_reference(data), trajectory.column
         if noise_enters:
-            linearise(read_state(trajectory.kept[node]), about, parameters, work)
+            linearise(read_state(trajectory.kept[node]), reference, parameters, work)
             _, squared = whiten_residual(data, parameters, work)
             trajectory.held[0] += robust(squared, trajectory.loss)[0]
-        linearise(read_state(trajectory.mean[node]), about, parameters, work)
+        linearise(read_state(trajectory.mean[node]), reference, parameters, work)
         size, squared = whiten_residual(data, parameters, work)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE

@@ -141,7 +141,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         return ForwardMemory(steps.memory(sets), *(np.empty((t, t)) for _ in range(4)))
 
     updates = tuple(_with_memory(update) for update in steps.updates)
-    return Steps(memory, predict, updates, estimate, steps.sampled, steps.resumes)
+    return Steps(memory, predict, updates, estimate, steps.sampled, steps.resumes_after_gap)
 
 
 def _with_memory(update: Function) -> Function:
@@ -230,7 +230,7 @@ class BackMemory(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def going_back(kinds: Kinds, correct: Correction | None = None) -> Function:
+def reprocessing(kinds: Kinds, correct: Correction | None = None) -> Function:
     """The same over all runs, compiled; see `way_back`."""
     return compile_over_runs(way_back(kinds, correct), allocates=False, title="a smoother's way back")
 

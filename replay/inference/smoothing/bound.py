@@ -272,26 +272,26 @@ class Kept(NamedTuple):
 class BoundFilter(Filter):
     """A filter that knows the truth, and tells of every step of it."""
 
-    def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
+    def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
         """The topics of a log that it starts from; raises BadInput where it has no truth."""
         if self.truth not in topics:
             raise BadInput(
                 f"estimator {self.name}: a bound needs the true states, and there is no topic "
                 f"{self.truth}; give a log with a truth, such as a simulated one"
             )
-        return (*super().whole(topics), self.truth)
+        return (*super().static(topics), self.truth)
 
     @property
-    def cannot_rewind(self) -> str:
-        """See `Filter.cannot_rewind`."""
+    def why_in_sequence(self) -> str:
+        """See `Filter.why_in_sequence`."""
         return "a bound is that of all messages in the order of their stamps"
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+        state = super().start(static)
         _, covariance = state.carried.belief
         runs, t, _ = covariance.shape
-        kept = Kept(whole[self.truth], np.zeros(runs, bool))
+        kept = Kept(static[self.truth], np.zeros(runs, bool))
         mean = self.truths(kept.truth, state.carried.time_ns, np.arange(runs + 1))
         unit, none = np.tile(np.eye(t), (runs, 1, 1)), np.zeros((2, runs, t, t))
         along = Along(mean, covariance, unit, *none)

@@ -39,8 +39,8 @@ from replay.inference.smoothing.backward_pass import (
     Chain,
     Nodes,
     back_memory,
-    going_back,
     no_later,
+    reprocessing,
     smoothing_steps,
 )
 from replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
@@ -131,13 +131,13 @@ class Smoother(Filter):
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
-    def cannot_rewind(self) -> str:
+    def why_in_sequence(self) -> str:
         """A smoother has its estimates from what came later in any case."""
         return "a smoother uses later messages in any case; replay it in the order of the stamps"
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> State:
         """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+        state = super().start(static)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         slope, none = np.zeros(covariance.shape[:2]), np.zeros(len(mean), np.int64)
@@ -223,7 +223,7 @@ class Smoother(Filter):
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            going_back(model.kinds, model.correct)(runs, *arguments, scratch=memory)
+            reprocessing(model.kinds, model.correct)(runs, *arguments, scratch=memory)
         return smoothed, offsets
 
 

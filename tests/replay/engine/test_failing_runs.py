@@ -75,7 +75,7 @@ def make_filter(*, compiled: bool = False) -> Estimator[Parameters]:
         "a filter that fails on command",
         parameters=Parameters,
         streams={"bearing": schemas.BEARING},
-        whole={"/landmarks": schemas.LANDMARK},
+        static={"/landmarks": schemas.LANDMARK},
         components={"a_m": "linear", "b_m": "linear"},
         start=start,
         follow=follow,
@@ -204,7 +204,7 @@ def test_a_batch_fails_alone_too(mode: int, reason: str, kept: int, time: int) -
         "all at once",
         parameters=Parameters,
         streams={"bearing": schemas.BEARING},
-        whole={},
+        static={},
         components={"a_m": "linear", "b_m": "linear"},
         solve=each_run(solve_backwards),
     )

@@ -109,7 +109,7 @@ def walking(**more: Any) -> Estimator[Any]:
         "walks at random",
         parameters=SeededParameters,
         streams={"range": schemas.RANGE, "odometry": schemas.ODOMETRY},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=X,  # type: ignore[arg-type]
         optional=("odometry",),
         outputs={"detour": DETOUR},
@@ -144,14 +144,14 @@ def test_further_outputs_and_topics_that_may_be_absent() -> None:
     without = run(walking(), [make_run([1.0, 2.0], odometry=False)])
     assert len(without["/estimates/m/a/state"]) == 2
     assert len(without["/estimates/m/a/detour"]) == 0
-    assert "odometry (fuselog.Odometry, optional)" in walking().needs
+    assert "odometry (fuselog.Odometry, optional)" in walking().requirements
     vector = Schema("V", "v", (Field("sensor_time_ns", "time_ns"), Field("v", "vector")), package="t")
     with pytest.raises(BadInput, match="field v of its output extra is a vector"):
         recursive(
             "v",
             parameters=Parameters,
             streams={},
-            whole={},
+            static={},
             components=X,  # type: ignore[arg-type]
             outputs={"extra": vector},
             start=start,
@@ -178,7 +178,7 @@ def test_what_cannot_be_compiled_is_named_with_its_line() -> None:
         "wrong",
         parameters=Parameters,
         streams={"range": schemas.RANGE},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=X,  # type: ignore[arg-type]
         start=start,
         follow=slips,
@@ -212,7 +212,7 @@ def solved(shape: tuple[int, ...]) -> Estimator[Any]:
         "solves",
         parameters=SeededParameters,
         streams={"range": schemas.RANGE},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=X,  # type: ignore[arg-type]
         measured={"range_m": "linear"},
         outputs={"detour": DETOUR},

@@ -66,11 +66,11 @@ def seen(state: Any, vector: Any) -> Any:
     )
 
 
-def feel(state: Any, about: Any, parameters: Any) -> Any:
+def feel(state: Any, reference: Any, parameters: Any) -> Any:
     return seen(state, (0.0, 0.0, 9.81))
 
 
-def point(state: Any, about: Any, parameters: Any) -> Any:
+def point(state: Any, reference: Any, parameters: Any) -> Any:
     return seen(state, (0.5, 0.0, -0.4))
 
 

@@ -33,7 +33,7 @@ def move_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return (parameters.sigma_moved**2,)
 
 
-def measure(state: Any, about: Any, parameters: Any) -> Any:
+def measure(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[0],)
 
 

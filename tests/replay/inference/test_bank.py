@@ -126,10 +126,10 @@ def test_no_two_members_are_opposite_so_that_their_mean_does_not_hang_on_roundin
 
 def test_of_directions_as_wide_the_first_is_cut():
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    about = np.diag([4.0, 4.0, 1.0])
+    reference = np.diag([4.0, 4.0, 1.0])
     for covariance, expected in (
         (4.0 * turn @ turn.T, [1.0, 0.0, 0.0]),
-        (about[::-1, ::-1], [0.0, 1.0, 0.0]),
+        (reference[::-1, ::-1], [0.0, 1.0, 0.0]),
         (turn @ np.diag([1.0, 2.0, 3.0]) @ turn.T, turn[:, 2] * np.sign(turn[:, 2][0])),
     ):
         direction, _ = widest(["quaternion"] * 4, covariance)

@@ -52,7 +52,7 @@ def stiff_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return 0.0, 0.0, parameters.density * duration_s, parameters.density * duration_s
 
 
-def measure(state: Any, about: Any, parameters: Any) -> Any:
+def measure(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[1]
 
 

@@ -192,7 +192,7 @@ class Linear(NamedTuple):
         measured = {**all_linear("z", components), f"z{components - 1}": "angle"}
         targets = Map("/targets", schemas.LANDMARK, "landmark_id", "position_m", all_linear("p", states))
         schema = schemas.VECTOR_MEASUREMENT
-        sensor = Sensor("sensor", schema, measured, measure, variances, about=targets)
+        sensor = Sensor("sensor", schema, measured, measure, variances, reference=targets)
         motion = Motion(move, control_noise=control_noise)
         control = Control("control", schema, names("u", controls))
         state = all_linear("x", states)

@@ -173,7 +173,7 @@ def line_rates(parameters: Any) -> Any:
     return parameters.up_per_s, parameters.down_per_s
 
 
-def read_place(state: Any, about: Any, parameters: Any) -> Any:
+def read_place(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[0],)
 
 

@@ -42,7 +42,7 @@ def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return near, 0.0, near, mixed, 0.0, fast, 0.0, mixed, 0.0, fast
 
 
-def place(state: Any, about: Any, parameters: Any) -> Any:
+def place(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[1]
 
 

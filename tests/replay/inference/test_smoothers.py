@@ -175,7 +175,7 @@ def move_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return parameters.level * duration_s, parameters.slope * duration_s
 
 
-def read(state: Any, about: Any, parameters: Any) -> Any:
+def read(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[0] + state[1]
 
 

@@ -61,15 +61,15 @@ def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     )
 
 
-def see(state: Any, about: Any, parameters: Any) -> Any:
-    return range_bearing((state[0], state[1], state[2]), about)
+def see(state: Any, reference: Any, parameters: Any) -> Any:
+    return range_bearing((state[0], state[1], state[2]), reference)
 
 
 def see_noise(parameters: Any) -> Any:
     return parameters.sigma_range_m**2, parameters.sigma_bearing_rad**2
 
 
-def read_speed(state: Any, about: Any, parameters: Any) -> Any:
+def read_speed(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[3],)
 
 
@@ -94,7 +94,7 @@ RANGE_BEARING = Sensor(
     {"range_m": "linear", "bearing_rad": "angle"},
     see,
     see_noise,
-    about=Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE),
+    reference=Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE),
 )
 SPEED = Sensor(
     "speed",
