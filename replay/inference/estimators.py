@@ -23,7 +23,7 @@ from replay.inference.model.augmentation import (
     augmented_stage,
     begin,
     estimated,
-    with_walks,
+    with_gauss_markov,
 )
 from replay.inference.model.binding import Found, roles_of, topics_of
 from replay.inference.model.model import Model, ModelParameters, Motion
@@ -234,7 +234,7 @@ def bind_model(
             raise BadInput(f"estimator {label}: {error}") from error
         name = label + found.prefix
         samplers = samplers_of(stage, method, parameters)
-        settings = with_walks(numbers, added)
+        settings = with_gauss_markov(numbers, added)
         made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []

@@ -40,7 +40,7 @@ from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.filtering import State
+from replay.inference.run.filtering import FilterState
 from replay.inference.run.recursion import Estimates, filled, no_results, recursion
 from replay.inference.smoothing.affine import carrying
 from replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
@@ -64,7 +64,7 @@ class Gramian(NamedTuple):
     messages: Integers
 
 
-class Along(NamedTuple):
+class LinearizationTrajectory(NamedTuple):
     """The trajectory: its states (nodes, n), of every event the node, and memory for one offset."""
 
     mean: Floats
@@ -106,12 +106,14 @@ def _carried_by_motion(stage: Stage) -> Function:
         event: int,
         work: Workspace,
     ) -> bool:
-        along, transition = work.samples[0], belief.transition[run]
-        node = along.node[event]
-        linearise(read_state(along.mean[node - 1]), read_control(control), duration_s, parameters, work)
+        trajectory, transition = work.samples[0], belief.transition[run]
+        node = trajectory.node[event]
+        linearise(
+            read_state(trajectory.mean[node - 1]), read_control(control), duration_s, parameters, work
+        )
         if not flat:
-            subtract(along.mean[node], work.state, along.offset, 0)
-            carry(along.offset[0], work.transition, work.step)
+            subtract(trajectory.mean[node], work.state, trajectory.offset, 0)
+            carry(trajectory.offset[0], work.transition, work.step)
         multiply_into(work.transition, transition, work.product)
         return True
 
@@ -134,9 +136,11 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
         work: Workspace,
         record: InnovationRecord,
     ) -> int:
-        along, innovation = work.samples[0], work.innovations[number]
+        trajectory, innovation = work.samples[0], work.innovations[number]
         cross = innovation.cross_covariance
-        linearise(read_state(along.mean[along.node[event]]), read_reference(data), parameters, work)
+        linearise(
+            read_state(trajectory.mean[trajectory.node[event]]), read_reference(data), parameters, work
+        )
         innovation.covariance[:] = 0.0
         add_noise(innovation.covariance, data, parameters, work)
         for i in range(m):
@@ -173,7 +177,7 @@ def _summing(stage: Stage) -> tuple[Function, Steps]:
 class Observability(IteratedSmoother):
     """The smoothed trajectory of every run, and the Gramians of its windows along it."""
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """One message for every window, at its last stamp."""
         state, _ = self.ended(state)
         if not state.kept:
@@ -207,7 +211,7 @@ class Observability(IteratedSmoother):
         model = self.stage.model
         return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
-    def _scales(self, state: State) -> Floats:
+    def _scales(self, state: FilterState) -> Floats:
         """What a scaled component of one stands for (runs, t)."""
         scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
         for name, scale in self.parameters.scales.items():
@@ -230,7 +234,7 @@ class Observability(IteratedSmoother):
         last = np.maximum(span_ns // length_ns - 1, 0)
         return np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
 
-    def _gramians(self, state: State, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
+    def _gramians(self, state: FilterState, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
         """The Gramians at the last stamps of windows, and how many messages are in each."""
         stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
         t, (loop, steps) = stage.model.tangent, _summing(stage)
@@ -254,7 +258,7 @@ class Observability(IteratedSmoother):
         settings = np.repeat(self.settings[None], runs, axis=0)
 
         def memory() -> Any:
-            return steps.memory((Along(way.states.mean, way.node, np.empty((1, t))),))
+            return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))
 
         loop(runs, events, settings, self.gates, carried, found, innovations, scratch=memory)
         return filled(found, due)

@@ -5,8 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Booleans, Floats, Integers, varying
-from replay.inference.association.association import Memory as AssociationMemory
-from replay.inference.association.association import Weights, nearest
+from replay.inference.association.association import AssociationMemory, Weights, nearest
 
 LEVELS = 4
 

@@ -11,7 +11,7 @@ from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import Fixes, Found, latest_fixes, scans_of
 from replay.estimators.tracking.track_outputs import track_outputs
 from replay.inference.association.scanning import Scans, in_time, take_scans
-from replay.inference.association.tracking import Newborn, Told, Tracker, of_last, track_scans
+from replay.inference.association.tracking import Newborn, Tracker, TrackOutputs, of_last, track_scans
 from replay.inference.association.tracks import Tracks, no_tracks
 
 
@@ -31,11 +31,11 @@ class Setup(NamedTuple):
         shared = self.newborn.covariance[first : first + count, first : first + count]
         return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
-    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
         """The tracks after some scans, and what is said of them."""
         return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
-    def outputs(self, scans: Scans, told: Told, *, repeated: int = 0) -> list[Ragged]:
+    def outputs(self, scans: Scans, told: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
         """The streams of what is said of these scans; see `track_outputs`."""
         return track_outputs(self.name, self.found, self.tracker.stage, scans, told, repeated=repeated)
 

@@ -45,7 +45,7 @@ class Weights(NamedTuple):
 
 
 @varying(2)
-class Memory(NamedTuple):
+class AssociationMemory(NamedTuple):
     """What association works in, for so many tracks and detections at most.
 
     Attributes:
@@ -77,11 +77,11 @@ class Memory(NamedTuple):
     column_of: Integers
 
 
-def memory_for(tracks: int, detections: int) -> Memory:
+def memory_for(tracks: int, detections: int) -> AssociationMemory:
     """Memory for scans of so many tracks and detections at most."""
     items, columns = max(tracks, detections), tracks + detections
     slots = min(tracks, detections, MOST_ENUMERATED)
-    return Memory(
+    return AssociationMemory(
         rows=np.empty(tracks, np.int64),
         columns=np.empty(detections, np.int64),
         is_seen=np.empty(detections, bool),
@@ -101,7 +101,9 @@ def memory_for(tracks: int, detections: int) -> Memory:
     )
 
 
-def jpda(weights: Weights, tracks: int, detections: int, probability: Floats, memory: Memory) -> int:
+def jpda(
+    weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
+) -> int:
     """Fill the marginals (tracks, 1 + detections) of all maps; the first column is for no detection.
 
     Tracks that share no detection, not even through others, are independent: each cluster is summed on
@@ -133,7 +135,7 @@ def gather_cluster(
     tracks: int,
     detections: int,
     probability: Floats,
-    memory: Memory,
+    memory: AssociationMemory,
 ) -> tuple[int, int]:
     """List the tracks and detections that are connected with a track; returns how many there are."""
     memory.rows[0], probability[first, 0] = first, 0.0
@@ -156,7 +158,7 @@ def gather_cluster(
 
 
 def enumerate_maps(
-    weights: Weights, rows: int, columns: int, probability: Floats, memory: Memory
+    weights: Weights, rows: int, columns: int, probability: Floats, memory: AssociationMemory
 ) -> None:
     """The marginals of one cluster by the sum over all of its maps.
 
@@ -194,7 +196,7 @@ def enumerate_maps(
             memory.backward[taken] = entry
 
 
-def sum_maps(weights: Weights, rows: int, columns: int, memory: Memory) -> float:
+def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemory) -> float:
     """Fill a cluster's sums `forward`, and `backward` behind the last item; returns that of all maps."""
     tracks_are_slots = rows <= columns
     slots, items = (rows, columns) if tracks_are_slots else (columns, rows)
@@ -231,7 +233,7 @@ def sum_maps(weights: Weights, rows: int, columns: int, memory: Memory) -> float
     return total
 
 
-def ending_without(slot: int, items: int, slots: int, memory: Memory) -> float:
+def ending_without(slot: int, items: int, slots: int, memory: AssociationMemory) -> float:
     """The sum over the maps in which no item takes a slot."""
     found = 0.0
     for taken in range(1 << slots):
@@ -241,7 +243,7 @@ def ending_without(slot: int, items: int, slots: int, memory: Memory) -> float:
 
 
 def propagate_beliefs(
-    weights: Weights, rows: int, columns: int, probability: Floats, memory: Memory
+    weights: Weights, rows: int, columns: int, probability: Floats, memory: AssociationMemory
 ) -> None:
     """About the marginals of one cluster: messages between tracks and detections until they settle.
 
@@ -295,7 +297,9 @@ def choose(row: int, column: int, detections: int, probability: Floats) -> None:
         probability[row, entry] = 1.0 if entry == 1 + column else 0.0
 
 
-def nearest(weights: Weights, tracks: int, detections: int, probability: Floats, memory: Memory) -> int:
+def nearest(
+    weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
+) -> int:
     """Choose one map: the surest pair first, then the surest of the tracks and detections left."""
     for column in range(detections):
         memory.is_seen[column] = False
@@ -318,7 +322,7 @@ def nearest(weights: Weights, tracks: int, detections: int, probability: Floats,
 
 
 def hungarian(
-    weights: Weights, tracks: int, detections: int, probability: Floats, memory: Memory
+    weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
     """Choose the map of the greatest weight: successive shortest augmenting paths (Crouse, fig. 3).
 

@@ -25,8 +25,7 @@ from recorders.log import Schema
 from recorders.models.states import PLANE_MOTION
 from replay.engine.arrays import Booleans, Floats, Function, Integers, varying
 from replay.engine.vectors.components import Components
-from replay.inference.association.association import Memory as AssociationMemory
-from replay.inference.association.association import Weights, memory_for
+from replay.inference.association.association import AssociationMemory, Weights, memory_for
 from replay.inference.association.shared_bias import Pool, pool_of
 from replay.inference.association.tracks import Tracks
 from replay.inference.kalman.steps import Workspace, workspace
@@ -117,7 +116,7 @@ def in_time(first: Scans, second: Scans) -> Scans:
 
 
 @varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
-class Memory(NamedTuple):
+class ScanMemory(NamedTuple):
     """What one core works in; axes are tracks, their modes, and the detections of a scan.
 
     Attributes:
@@ -165,10 +164,10 @@ class Memory(NamedTuple):
     shift: Floats
 
 
-def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> Memory:
+def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> ScanMemory:
     """Memory for so many errors that tracks share, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
-    return Memory(
+    return ScanMemory(
         motion=motion,
         step=workspace(stage),
         pool=pool_of(shared, size, places),
@@ -259,7 +258,7 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Functio
         covariance: Floats,
         origin: Floats,
         parameters: Any,
-        memory: Memory,
+        memory: ScanMemory,
     ) -> float:
         state, here = read_state(mean), read_origin(origin)
         linearise(state, here, parameters, memory.step)
@@ -332,7 +331,7 @@ def comparing(kind: ScanSensor) -> Function:
     """`compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
     m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
 
-    def compare(track: int, mode: int, detection: int, memory: Memory) -> float:
+    def compare(track: int, mode: int, detection: int, memory: ScanMemory) -> float:
         factor, white = memory.spread[track, mode], memory.white[track, mode, detection]
         squared = 0.0
         for i in range(m):
@@ -352,7 +351,7 @@ def updating(model: Model, kind: ScanSensor) -> Function:
     find_slope = sloping(model.kinds, model.correct)
 
     def update(
-        track: int, mode: int, detections: int, mean: Floats, covariance: Floats, memory: Memory
+        track: int, mode: int, detections: int, mean: Floats, covariance: Floats, memory: ScanMemory
     ) -> None:
         given, moment, shift, step = memory.given, memory.moment, memory.shift, memory.step.step
         for i in range(m):
@@ -388,7 +387,7 @@ def updating(model: Model, kind: ScanSensor) -> Function:
 
 
 def split_by_mode(
-    run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: Memory
+    run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: ScanMemory
 ) -> float:
     """Fill a track's associations in one of its modes; returns how probable the mode is after them."""
     probability, given = memory.probability[track], memory.given
@@ -408,7 +407,7 @@ def split_by_mode(
     return after
 
 
-def join_near(first: int, end: int, scans: Scans, within: float, memory: Memory) -> int:
+def join_near(first: int, end: int, scans: Scans, within: float, memory: ScanMemory) -> int:
     """Fill the detections of a scan, each chain of those within a distance as their mean.
 
     Chains are in the order of their first detections.

@@ -17,8 +17,8 @@ from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
     back_memory,
+    backward_pass_over_runs,
     no_later,
-    reprocessing,
 )
 
 
@@ -42,7 +42,7 @@ def smooth_tracks(
         np.empty(covariance.shape),
     )
     arguments = (nodes, offsets, offsets[1:], FOREVER_NS, no_later(runs, n, n), offsets[:-1], smoothed)
-    reprocessing(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
+    backward_pass_over_runs(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
     back = np.argsort(order)
     return smoothed.mean[back], smoothed.covariance[back]
 

@@ -18,7 +18,7 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.inference.association.association import ASSOCIATIONS
 from replay.inference.association.scanning import (
     BY_SCAN,
-    Memory,
+    ScanMemory,
     Scans,
     ScanSensor,
     comparing,
@@ -83,7 +83,7 @@ class Newborn(NamedTuple):
 
 
 @varying(2)
-class Told(NamedTuple):
+class TrackOutputs(NamedTuple):
     """What is said after every scan; scan s of run r has the rows of that number.
 
     Attributes:
@@ -195,9 +195,9 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
     stage, associate = tracker.stage, ASSOCIATIONS[tracker.association]
-    advance, weigh, process = advancing(tracker), weighing(tracker), processing(tracker)
+    advance, weigh, process = advancing(tracker), association_weights(tracker), processing(tracker)
     end_tracks, begin_tracks = ending(tracker), beginning(tracker)
-    tell_pairs, tell_tracks = telling_pairs(tracker.sizes[0]), telling_tracks(stage)
+    write_pairs, write_tracks = writing_pairs(tracker.sizes[0]), writing_tracks(stage)
 
     def follow(
         run: int,
@@ -205,8 +205,8 @@ def tracking(tracker: Tracker, read: Function) -> Function:
         settings: Floats,
         newborn: Newborn,
         tracks: Tracks,
-        told: Told,
-        memory: Memory,
+        outputs: TrackOutputs,
+        memory: ScanMemory,
     ) -> None:
         """Take one run through its scans."""
         for scan in range(scans.offsets[run], scans.offsets[run + 1]):
@@ -217,18 +217,18 @@ def tracking(tracker: Tracker, read: Function) -> Function:
             count = join_near(scans.first[scan], scans.end[scan], scans, p.joined_within_m, memory)
             weigh(run, scan, count, scans, tracks, p, memory)
             used = tracks.used[run]
-            told.approximated[scan] = associate(
+            outputs.approximated[scan] = associate(
                 memory.weights, used, count, memory.probability, memory.association
             )
             for detection in range(count):
                 memory.left[detection] = 1.0
                 for place in range(used):
                     memory.left[detection] -= memory.probability[place, 1 + detection]
-            tell_pairs(run, scan, count, tracks, told, memory)
+            write_pairs(run, scan, count, tracks, outputs, memory)
             process(run, scan, count, scans, tracks, p, memory)
             end_tracks(run, tracks, p)
-            told.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
-            tell_tracks(run, scan, tracks, told, memory)
+            outputs.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
+            write_tracks(run, scan, tracks, outputs, memory)
 
     return follow
 
@@ -238,7 +238,7 @@ def advancing(tracker: Tracker) -> Function:
     belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
     wait, _, _ = MANAGEMENTS[tracker.management]
 
-    def advance(run: int, time_ns: int, tracks: Tracks, p: Any, memory: Memory) -> None:
+    def advance(run: int, time_ns: int, tracks: Tracks, p: Any, memory: ScanMemory) -> None:
         """Predict all tracks."""
         duration_s = (time_ns - tracks.time_ns[run]) * 1e-9
         if tracks.time_ns[run] != NEVER and duration_s > 0.0:
@@ -251,7 +251,7 @@ def advancing(tracker: Tracker) -> Function:
     return advance
 
 
-def weighing(tracker: Tracker) -> Function:
+def association_weights(tracker: Tracker) -> Function:
     """`weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
@@ -270,7 +270,7 @@ def weighing(tracker: Tracker) -> Function:
         return total
 
     def weigh(
-        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
+        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: ScanMemory
     ) -> None:
         """Fill the weights of all pairs, and which detections are outside all gates."""
         kind, weights, origin = scans.kind[scan], memory.weights, read_pair(scans.origin[scan])
@@ -319,7 +319,7 @@ def processing(tracker: Tracker) -> Function:
     _, judge, _ = MANAGEMENTS[tracker.management]
     begins, (shared_at, shared) = births_of(kinds).begins, tracker.shared
 
-    def correct(run: int, place: int, count: int, kind: int, tracks: Tracks, memory: Memory) -> None:
+    def correct(run: int, place: int, count: int, kind: int, tracks: Tracks, memory: ScanMemory) -> None:
         """Update a track's Gaussians and the probabilities of its modes by its associations."""
         for mode in range(modes):
             after = split_by_mode(run, place, mode, count, tracks, memory)
@@ -333,7 +333,7 @@ def processing(tracker: Tracker) -> Function:
             tracks.log_mode[run, place, mode] = np.log(after) if after > 0.0 else -np.inf
 
     def process(
-        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
+        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: ScanMemory
     ) -> None:
         """Update all tracks by the associations, and what is known of their targets' existence."""
         kind, sensor, now_ns = scans.kind[scan], scans.sensor[scan], tracks.time_ns[run]
@@ -412,7 +412,7 @@ def beginning(tracker: Tracker) -> Function:
         return False
 
     def first_existence(
-        run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: Memory
+        run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: ScanMemory
     ) -> float:
         """How probable it is that a detection is of a target that no track is of; 0 to begin none."""
         if p.undetected_per_m2 > 0.0:
@@ -430,7 +430,7 @@ def beginning(tracker: Tracker) -> Function:
         tracks: Tracks,
         newborn: Newborn,
         p: Any,
-        memory: Memory,
+        memory: ScanMemory,
     ) -> int:
         """Begin tracks with the detections that may be of no other; returns how many had no room."""
         kind, turned_away = scans.kind[scan], 0
@@ -478,18 +478,20 @@ def beginning(tracker: Tracker) -> Function:
     return begin_tracks
 
 
-def telling_pairs(modes: int) -> Function:
-    """`tell_pairs(run, scan, count, tracks, told, memory)`: the associations of confirmed tracks."""
+def writing_pairs(modes: int) -> Function:
+    """`write_pairs(run, scan, count, tracks, outputs, memory)`: the associations of confirmed tracks."""
 
-    def tell_pairs(run: int, scan: int, count: int, tracks: Tracks, told: Told, memory: Memory) -> None:
+    def write_pairs(
+        run: int, scan: int, count: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
+    ) -> None:
         """Tell which detections went to confirmed tracks."""
         for place in range(tracks.used[run]):
             for detection in range(count if tracks.is_confirmed[run, place] else 0):
                 if memory.probability[place, 1 + detection] > 0.0:
-                    row = told.end[run, 1]
-                    told.pair[run, row, 0] = tracks.number[run, place]
-                    told.pair[run, row, 1], told.pair[run, row, 2] = scan, detection
-                    told.associated[run, row] = memory.probability[place, 1 + detection]
+                    row = outputs.end[run, 1]
+                    outputs.pair[run, row, 0] = tracks.number[run, place]
+                    outputs.pair[run, row, 1], outputs.pair[run, row, 2] = scan, detection
+                    outputs.associated[run, row] = memory.probability[place, 1 + detection]
                     likeliest = 0
                     for mode in range(1, modes):
                         likelihood = memory.likelihood[place, mode, detection]
@@ -497,31 +499,31 @@ def telling_pairs(modes: int) -> Function:
                             likeliest = mode
                     white = memory.white[place, likeliest, detection]
                     factor = memory.spread[place, likeliest]
-                    copy_gaussian(white, factor, told.white[run, row], told.factor[run, row])
-                    told.end[run, 1] = row + 1
+                    copy_gaussian(white, factor, outputs.white[run, row], outputs.factor[run, row])
+                    outputs.end[run, 1] = row + 1
 
-    return tell_pairs
+    return write_pairs
 
 
-def telling_tracks(stage: Stage) -> Function:
-    """`tell_tracks(run, scan, tracks, told, memory)`: the confirmed tracks."""
+def writing_tracks(stage: Stage) -> Function:
+    """`write_tracks(run, scan, tracks, outputs, memory)`: the confirmed tracks."""
     belief_of, estimate = believing(stage), moving(stage).estimate
 
-    def tell_tracks(run: int, scan: int, tracks: Tracks, told: Told, memory: Memory) -> None:
+    def write_tracks(run: int, scan: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory) -> None:
         """Tell the confirmed tracks as they are now."""
         belief = belief_of(run, tracks)
-        rows = Rows(told.mean[run], told.covariance[run], told.probability[run])
-        told.confirmed[scan] = 0
+        rows = Rows(outputs.mean[run], outputs.covariance[run], outputs.probability[run])
+        outputs.confirmed[scan] = 0
         for place in range(tracks.used[run]):
             if tracks.is_confirmed[run, place]:
-                row = told.end[run, 0]
-                told.number[run, row] = tracks.number[run, place]
+                row = outputs.end[run, 0]
+                outputs.number[run, row] = tracks.number[run, place]
                 estimate(place, belief, rows, row, memory.motion)
-                told.existence[run, row] = tracks.existence[run, place]
-                told.end[run, 0] = row + 1
-                told.confirmed[scan] += 1
+                outputs.existence[run, row] = tracks.existence[run, place]
+                outputs.end[run, 0] = row + 1
+                outputs.confirmed[scan] += 1
 
-    return tell_tracks
+    return write_tracks
 
 
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.
@@ -538,7 +540,7 @@ def _compiled(tracker: Tracker) -> Callable[..., None]:
 
 def track_scans(
     tracker: Tracker, scans: Scans, settings: Floats, newborn: Newborn, before: Tracks
-) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
     """The tracks after the scans; and by batch, its scans and what was said of them.
 
     `settings` (sensors, names) are the parameters for each sensor.
@@ -556,26 +558,26 @@ def track_scans(
             offsets=np.concatenate([[0], np.cumsum(bounds[1] - bounds[0])]),
             **{name: getattr(scans, name)[rows] for name in BY_SCAN},
         )
-        told = _no_told(batch, runs, places, tracker.sizes)
+        outputs = _blank_outputs(batch, runs, places, tracker.sizes)
         memory = partial(_memory, tracker, places, largest)
-        _compiled(tracker)(runs, batch, settings, newborn, tracks, told, scratch=memory)
-        said.append((batch, told))
+        _compiled(tracker)(runs, batch, settings, newborn, tracks, outputs, scratch=memory)
+        said.append((batch, outputs))
     return tracks, said
 
 
-def _memory(tracker: Tracker, places: int, detections: int) -> Memory:
+def _memory(tracker: Tracker, places: int, detections: int) -> ScanMemory:
     motion = moving(tracker.stage).memory(())
     return memory_of(tracker.stage, motion, tracker.shared[1], places, detections)
 
 
-def _no_told(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> Told:
+def _blank_outputs(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> TrackOutputs:
     """Room for all that could be said: memory that is not written takes none."""
     modes, n, t = sizes
     counts = np.diff(scans.offsets)
     detections = np.add.reduceat(np.append(scans.end - scans.first, 0), scans.offsets[:-1])
     rows = places * int(counts.max(initial=0))
     pairs = places * int(np.where(counts > 0, detections, 0).max(initial=0))
-    return Told(
+    return TrackOutputs(
         end=np.zeros((runs, 2), np.int64),
         confirmed=np.full(len(scans.time_ns), NEVER),
         approximated=np.zeros(len(scans.time_ns), np.int64),
@@ -592,17 +594,17 @@ def _no_told(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) 
     )
 
 
-def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
+def of_last(scans: Scans, outputs: TrackOutputs) -> tuple[Scans, TrackOutputs]:
     """The last scan of one run, and what was said of it."""
     last = len(scans.time_ns) - 1
-    count, (end, paired) = max(int(told.confirmed[last]), 0), told.end[0]
-    is_of_it = told.pair[0, :paired, 1] == last
-    by_scan = {name: getattr(told, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
-    by_track = {name: getattr(told, name)[:, end - count : end] for name in BY_TRACK}
-    return take_scans(scans, np.array([last])), Told(
+    count, (end, paired) = max(int(outputs.confirmed[last]), 0), outputs.end[0]
+    is_of_it = outputs.pair[0, :paired, 1] == last
+    by_scan = {name: getattr(outputs, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
+    by_track = {name: getattr(outputs, name)[:, end - count : end] for name in BY_TRACK}
+    return take_scans(scans, np.array([last])), TrackOutputs(
         end=np.array([[count, int(is_of_it.sum())]]),
         **by_scan,
         **by_track,
-        pair=told.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
-        **{name: getattr(told, name)[:, :paired][:, is_of_it] for name in BY_PAIR},
+        pair=outputs.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
+        **{name: getattr(outputs, name)[:, :paired][:, is_of_it] for name in BY_PAIR},
     )

@@ -20,7 +20,12 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import gaussian_stream
 from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import Walk, kept, spread, with_walk_parameters
+from replay.inference.model.gauss_markov import (
+    GaussMarkov,
+    added_variance,
+    remaining_share,
+    with_gauss_markov_parameters,
+)
 from replay.inference.model.model import Model, Motion, Sensor, trial_state
 from replay.inference.model.parameters import number_fields, settings_type
 from replay.inference.model.point_errors import (
@@ -43,7 +48,7 @@ class Added(NamedTuple):
 
     parameters: Names
     errors: Errors
-    walks: tuple[Walk, ...]
+    processes: tuple[GaussMarkov, ...]
 
     @property
     def names(self) -> Names:
@@ -67,8 +72,8 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
     for option, given in options.items():
         for name in given.keys() - set(asked):
             raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
-    named: dict[str, Walk] = {}
-    errors: dict[PointError, Walk] = {}
+    named: dict[str, GaussMarkov] = {}
+    errors: dict[PointError, GaussMarkov] = {}
     for asks in asked:
         where = f"estimator {label}: estimate = {asks}"
         own = point_errors(where, model, asks)
@@ -88,11 +93,11 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
                 f"{where}: is an angle, which cannot return to a mean; give "
                 f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
             )
-        walk = Walk(sigma, drift or 0.0, time_s or np.inf)
+        process = GaussMarkov(sigma, drift or 0.0, time_s or np.inf)
         if own:
-            errors |= dict.fromkeys(own, walk)
+            errors |= dict.fromkeys(own, process)
         else:
-            named[asks] = walk
+            named[asks] = process
     return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
 
 
@@ -142,9 +147,9 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
     return stage
 
 
-def with_walks(settings: Floats, added: Added) -> Floats:
+def with_gauss_markov(settings: Floats, added: Added) -> Floats:
     """Numbers of motion and sensors with those that an augmented model has beside them."""
-    numbers = np.ravel(added.walks)
+    numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
 
@@ -166,11 +171,11 @@ def begin(
                 f"estimator {label}: estimate = {name}: its value at the start is missing; give "
                 f"{name}=..."
             )
-    variances = np.array([walk.sigma**2 for walk in added.walks])
+    variances = np.array([process.sigma**2 for process in added.processes])
 
     def extended(prior: Ragged) -> Ragged:
         time_ns, mean, covariance = gaussians(prior)
-        runs, t, k = len(mean), covariance.shape[1], len(added.walks)
+        runs, t, k = len(mean), covariance.shape[1], len(added.processes)
         wider = np.zeros((runs, t + k, t + k))
         wider[:, :t, :t] = covariance
         wider[:, range(t, t + k), range(t, t + k)] = variances
@@ -179,7 +184,9 @@ def begin(
 
     def begun(start: Start) -> Start:
         return (
-            (lambda static: start({**static, topic: extended(static[topic])})) if added.walks else start
+            (lambda static: start({**static, topic: extended(static[topic])}))
+            if added.processes
+            else start
         )
 
     return begun
@@ -193,7 +200,7 @@ def _augmented(model: Model, names: Names) -> Model:
     return replace(
         model,
         state={**model.state, **{name: model.augmentable[name] for name in names}},
-        parameters=with_walk_parameters(model.parameters, names),
+        parameters=with_gauss_markov_parameters(model.parameters, names),
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
         modes=modes,
@@ -223,7 +230,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         for index, name in enumerate(names):
             stay = state[n + index]
             if not angular[index]:  # an angle has no mean to come back to
-                share = kept(name, duration_s, parameters)
+                share = remaining_share(name, duration_s, parameters)
                 stay = share * stay + (1.0 - share) * getattr(parameters, name)
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
@@ -235,7 +242,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
             found = list(own(state, duration_s, parameters))
             for index, name in enumerate(names):
                 found += [0.0] * (t + index) if is_triangle else []
-                found.append(spread(name, duration_s, parameters))
+                found.append(added_variance(name, duration_s, parameters))
             return tuple(found)
 
         return noise

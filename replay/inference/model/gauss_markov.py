@@ -12,7 +12,7 @@ from pydantic import NonNegativeFloat, create_model
 from replay.inference.model.model import ModelParameters
 
 
-class Walk(NamedTuple):
+class GaussMarkov(NamedTuple):
     """What is known of a component.
 
     Attributes:
@@ -26,22 +26,22 @@ class Walk(NamedTuple):
     time_s: float
 
 
-def with_walk_parameters(
+def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
     """Parameters of a model with those of the walks of these components."""
-    walks: dict[str, Any] = {
-        f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in Walk._fields
+    processes: dict[str, Any] = {
+        f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }
-    return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **walks)
+    return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **processes)
 
 
-def kept(name: str, duration_s: Any, parameters: Any) -> Any:
+def remaining_share(name: str, duration_s: Any, parameters: Any) -> Any:
     """The share of a component's distance from its mean that is left after a step."""
     return np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
 
 
-def spread(name: str, duration_s: Any, parameters: Any) -> Any:
+def added_variance(name: str, duration_s: Any, parameters: Any) -> Any:
     """The variance that a step adds to it."""
     walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
     returned = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))

@@ -16,7 +16,11 @@ from typing import Any, NamedTuple
 
 from recorders.errors import BadInput
 from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import kept, spread, with_walk_parameters
+from replay.inference.model.gauss_markov import (
+    added_variance,
+    remaining_share,
+    with_gauss_markov_parameters,
+)
 from replay.inference.model.model import Model, Motion, Sensor, trial_state
 from replay.inference.model.settings import trial_parameters
 
@@ -67,7 +71,7 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
     return replace(
         model,
         state={**model.state, **{each.name: kinds[each.measured] for each in errors}},
-        parameters=with_walk_parameters(model.parameters, _names(errors)),
+        parameters=with_gauss_markov_parameters(model.parameters, _names(errors)),
         sensors=tuple(sensor_with_errors(model, sensor, errors) for sensor in model.sensors),
         motion=motion_with_errors(model, model.motion, errors),
         correct=correcting_more(model, len(errors)),
@@ -89,13 +93,13 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
         own = (each[:noises] for each in entering)
         moved = list(inner(state[:n], control, *own, duration_s, parameters))
         for index, name in enumerate(names):
-            stay = kept(name, duration_s, parameters) * state[n + index]
+            stay = remaining_share(name, duration_s, parameters) * state[n + index]
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
 
     def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
         found = noise_of(state[:n], duration_s, parameters) if noise_of else (0.0,) * t
-        return (*found, *(spread(name, duration_s, parameters) for name in names))
+        return (*found, *(added_variance(name, duration_s, parameters) for name in names))
 
     return replace(
         motion,

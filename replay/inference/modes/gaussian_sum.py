@@ -36,7 +36,7 @@ from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
 from replay.inference.modes.imm import MixtureFilter, Mixtures, likeliest_of, mixing, mixture_update
-from replay.inference.run.filtering import State
+from replay.inference.run.filtering import FilterState
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
 ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding says
@@ -270,7 +270,7 @@ class GaussianSumFilter(MixtureFilter):
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 
-    def start(self, static: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, which is split; see `Filter.start`."""
         state, members = super().start(static), self.parameters.members
         mean, covariance = state.carried.belief

@@ -51,7 +51,7 @@ from replay.inference.model.model import Model, switching_of
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, State
+from replay.inference.run.filtering import Filter, FilterState
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 
 TINY = 1e-280  # below it a probability loses digits
@@ -595,7 +595,7 @@ class InteractingFilter(MixtureFilter):
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         return switching_of(f"estimator {self.name}", model, parameters)
 
-    def start(self, static: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, the same in all modes; see `Filter.start`."""
         state, (_, initial) = super().start(static), self.chain
         mean, covariance = (
@@ -613,14 +613,14 @@ class InteractingFilter(MixtureFilter):
             return "smoothed modes use what came later in any case (smoothed_modes)"
         return super().why_in_sequence
 
-    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events."""
         after, made = super().follow(state, events)
         if self.parameters.smoothed_modes:
             after = after._replace(kept=(*state.kept, made[1]))
         return after, made
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for a control, and, where asked for, the modes' probabilities given all data."""
         state, made = self.ended(state)
         return [*made, self.smoothed(join(state.kept))] if state.kept else made

@@ -36,7 +36,7 @@ from replay.inference.particles.particles import (
 )
 from replay.inference.particles.update import weighing
 from replay.inference.run.events import join_events, select_events
-from replay.inference.run.filtering import Filter, State
+from replay.inference.run.filtering import Filter, FilterState
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 
 MOST_PARTICLES = 1_000_000
@@ -103,7 +103,7 @@ _draw_normals = compiled(fill_normals, allocates=False)
 class ParticleFilter(Filter):
     """A filter whose runs begin when their first measurement, which seeds them, is there."""
 
-    def start(self, static: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, see `Filter.start`."""
         state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
@@ -125,7 +125,7 @@ class ParticleFilter(Filter):
         """See `Filter.why_in_sequence`."""
         return "all particles would have to be kept for every message of the window"
 
-    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events of the runs in which something was measured; those of the others wait."""
         if state.kept is not None:
             events = join_events(state.kept, events)
@@ -161,7 +161,7 @@ class ParticleFilter(Filter):
         )
         return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for a control or a measurement that did not come; then the prior seeds the run."""
         state, made = self.ended(state)
         if state.kept is None:
@@ -171,7 +171,7 @@ class ParticleFilter(Filter):
         after = self.begun(state, {run: [prior.mean[run], prior.covariance[run]] for run in unseeded})
         return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
 
-    def begun(self, state: State, seeds: Mapping[int, list[Any]]) -> State:
+    def begun(self, state: FilterState, seeds: Mapping[int, list[Any]]) -> FilterState:
         """The state with particles drawn from the priors of some runs, each seeded by its data."""
         if not seeds:
             return state

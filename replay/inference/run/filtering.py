@@ -40,10 +40,10 @@ from replay.inference.run.events import (
 )
 from replay.inference.run.out_of_sequence import issued
 from replay.inference.run.recursion import (
-    Carried,
     Estimates,
     FilterEvents,
     Innovations,
+    RecursionState,
     filled,
     no_results,
     recursion,
@@ -52,11 +52,11 @@ from replay.sampling.samplers import Sampler
 from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 
 
-class State(NamedTuple):
+class FilterState(NamedTuple):
     """What a filter carries from block to block.
 
     Attributes:
-        carried: see `recursion.Carried`.
+        carried: see `recursion.RecursionState`.
         context: what messages are read against.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
@@ -65,7 +65,7 @@ class State(NamedTuple):
         next_output: (runs,) the number of the next extra estimate.
     """
 
-    carried: Carried
+    carried: RecursionState
     context: Context
     generators: tuple[Any, ...]
     waiting: FilterEvents | None
@@ -124,14 +124,14 @@ class Filter:
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
-    def start(self, static: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior; a run whose prior cannot be used takes no part."""
         model = self.stage.model
         time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
         accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
-        carried = Carried(Gaussian(mean, covariance), control, time_ns, accepted_ns, started)
+        carried = RecursionState(Gaussian(mean, covariance), control, time_ns, accepted_ns, started)
         maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
         points = {topic: points_of(static[topic], asked) for topic, asked in maps.items()}
         waiting = None
@@ -139,7 +139,7 @@ class Filter:
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
             waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
         context = Context(points, self.origins(static, len(mean)))
-        return State(carried, context, (), waiting, np.zeros(len(mean), np.int64))
+        return FilterState(carried, context, (), waiting, np.zeros(len(mean), np.int64))
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
         """The origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
@@ -147,7 +147,7 @@ class Filter:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
 
-    def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
+    def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
         events, without_covariance = filter_events(
             self.stage, self.found, block, state.context, self.settings
@@ -156,7 +156,9 @@ class Filter:
         after, made = self.through(state, events, is_end=False)
         return after, [*made, *passed_over]
 
-    def through(self, state: State, events: FilterEvents, *, is_end: bool) -> tuple[State, list[Ragged]]:
+    def through(
+        self, state: FilterState, events: FilterEvents, *, is_end: bool
+    ) -> tuple[FilterState, list[Ragged]]:
         """Filter the events that need not wait for others."""
         next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
@@ -220,11 +222,11 @@ class Filter:
         )
         return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What still waits for messages that do not come any more."""
         return self.ended(state)[1]
 
-    def ended(self, state: State) -> tuple[State, list[Ragged]]:
+    def ended(self, state: FilterState) -> tuple[FilterState, list[Ragged]]:
         """The state after what waits for messages that do not come any more, and its outputs."""
         made: list[Ragged] = []
         if state.unsettled is not None:
@@ -270,15 +272,15 @@ class Filter:
             return "its samples are random, so that a message that is used again gets others"
         return ""
 
-    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events."""
         after, estimated, made = self.filtered(state, events)
         states, *others = self.told(*estimated)
         return after, [issued(states, events, state.carried.time_ns), *others, *made]
 
     def filtered(
-        self, state: State, events: FilterEvents
-    ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
+        self, state: FilterState, events: FilterEvents
+    ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
         """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
         sensors = self.stage.sensors
         loop, steps = _compiled(self.stage, self.method)

@@ -29,9 +29,9 @@ from replay.inference.run.events import data_columns, filter_events
 from replay.inference.run.recursion import (
     CONTROL,
     NOTHING,
-    Carried,
     FilterEvents,
     Innovations,
+    RecursionState,
     fault_of,
     filled,
     processing,
@@ -42,7 +42,7 @@ BEFORE_ALL_NS = np.iinfo(np.int64).min
 Structure = tuple[tuple[str, Any], ...]
 
 
-class Kept(NamedTuple):
+class KeptMessages(NamedTuple):
     """Messages in order, and what they did; first axis = run and message.
 
     Attributes:
@@ -58,7 +58,7 @@ class Kept(NamedTuple):
     data: Floats
     target_id: Any
     position: Integers
-    after: Carried
+    after: RecursionState
     has_innovation: Booleans
     difference: Floats
     covariance: Floats
@@ -79,7 +79,7 @@ class History(NamedTuple):
     start_ns: Integers
     first: Integers
     counts: Integers
-    kept: Kept
+    kept: KeptMessages
 
     @property
     def capacity(self) -> int:
@@ -116,14 +116,14 @@ class History(NamedTuple):
         )
 
 
-def _no_history(stage: Stage, carried: Carried) -> History:
+def _no_history(stage: Stage, carried: RecursionState) -> History:
     """The priors alone, before all messages."""
     runs, innovation_size, (width, _) = (
         len(carried.time_ns),
         len(innovation_components(stage.sensors)),
         data_columns(stage),
     )
-    kept = Kept(
+    kept = KeptMessages(
         np.full(runs, BEFORE_ALL_NS),
         np.full(runs, NOTHING),
         np.zeros((runs, width)),
@@ -165,7 +165,7 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Funct
 def reprocessing(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
     """The loop over the events of one run in the order in which they came; see `recursion.recursion`.
 
-    `structure` is that of `Kept`.
+    `structure` is that of `KeptMessages`.
     """
     copy, restore = copying_rows(structure), copying_rows(dict(structure)["after"])
     passes_controls = model.control is not None and not model.control.estimates
@@ -197,8 +197,8 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         events: FilterEvents,
         settings: Floats,
         gates: Floats,
-        carried: Carried,
-        kept: Kept,
+        carried: RecursionState,
+        kept: KeptMessages,
         at: Integers,
         memory: Any,
     ) -> int:
@@ -225,7 +225,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         restore(carried, run, kept.after, row)
         return failure
 
-    def write_innovation(run: int, row: int, kept: Kept, innovations: Innovations) -> None:
+    def write_innovation(run: int, row: int, kept: KeptMessages, innovations: Innovations) -> None:
         """Fill in the innovation of a kept message."""
         if kept.has_innovation[row]:
             result = innovations.end[run]
@@ -241,7 +241,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
                 innovations.numbers[result, i] = kept.numbers[row, i]
             innovations.end[run] = result + 1
 
-    def newest_estimated(last: int, kept: Kept) -> int:
+    def newest_estimated(last: int, kept: KeptMessages) -> int:
         """The last row of the newest stamp at which there are estimates."""
         row = last
         while passes_controls and kept.source[row] == CONTROL:
@@ -256,7 +256,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         settings: Floats,
         gates: Floats,
         window_ns: int,
-        carried: Carried,
+        carried: RecursionState,
         history: History,
         estimates: Any,
         innovations: Innovations,

@@ -60,7 +60,7 @@ class FilterEvents(NamedTuple):
     arrival: Integers
 
 
-class Carried(NamedTuple):
+class RecursionState(NamedTuple):
     """What the recursion carries from block to block; first axis = run.
 
     Attributes:
@@ -150,7 +150,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     resumes_after_gap = steps.resumes_after_gap
     controls = stage.model.controls
 
-    def drive(run: int, data: Floats, carried: Carried) -> None:
+    def drive(run: int, data: Floats, carried: RecursionState) -> None:
         """The control from this event on, of what it has; an interpolated one stands at the end."""
         first = len(data) - controls if interpolated else 0
         for k in range(controls):
@@ -163,7 +163,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         duration_s: float,
         events: FilterEvents,
         settings: Floats,
-        carried: Carried,
+        carried: RecursionState,
         memory: Any,
     ) -> bool:
         """Predict to an event."""
@@ -181,7 +181,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         events: FilterEvents,
         settings: Floats,
         gates: Floats,
-        carried: Carried,
+        carried: RecursionState,
         innovations: Innovations,
         memory: Any,
     ) -> int:
@@ -236,7 +236,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         events: FilterEvents,
         settings: Floats,
         gates: Floats,
-        carried: Carried,
+        carried: RecursionState,
         estimates: Estimates,
         innovations: Innovations,
         memory: Any,

@@ -115,7 +115,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
                 for k in range(t):
                     entry -= turned[k, row] * cross[k, column]
                 rest[row, column] = rest[column, row] = entry
-        lengthen(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
+        compose(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
         belief.predictions[run] += 1
         find_slope(mean, covariance, belief.slope[run])
         for row in range(len(mean)):
@@ -160,7 +160,7 @@ def _with_memory(update: Function) -> Function:
     return update_filter
 
 
-def lengthen(
+def compose(
     gain: Floats, rest: Floats, predictions: int, next_gain: Floats, next_rest: Floats, product: Floats
 ) -> None:
     """Make one step of the steps so far and the next, which it uses up: G G1, and A + G A1 G'."""
@@ -230,12 +230,14 @@ class BackMemory(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def reprocessing(kinds: Kinds, correct: Correction | None = None) -> Function:
-    """The same over all runs, compiled; see `way_back`."""
-    return compile_over_runs(way_back(kinds, correct), allocates=False, title="a smoother's way back")
+def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> Function:
+    """The same over all runs, compiled; see `backward_pass`."""
+    return compile_over_runs(
+        backward_pass(kinds, correct), allocates=False, title="a smoother's way back"
+    )
 
 
-def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:
+def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
     """The loop over the nodes of one run, from its last to its first."""
     move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)

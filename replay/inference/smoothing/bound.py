@@ -47,8 +47,8 @@ from replay.inference.linear_algebra.gaussian import (
 )
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Carried, Estimates, FilterEvents, Innovations
+from replay.inference.run.filtering import Filter, FilterState
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
 from replay.inference.smoothing.backward_pass import solve_semidefinite
 
 
@@ -59,7 +59,7 @@ class BoundParameters(MethodParameters):
     gap_limit_s: PositiveFloat = 0.2
 
 
-class Along(NamedTuple):
+class TrueTrajectory(NamedTuple):
     """What is carried along the true trajectories; first axis = run.
 
     Attributes:
@@ -77,7 +77,7 @@ class Along(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Estimates as the recursion fills them in, with the step to each; see `Along`."""
+    """Estimates as the recursion fills them in, with the step to each; see `TrueTrajectory`."""
 
     end: Integers
     time_ns: Integers
@@ -106,36 +106,36 @@ def bound_steps(stage: Stage) -> Steps:
 
     def predict(
         run: int,
-        along: Along,
+        trajectory: TrueTrajectory,
         control: Floats,
         duration_s: float,
         parameters: Any,
         event: int,
         memory: BoundMemory,
     ) -> bool:
-        mean, work = along.mean[run], memory.work
+        mean, work = trajectory.mean[run], memory.work
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
-        multiply_into(work.transition, along.transition[run], work.product)
-        propagate_covariance(along.noise[run], work.transition, work.product)
-        add_noise(state, along.noise[run], duration_s, parameters, work)
-        propagate_covariance(along.covariance[run], work.transition, work.product)
-        add_noise(state, along.covariance[run], duration_s, parameters, work)
+        multiply_into(work.transition, trajectory.transition[run], work.product)
+        propagate_covariance(trajectory.noise[run], work.transition, work.product)
+        add_noise(state, trajectory.noise[run], duration_s, parameters, work)
+        propagate_covariance(trajectory.covariance[run], work.transition, work.product)
+        add_noise(state, trajectory.covariance[run], duration_s, parameters, work)
         for i in range(n):
             mean[i] = memory.truth[event, i]
         return True
 
-    def estimate(run: int, along: Along, nodes: Nodes, row: int, _: Any) -> None:
+    def estimate(run: int, trajectory: TrueTrajectory, nodes: Nodes, row: int, _: Any) -> None:
         for i in range(n):
-            nodes.mean[row, i] = along.mean[run, i]
+            nodes.mean[row, i] = trajectory.mean[run, i]
         for i in range(t):
             for j in range(t):
-                nodes.covariance[row, i, j] = along.covariance[run, i, j]
-                nodes.transition[row, i, j] = along.transition[run, i, j]
-                nodes.noise[row, i, j] = along.noise[run, i, j]
-                nodes.information[row, i, j] = along.information[run, i, j]
-                along.transition[run, i, j] = 1.0 if i == j else 0.0
-                along.noise[run, i, j] = along.information[run, i, j] = 0.0
+                nodes.covariance[row, i, j] = trajectory.covariance[run, i, j]
+                nodes.transition[row, i, j] = trajectory.transition[run, i, j]
+                nodes.noise[row, i, j] = trajectory.noise[run, i, j]
+                nodes.information[row, i, j] = trajectory.information[run, i, j]
+                trajectory.transition[run, i, j] = 1.0 if i == j else 0.0
+                trajectory.noise[run, i, j] = trajectory.information[run, i, j] = 0.0
 
     def memory(sets: tuple[Any, ...]) -> BoundMemory:
         sizes = [len(sensor.measured) for sensor in stage.sensors] or [0]
@@ -152,7 +152,7 @@ def _update(stage: Stage, number: int) -> Function:
 
     def update(
         run: int,
-        along: Along,
+        trajectory: TrueTrajectory,
         data: Floats,
         parameters: Any,
         gate: Floats,
@@ -160,7 +160,7 @@ def _update(stage: Stage, number: int) -> Function:
         memory: BoundMemory,
         record: InnovationRecord,
     ) -> int:
-        mean, covariance, work = along.mean[run], along.covariance[run], memory.work
+        mean, covariance, work = trajectory.mean[run], trajectory.covariance[run], memory.work
         if np.isnan(mean[0]):
             return NO_TRUTH
         innovate(mean, covariance, data, parameters, event, work)
@@ -179,7 +179,7 @@ def _update(stage: Stage, number: int) -> Function:
                 for j in range(m):
                     noise[j, size] = noise[j, i]
                 size += 1
-        add_information(along.information[run], work.rows, noise, size)
+        add_information(trajectory.information[run], work.rows, noise, size)
         drop_missing(innovation)
         for i in range(size):
             innovation.difference[i] = 0.0
@@ -261,7 +261,7 @@ def smooth(
                 here[row, column] += predicted[row, column]
 
 
-class Kept(NamedTuple):
+class BoundHistory(NamedTuple):
     """What is kept: the truths of all runs, which came to a node (runs,), and nodes to smooth."""
 
     truth: Ragged
@@ -286,16 +286,16 @@ class BoundFilter(Filter):
         """See `Filter.why_in_sequence`."""
         return "a bound is that of all messages in the order of their stamps"
 
-    def start(self, static: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, see `Filter.start`."""
         state = super().start(static)
         _, covariance = state.carried.belief
         runs, t, _ = covariance.shape
-        kept = Kept(static[self.truth], np.zeros(runs, bool))
+        kept = BoundHistory(static[self.truth], np.zeros(runs, bool))
         mean = self.truths(kept.truth, state.carried.time_ns, np.arange(runs + 1))
         unit, none = np.tile(np.eye(t), (runs, 1, 1)), np.zeros((2, runs, t, t))
-        along = Along(mean, covariance, unit, *none)
-        return state._replace(carried=state.carried._replace(belief=along), kept=kept)
+        trajectory = TrueTrajectory(mean, covariance, unit, *none)
+        return state._replace(carried=state.carried._replace(belief=trajectory), kept=kept)
 
     def truths(self, truth: Ragged, time_ns: Integers, offsets: Integers) -> Floats:
         """The true states (n, components) at stamps of the runs; NaN where there is none."""
@@ -311,8 +311,8 @@ class BoundFilter(Filter):
         return found
 
     def filtered(
-        self, state: State, events: FilterEvents
-    ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
+        self, state: FilterState, events: FilterEvents
+    ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
         """Go through events, with the truths at all of them."""
         truths = self.truths(state.kept.truth, events.time_ns, events.offsets)
         after, nodes, made = super().filtered(state._replace(generators=(truths,)), events)
@@ -331,7 +331,7 @@ class BoundFilter(Filter):
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
 
-    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Go through events; smoothed covariances have to wait for the end."""
         before, kept = state.carried, state.kept
         after, (nodes, offsets), made = self.filtered(state, events)
@@ -343,7 +343,7 @@ class BoundFilter(Filter):
             made.append(self.states(Estimates(*nodes[:4]), offsets))
         return after._replace(kept=kept), made
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for a control that does not come any more, and what is smoothed."""
         state, made = self.ended(state)
         if self.parameters.of == "smoother" and state.kept.nodes:
@@ -369,7 +369,9 @@ class BoundFilter(Filter):
         metadata = {**found.stream.metadata, "bound": self.parameters.of}
         return Ragged(replace(found.stream, metadata=metadata), found.offsets)
 
-    def begun(self, before: Carried, kept: Kept, nodes: Nodes, offsets: Integers) -> tuple[Kept, Ragged]:
+    def begun(
+        self, before: RecursionState, kept: BoundHistory, nodes: Nodes, offsets: Integers
+    ) -> tuple[BoundHistory, Ragged]:
         """The steps to the priors of runs that come to their first node: from nothing.
 
         The noise of such a step is the prior's covariance. Where the first node has the prior's stamp,

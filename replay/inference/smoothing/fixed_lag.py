@@ -13,7 +13,7 @@ from replay.engine.compiling.compile import compile_over_runs
 from replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
 from replay.inference.linear_algebra.manifold import boxminus, boxplus
 from replay.inference.run.recursion import Estimates
-from replay.inference.smoothing.backward_pass import BackMemory, Nodes, lengthen
+from replay.inference.smoothing.backward_pass import BackMemory, Nodes, compose
 
 
 class Window(NamedTuple):
@@ -128,4 +128,4 @@ def extend(
         for column in range(len(shift)):
             shift[row] += gain[row, column] * next_shift[column]
             work.rest[row, column] = next_rest[row, column]
-    lengthen(gain, rest, 1, next_gain, work.rest, work.product)
+    compose(gain, rest, 1, next_gain, work.rest, work.product)

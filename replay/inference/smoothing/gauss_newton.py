@@ -25,9 +25,21 @@ from replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian,
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.recursion import Carried, Estimates, FilterEvents, Innovations, recursion
+from replay.inference.run.recursion import (
+    Estimates,
+    FilterEvents,
+    Innovations,
+    RecursionState,
+    recursion,
+)
 from replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
-from replay.inference.smoothing.backward_pass import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
+from replay.inference.smoothing.backward_pass import (
+    FOREVER_NS,
+    ForwardMemory,
+    Later,
+    Nodes,
+    backward_pass,
+)
 
 SETTLED = 1e-10  # the largest last step, in standard deviations; and what of a state is round-off
 ROUNDING = 1e-15
@@ -71,7 +83,7 @@ def searching(stage: Stage) -> tuple[Function, Steps]:
 def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     """The search of one run's trajectory, for `replay.engine.compiling.compile.compile_over_runs`."""
     kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
-    follow, go_back = recursion(stage, steps, settings_of), way_back(("linear",) * t)
+    follow, go_back = recursion(stage, steps, settings_of), backward_pass(("linear",) * t)
     add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)
     flat, hold = is_flat(kinds), damped
 
@@ -81,7 +93,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         settings: Floats,
         gates: Floats,
         plan: Plan,
-        carried: Carried,
+        carried: RecursionState,
         nodes: Nodes,
         offsets: Integers,
         innovations: Innovations,
@@ -141,7 +153,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         settings: Floats,
         gates: Floats,
         plan: Plan,
-        carried: Carried,
+        carried: RecursionState,
         nodes: Nodes,
         offsets: Integers,
         innovations: Innovations,

@@ -27,7 +27,7 @@ from replay.inference.run.events import (
     output_times,
     select_events,
 )
-from replay.inference.run.filtering import State
+from replay.inference.run.filtering import FilterState
 from replay.inference.run.recursion import NOTHING, Estimates, FilterEvents, no_results
 from replay.inference.smoothing import smoothers
 from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
@@ -91,11 +91,11 @@ class IteratedSmoother(Smoother):
         """The whole run."""
         return FOREVER_NS
 
-    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Keep the events."""
         return state._replace(kept=(*state.kept, events)), []
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """The best trajectory, and how the search for it ended."""
         state, _ = self.ended(state)
         if not state.kept:
@@ -113,7 +113,7 @@ class IteratedSmoother(Smoother):
         states = self.states(found, ragged_rows(rows, offsets))
         return [states, *way.made, *self._told(ended, way)]
 
-    def smoothed_once(self, state: State) -> "Way":
+    def smoothed_once(self, state: FilterState) -> "Way":
         """The extended smoother's states at all stamps, from the prior's on."""
         events = reduce(join_events, (*self._first(state), *state.kept))
         run = np.repeat(np.arange(len(state.next_output)), np.diff(events.offsets))
@@ -132,7 +132,7 @@ class IteratedSmoother(Smoother):
         used = select_events(self._accepted(events, start_ns, made), known)
         return Way(used, node[known], nodes, offsets, states, wanted, made)
 
-    def _moved(self, state: State, way: "Way") -> Floats:
+    def _moved(self, state: FilterState, way: "Way") -> Floats:
         """The prior's means, moved along all of every run as if nothing was measured."""
         unseen = np.where(way.events.source >= 0, NOTHING, way.events.source)
         _, (moved, reached), _ = self.filtered(state, way.events._replace(source=unseen))
@@ -143,7 +143,7 @@ class IteratedSmoother(Smoother):
             )
         return moved.mean
 
-    def _first(self, state: State) -> list[FilterEvents]:
+    def _first(self, state: FilterState) -> list[FilterEvents]:
         """The prior's time as an event; an interpolated control has made one already."""
         control = self.stage.model.control
         if control is not None and control.interpolated:
@@ -170,7 +170,7 @@ class IteratedSmoother(Smoother):
             source[rows[accepted == 0]] = NOTHING
         return events._replace(source=source)
 
-    def _search(self, state: State, way: Way, scale: Floats) -> Ended:
+    def _search(self, state: FilterState, way: Way, scale: Floats) -> Ended:
         """Search the trajectories of all runs from the way's states, which they replace."""
         stage, asked = self.stage, self.parameters
         events, nodes, offsets, kept = way.events, way.nodes, way.offsets, way.states

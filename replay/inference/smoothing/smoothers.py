@@ -32,15 +32,15 @@ from replay.inference.kalman.steps import Steps
 from replay.inference.linear_algebra.manifold import is_flat
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, State
+from replay.inference.run.filtering import Filter, FilterState
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
     Nodes,
     back_memory,
+    backward_pass_over_runs,
     no_later,
-    reprocessing,
     smoothing_steps,
 )
 from replay.inference.smoothing.fixed_lag import Window, sliding_over_runs
@@ -135,7 +135,7 @@ class Smoother(Filter):
         """A smoother has its estimates from what came later in any case."""
         return "a smoother uses later messages in any case; replay it in the order of the stamps"
 
-    def start(self, static: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, see `Filter.start`."""
         state = super().start(static)
         mean, covariance = state.carried.belief
@@ -154,7 +154,7 @@ class Smoother(Filter):
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
 
-    def follow(self, state: State, events: FilterEvents) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events, and smooth what the lag lets go."""
         after, (nodes, offsets), made = self.filtered(state, events)
         new = Piece(nodes, offsets)
@@ -172,7 +172,7 @@ class Smoother(Filter):
         smoothed = self.states(*self.lagging(piece, window, stop))
         return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for later messages, and what those say of all before them."""
         state, made = self.ended(state)
         if self.lag_ns == FOREVER_NS:
@@ -223,7 +223,7 @@ class Smoother(Filter):
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            reprocessing(model.kinds, model.correct)(runs, *arguments, scratch=memory)
+            backward_pass_over_runs(model.kinds, model.correct)(runs, *arguments, scratch=memory)
         return smoothed, offsets
 
 
