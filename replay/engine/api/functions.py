@@ -128,7 +128,7 @@ def recursive(
         if follow_all is not None:
             follow_all(*arguments, *([generators] if draws else []))
         else:
-            loop()(len(generators), *arguments, own=generators if draws else None)
+            loop()(len(generators), *arguments, per_run=generators if draws else None)
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         made = Outputs(

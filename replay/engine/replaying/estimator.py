@@ -16,7 +16,7 @@ from recorders.errors import BadInput
 from recorders.log import Clock, Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
-from replay.engine.compiling.bundling import DoesNotCompile
+from replay.engine.compiling.kernel_source import DoesNotCompile
 from replay.engine.renamed import renamed
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.sources import Source, ensemble_of

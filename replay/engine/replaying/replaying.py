@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.log import Clock
 from replay.engine.replaying.estimator import Batch, Bound, Recursive, code_of
 from replay.engine.replaying.late import Late, taking_late
-from replay.engine.replaying.supervision import Watch
+from replay.engine.replaying.monitor import RunMonitor
 from replay.engine.replaying.usage import Usage
 from replay.engine.streams.blocks import Block, Ragged, gather, join, merge_events
 from replay.engine.streams.priors import start_of_runs
@@ -70,7 +70,7 @@ def replay(
         is_part: whether there are more runs than these. Then it is no bad input that an estimator can
             follow none of them: they fail, and the report says so.
 
-    A run that an estimator cannot follow fails alone, see `replay.engine.replaying.supervision`; the
+    A run that an estimator cannot follow fails alone, see `replay.engine.replaying.monitor`; the
     failures come last.
     Raises BadInput where an estimator can follow no run, no run has a message for it, a run's span
     begins after the prior of an estimator (see `pipeline.runs.initial_states`), or it cannot do as
@@ -87,46 +87,46 @@ def replay(
         _refuse_old_priors(bound, ensemble, static, order)
         _refuse_asymmetric_priors(bound, ensemble, static)
     stamps: Clock = order if late is None else "publish_time"
-    watches = [
-        Watch(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
+    monitors = [
+        RunMonitor(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
     ]
-    for watch, static in zip(watches, statics, strict=True):
-        watch.static = static
-        watch.usage.note_start(static)
+    for monitor, static in zip(monitors, statics, strict=True):
+        monitor.static = static
+        monitor.usage.note_start(static)
     told: list[Ragged] = []
     initialization = partial(_open, ensemble, order, stamps, told)
-    states, refused = _start(estimators, watches, statics, initialization)
+    states, refused = _start(estimators, monitors, statics, initialization)
     if refused and not is_part:
         raise next(iter(refused.values()))
     if told:
         yield told
-    for bound, watch, given in zip(estimators, watches, states, strict=True):
+    for bound, monitor, given in zip(estimators, monitors, states, strict=True):
         if isinstance(bound, Batch):
             for block in _required(ensemble, bound.streams, order, sys.maxsize):
-                yield watch.receive(watch.take(partial(_solve, bound, given), block))
+                yield monitor.receive(monitor.take(partial(_solve, bound, given), block))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
     for block in _required(ensemble, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
-        for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
+        for index, (bound, monitor) in enumerate(zip(estimators, monitors, strict=True)):
             if isinstance(bound, Recursive):
                 streams = {topic: block[topic] for topic in bound.streams}
                 work = partial(_advance, bound, states[index], order)
-                states[index], produced = watch.take(work, streams)
-                outputs += watch.receive(produced)
+                states[index], produced = monitor.take(work, streams)
+                outputs += monitor.receive(produced)
         yield outputs
-    for bound, watch, state in zip(estimators, watches, states, strict=True):
+    for bound, monitor, state in zip(estimators, monitors, states, strict=True):
         if isinstance(bound, Recursive) and bound.finish is not None and state is not _REFUSED:
-            yield watch.receive(watch.take(partial(_finish, bound, bound.finish, state), {}))
-    yield [failures for watch in watches for failures in watch.finish()]
+            yield monitor.receive(monitor.take(partial(_finish, bound, bound.finish, state), {}))
+    yield [failures for monitor in monitors for failures in monitor.finish()]
     if report is not None:
         report.refused |= refused
-        for watch in watches:
-            if watch.refused is not None:
-                report.refused[watch.name] = watch.refused
-            report.seconds[watch.name.partition("/")[0]] += watch.seconds
-            report.coverage += watch.coverage()
-            report.usages[watch.name] = watch.usage
+        for monitor in monitors:
+            if monitor.refused is not None:
+                report.refused[monitor.name] = monitor.refused
+            report.seconds[monitor.name.partition("/")[0]] += monitor.seconds
+            report.coverage += monitor.coverage()
+            report.usages[monitor.name] = monitor.usage
 
 
 def _open(
@@ -151,7 +151,7 @@ def _open(
 
 def _start(
     estimators: Sequence[Bound],
-    watches: Sequence[Watch],
+    monitors: Sequence[RunMonitor],
     statics: Sequence[Mapping[str, Ragged]],
     initialization: Callable[[Bound, Mapping[str, Ragged]], dict[str, Ragged]],
 ) -> tuple[list[Any], dict[str, BadInput]]:
@@ -162,17 +162,17 @@ def _start(
     """
     states: list[Any] = []
     told_of: dict[str, list[BadInput | None]] = {}
-    for bound, watch, static in zip(estimators, watches, statics, strict=True):
+    for bound, monitor, static in zip(estimators, monitors, statics, strict=True):
         told = told_of.setdefault(bound.name.partition("/")[0], [])
         try:
             given, unable = start_of_runs({**static, **initialization(bound, static)}, bound.priors)
-            watch.exclude(unable)
+            monitor.exclude(unable)
             with code_of(bound.name):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))
-            starts = len(unable) < watch.runs
+            starts = len(unable) < monitor.runs
             told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
         except BadInput as error:
-            watch.exclude(dict.fromkeys(range(watch.runs), str(error)))
+            monitor.exclude(dict.fromkeys(range(monitor.runs), str(error)))
             states.append(_REFUSED)
             told.append(error)
     refused = {

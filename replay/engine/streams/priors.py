@@ -65,8 +65,8 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
             )
         time_ns[present] = stream.publish_time_ns[first]
         mean[present] = stream["mean"][first][:, layout.columns]
-        static = stream["covariance"][first].reshape(-1, size, size)
-        covariance[present] = static[:, layout.rows][:, :, layout.rows]
+        whole = stream["covariance"][first].reshape(-1, size, size)
+        covariance[present] = whole[:, layout.rows][:, :, layout.rows]
     finite = np.isfinite(mean.sum(axis=1) + covariance.sum(axis=(1, 2)))
     usable = finite & is_positive_definite(covariance)
     if not usable.all():
@@ -117,7 +117,7 @@ def start_of_runs(
     """What an estimator starts from, and why some runs cannot start.
 
     Args:
-        static: static topics of all runs.
+        static: topics of all runs.
         priors: which of them are priors, and the components that are wanted of each.
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their

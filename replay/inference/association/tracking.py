@@ -509,7 +509,9 @@ def writing_tracks(stage: Stage) -> Function:
     """`write_tracks(run, scan, tracks, outputs, memory)`: the confirmed tracks."""
     belief_of, estimate = believing(stage), moving(stage).estimate
 
-    def write_tracks(run: int, scan: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory) -> None:
+    def write_tracks(
+        run: int, scan: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
+    ) -> None:
         """Tell the confirmed tracks as they are now."""
         belief = belief_of(run, tracks)
         rows = Rows(outputs.mean[run], outputs.covariance[run], outputs.probability[run])
@@ -599,7 +601,9 @@ def of_last(scans: Scans, outputs: TrackOutputs) -> tuple[Scans, TrackOutputs]:
     last = len(scans.time_ns) - 1
     count, (end, paired) = max(int(outputs.confirmed[last]), 0), outputs.end[0]
     is_of_it = outputs.pair[0, :paired, 1] == last
-    by_scan = {name: getattr(outputs, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
+    by_scan = {
+        name: getattr(outputs, name)[last:] for name in ("confirmed", "approximated", "turned_away")
+    }
     by_track = {name: getattr(outputs, name)[:, end - count : end] for name in BY_TRACK}
     return take_scans(scans, np.array([last])), TrackOutputs(
         end=np.array([[count, int(is_of_it.sum())]]),

@@ -22,7 +22,7 @@ from replay.engine.api.outputs import Estimates, Results
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.replaying.estimator import Batch, Estimator, Recursive
 from replay.engine.replaying.replaying import Report, collect, replay
-from replay.engine.replaying.supervision import find_unsound
+from replay.engine.replaying.soundness import find_unsound
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import Failure, failure_stream, sentences_of
 from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source

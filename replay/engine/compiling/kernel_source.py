@@ -25,7 +25,7 @@ class DoesNotCompile(BadInput):
     """What numba says of a function that it cannot compile, and of which line."""
 
 
-class Bundle:
+class KernelSource:
     """Sources in the order they are needed, each under a name that says what it is.
 
     The name has the hash of the source, in which the names of all that it needs stand: two closures of
