@@ -18,11 +18,11 @@ from recorders.registry import available, load
 from replay.engine.replaying.estimator import Estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
+from replay.inference.formulas import formulas, formulas_by_function
 from replay.inference.model.binding import serving
-from replay.inference.model.formulas import formulas, formulas_by_function
-from replay.inference.model.model import Model, ModelParameters
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.requirements import requirements_of
+from replay.inference.model.model import Model
+from replay.inference.model.parameters import ModelParameters, number_fields
+from replay.inference.requirements import requirements_of
 from replay.judging.metrics.measuring import Metric
 
 

@@ -20,7 +20,7 @@ from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model.binding import topics_of
 from replay.inference.model.model import Model
-from replay.inference.model.requirements import OWN_MODEL, names_state, nearest, nearest_parts
+from replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
 
 def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:

@@ -26,19 +26,20 @@ from replay.inference.model.augmentation import (
     with_gauss_markov,
 )
 from replay.inference.model.binding import Found, roles_of, topics_of
-from replay.inference.model.model import Model, ModelParameters, Motion
-from replay.inference.model.requirements import (
+from replay.inference.model.model import Model, Motion
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.settings import (
+    assumed_of,
+    settings_of,
+)
+from replay.inference.model.stage import Stage, stage_of
+from replay.inference.requirements import (
     OWN_MODEL,
     elsewhere,
     names_state,
     nearest,
     requirements_of,
 )
-from replay.inference.model.settings import (
-    assumed_of,
-    settings_of,
-)
-from replay.inference.model.stage import Stage, stage_of
 from replay.inference.run.filtering import Filter, samplers_of
 from replay.inference.run.initialization import Initializer
 from replay.inference.run.out_of_sequence import OutOfSequenceFilter

@@ -15,7 +15,8 @@ from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_
 from recorders.models.planar import Components
 from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 STATES = 4
 

@@ -18,7 +18,9 @@ from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE
 from replay.engine.vectors.tangent import Kind
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Control, Map, Model, ModelParameters, Motion, Sensor, Start
+from replay.inference.model.model import Control, Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start
 
 POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE)

@@ -26,7 +26,8 @@ from recorders.models.optical import (
 from recorders.models.planar import Component, Components
 from replay.engine.streams.measurements import SPACE
 from replay.engine.vectors.tangent import Kind
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 
 class MovingSightParameters(ModelParameters):

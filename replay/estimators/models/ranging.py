@@ -20,7 +20,9 @@ from recorders.models.planar import Components
 from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import SPACE
 from replay.engine.vectors.tangent import Kind
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 HEADINGS = 8  # from which a pose is sought
 _NS = 1e-9

@@ -22,7 +22,9 @@ from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE
 from replay.estimators.localization.rays import intersect_rays
 from replay.inference.linear_algebra.gaussian import LOG_TWO_PI
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 _NS = 1e-9
 HALF_TURN = float(np.pi)

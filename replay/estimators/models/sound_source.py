@@ -17,7 +17,9 @@ from recorders.models.planar import Components
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.measurements import SPACE
 from replay.estimators.models.ranging import distance
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 # A source is sought on a grid about the microphones, so many times as large as they are apart, and from
 # the best of its points on.

@@ -30,7 +30,8 @@ from replay.estimators.navigation.samples import (
     read_samples,
     stated_or,
 )
-from replay.inference.model.model import ModelParameters, Started
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Started
 from replay.inference.run.initialization import WIDER
 
 LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows

@@ -23,7 +23,9 @@ from replay.estimators.navigation.navigation import UNIT as CARRIED
 from replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
 from replay.estimators.orientation.orientation import ORIENTATION
 from replay.estimators.orientation.triad import triad
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 PERIOD_NS = 1_000_000_000
 BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}

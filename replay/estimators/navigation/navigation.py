@@ -28,7 +28,8 @@ from replay.estimators.navigation.alignment import (
 )
 from replay.estimators.navigation.sensors import carried_sensors
 from replay.estimators.navigation.turning import WITH_HEADING
-from replay.inference.model.model import Control, Model, Motion, Sensor, Start
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.start import Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}

@@ -12,8 +12,8 @@ from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.results import innovation_stream, named
 from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import Found
-from replay.inference.association.scanning import Scans
-from replay.inference.association.tracking import TrackOutputs
+from replay.inference.association.outputs import TrackOutputs
+from replay.inference.association.scans import Scans
 from replay.inference.association.tracks import NEVER
 from replay.inference.model.stage import Stage
 

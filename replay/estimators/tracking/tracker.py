@@ -37,7 +37,7 @@ from replay.estimators.tracking.targets import Targets, targets_of
 from replay.estimators.tracking.track_smoother import smoothing_tracks
 from replay.estimators.tracking.tracker_run import Setup, run, run_out_of_sequence, start
 from replay.inference.association.scanning import measuring
-from replay.inference.association.tracking import Tracker
+from replay.inference.association.tracker import Tracker
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.stage import stage_of
 

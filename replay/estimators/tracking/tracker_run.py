@@ -10,8 +10,10 @@ from replay.engine.streams.blocks import Block, Ragged, gather, join
 from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import Fixes, Found, latest_fixes, scans_of
 from replay.estimators.tracking.track_outputs import track_outputs
-from replay.inference.association.scanning import Scans, in_time, take_scans
-from replay.inference.association.tracking import Newborn, Tracker, TrackOutputs, of_last, track_scans
+from replay.inference.association.outputs import TrackOutputs, of_last
+from replay.inference.association.scans import Scans, in_time, take_scans
+from replay.inference.association.tracker import Newborn, Tracker
+from replay.inference.association.tracking import track_scans
 from replay.inference.association.tracks import Tracks, no_tracks
 
 

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.association.association import Weights, existence_after
+from replay.inference.association.association import existence_after
+from replay.inference.association.clusters import Weights
 from replay.inference.association.tracks import Tracks
 
 # A miss says nothing of a young track where the sensor detects less than every second target.

@@ -48,10 +48,11 @@ from replay.inference.linear_algebra.gaussian import (
 )
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.corrections import correcting, relinearising, sloping
-from replay.inference.model.model import Model, trial_state
+from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import trial_parameters
 from replay.inference.model.stage import Stage, traced_sensor
+from replay.inference.model.validation import trial_state
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
 

@@ -124,9 +124,8 @@ def inflation(squared: float, size: int, parameters: Any) -> float:
     """How many times larger the covariance of an innovation counts, of a NIS and so many components.
 
     To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
-    a Kalman update still. 1 where no option of `replay.inference.model.model.ModelParameters` is given:
-    those
-    are NaN then. The largest of those given holds:
+    a Kalman update still. 1 where no option of `replay.inference.model.parameters.ModelParameters` is
+    given: those are NaN then. The largest of those given holds:
 
     - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
     - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,

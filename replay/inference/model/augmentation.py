@@ -26,7 +26,7 @@ from replay.inference.model.gauss_markov import (
     remaining_share,
     with_gauss_markov_parameters,
 )
-from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import number_fields, settings_type
 from replay.inference.model.point_errors import (
     Errors,
@@ -38,6 +38,7 @@ from replay.inference.model.point_errors import (
 )
 from replay.inference.model.settings import TracedParameters
 from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 Start = Callable[[Mapping[str, Ragged]], Any]

@@ -20,11 +20,9 @@ from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.manifold import boxminus, boxplus, manifold_blocks, tangent_size
 from replay.inference.linear_algebra.tuples import adding_noise
 from replay.inference.model.augmentation import check_augmentable
-from replay.inference.model.model import (
-    Correction,
-    Model,
-    Motion,
-    Sensor,
+from replay.inference.model.model import Correction, Model, Motion, Sensor
+from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.model.validation import (
     check_correction,
     check_motion,
     check_sensor,
@@ -32,7 +30,6 @@ from replay.inference.model.model import (
     check_switching,
     switching_of,
 )
-from replay.inference.model.parameters import number_fields, settings_type
 from replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200

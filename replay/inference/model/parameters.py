@@ -2,7 +2,9 @@
 
 from collections import namedtuple
 from functools import cache, lru_cache
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, PositiveFloat
 
 from recorders.parameters import Parameters
 
@@ -23,3 +25,25 @@ def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
 def settings_type(names: tuple[str, ...]) -> type[Any]:
     """The NamedTuple that model functions get as their parameters."""
     return namedtuple("Settings", names)
+
+
+class ModelParameters(Parameters):
+    """Options of every model.
+
+    A parameter that is none is what the channels of the log state: the sensor's own first, then those
+    of control, prior and the other sensors.
+    """
+
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
+    gate_reopens_s: PositiveFloat | None = None
+    """The gate is open for a sensor whose last accepted measurement is older, so that a filter that has
+    drifted, as in an outage, accepts what brings it back."""
+    inflate_nis: PositiveFloat | None = None
+    """An innovation with a greater NIS counts with a larger covariance, which gives it this NIS."""
+    student_freedom: PositiveFloat | None = None
+    """Innovations count as if they had Student's distribution with so many degrees of freedom."""
+    switch_nis: PositiveFloat | None = None
+    """Above this NIS a measurement counts less and less, as in dynamic covariance scaling."""
+    sigma_fix_m: PositiveFloat | None = None
+    """Standard deviation, in m, of each component of a fix that does not state its covariance."""

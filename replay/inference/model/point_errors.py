@@ -21,8 +21,9 @@ from replay.inference.model.gauss_markov import (
     remaining_share,
     with_gauss_markov_parameters,
 )
-from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.settings import trial_parameters
+from replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 

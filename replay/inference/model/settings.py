@@ -11,10 +11,10 @@ from recorders.log import Topic
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.channels import stated
 from replay.inference.model.binding import Found
-from replay.inference.model.model import (
-    Model,
-    ModelParameters,
-    Sensor,
+from replay.inference.model.model import Model, Sensor
+from replay.inference.model.parameters import ModelParameters, number_fields, settings_type
+from replay.inference.model.stage import Stage
+from replay.inference.model.validation import (
     check_correction,
     check_motion,
     check_sensor,
@@ -22,8 +22,6 @@ from replay.inference.model.model import (
     check_switching,
     switching_of,
 )
-from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.stage import Stage
 
 
 @lru_cache(maxsize=64)

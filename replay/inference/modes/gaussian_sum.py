@@ -35,7 +35,8 @@ from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
-from replay.inference.modes.imm import MixtureFilter, Mixtures, likeliest_of, mixing, mixture_update
+from replay.inference.modes.mixing import likeliest_of, mixing
+from replay.inference.modes.mixture import MixtureFilter, Mixtures, mixture_update
 from replay.inference.run.filtering import FilterState
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's

@@ -13,20 +13,16 @@ mode that fits badly lie below the smallest number.
 Blom and Bar-Shalom, IEEE TAC 33(8), 1988; smoothed probabilities: Kim, Journal of Econometrics 60, 1994.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import field_validator
 
-from recorders.log import make_stream, schemas
-from replay.engine.arrays import Floats, Function, Integers
-from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.arrays import Floats, Function
 from replay.engine.streams.blocks import Ragged, join
-from replay.engine.streams.results import ALL_WELL, named
 from replay.inference.kalman.methods import (
     FILTERS,
     Method,
@@ -37,27 +33,24 @@ from replay.inference.kalman.methods import (
     no_steps,
 )
 from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
-from replay.inference.kalman.update import innovation_components, writing_innovation
-from replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
-from replay.inference.linear_algebra.manifold import (
-    boxminus,
-    boxplus,
-    by_right_jacobian,
-    is_flat,
-    tangent_size,
-)
-from replay.inference.linear_algebra.tuples import filling, range_of, total
-from replay.inference.model.model import Model, switching_of
+from replay.inference.kalman.update import innovation_components
+from replay.inference.linear_algebra.tuples import filling
+from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, FilterState
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
-
-TINY = 1e-280  # below it a probability loses digits
-LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
-
-Matrix = tuple[tuple[float, ...], ...]  # its rows
+from replay.inference.model.validation import switching_of
+from replay.inference.modes.mixing import InteractingMemory, mixing, mixing_weights, transition_matrix
+from replay.inference.modes.mixture import (
+    MixtureFilter,
+    Mixtures,
+    ModeBelief,
+    mixture_update,
+    predicting,
+)
+from replay.inference.modes.mode_smoothing import smoothing_memory, smoothing_over_runs
+from replay.inference.run.filtering import FilterState
+from replay.inference.run.recursion import FilterEvents
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):
@@ -78,58 +71,6 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):
 
 
 # The steps
-
-
-class ModeBelief(NamedTuple):
-    """What is believed of the states, first axis = run: a Gaussian for each of M modes.
-
-    Attributes:
-        mean, covariance: (runs, M, n), (runs, M, t, t).
-        probability, log_probability: (runs, M), of the modes.
-    """
-
-    mean: Floats
-    covariance: Floats
-    probability: Floats
-    log_probability: Floats
-
-
-class Mixtures(NamedTuple):
-    """Estimates as the filter fills them in, see `recursion.Estimates`; and the modes' probabilities."""
-
-    end: Integers
-    time_ns: Integers
-    mean: Floats
-    covariance: Floats
-    probability: Floats
-
-
-class InteractingMemory(NamedTuple):
-    """What the steps of one core work in.
-
-    Attributes:
-        filters: the memory of every mode's filter.
-        rates, transition: (M (M - 1),), and Pi (M, M).
-        weights: (M, M), row j those of all modes in the mixture of mode j.
-        predicted: (M,), the logarithms of c.
-        centre: (n,), the mean in whose tangent space mixtures are made.
-        away, carried: (M, t), (M, t, t), the modes' Gaussians there.
-        shift: (t,), of a mixture.
-        records: what every mode's update tells, first axis = mode.
-        open_gate: (m + 1,), bounds that let everything in.
-    """
-
-    filters: tuple[Any, ...]
-    rates: Floats
-    transition: Floats
-    weights: Floats
-    predicted: Floats
-    centre: Floats
-    away: Floats
-    carried: Floats
-    shift: Floats
-    records: InnovationRecord
-    open_gate: Floats
 
 
 def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
@@ -224,360 +165,10 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     return Steps(memory, predict, updates, estimate, sampled, resumes_after_gap)
 
 
-def predicting(filters: Sequence[Steps]) -> Function:
-    """`predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
-    predictions = tuple(each.predict for each in filters)
-
-    def predict(
-        belief: Any,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memories: Any,
-    ) -> bool:
-        well = True
-        for mode in range_of(len(predictions)):
-            predict_mode, memory = predictions[mode], memories[mode]
-            well = (
-                predict_mode(mode, belief, control, duration_s, parameters, sample_index, memory)
-                and well
-            )
-        return well
-
-    return predict
-
-
-def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function:
-    """The update of several Gaussians by sensor `number`, and of the probabilities of their modes.
-
-    `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
-    measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
-    do not compare. The innovation that is told is that of the mixture, whose covariance has the spread
-    of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
-    """
-    components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
-    places = tuple(components.index(name) for name in measured)
-    angular = tuple(kind == "angle" for kind in measured.values())
-    m, write_innovation = len(measured), writing_innovation(stage, number)
-
-    def blend(probability: Floats, memory: Any, record: InnovationRecord) -> float:
-        """Note the innovation of the mixture of all modes; returns its NIS."""
-        innovation, records = memory.filters[0].innovations[number], memory.records
-        difference, covariance, _ = innovation
-        for i in range(m):
-            first = records.difference[0, places[i]]
-            difference[i] = first
-            for mode in range(1, len(probability)):
-                away = wrap(records.difference[mode, places[i]] - first, angular[i])
-                difference[i] += probability[mode] * away
-        for i in range(m):
-            for j in range(i + 1):
-                entry, row, column = 0.0, places[i], places[j]
-                for mode in range(len(probability)):
-                    spread = wrap(records.difference[mode, row] - difference[i], angular[i])
-                    spread *= wrap(records.difference[mode, column] - difference[j], angular[j])
-                    entry += probability[mode] * (records.covariance[mode, row, column] + spread)
-                covariance[i, j] = covariance[j, i] = entry
-        write_innovation(innovation, record)
-        return whiten(innovation, drop_missing(innovation))[0]
-
-    def update(
-        gaussians: Gaussian,
-        weights: tuple[Floats, Floats],
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
-        memory: Any,
-        record: InnovationRecord,
-    ) -> int:
-        probability, log_probability = weights
-        numbers, taken = memory.records.numbers, 0
-        for mode in range(len(probability)):
-            numbers[mode, 2] = 0.0
-        for bounds in (gate, memory.open_gate):
-            for mode in range(len(probability)):
-                if numbers[mode, 2] == 0.0:
-                    own = InnovationRecord(
-                        memory.records.difference[mode], memory.records.covariance[mode], numbers[mode]
-                    )
-                    outcome = update_mode(
-                        mode, gaussians, data, parameters, bounds, sample_index, memory.filters[0], own
-                    )
-                    if outcome != ALL_WELL:
-                        return outcome
-                    taken += int(numbers[mode, 2])
-            if taken == 0:
-                break
-        record.numbers[0] = blend(probability, memory, record)
-        record.numbers[1] = 0.0
-        record.numbers[2] = 1.0 if taken else 0.0
-        if taken:
-            record.numbers[1] = reweigh_modes(probability, log_probability, numbers)
-        return ALL_WELL
-
-    def reweigh_modes(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
-        """Weigh the modes by their likelihoods; returns the logarithm of the whole."""
-        highest, total = -np.inf, 0.0
-        for mode in range(len(probability)):
-            log_probability[mode] += numbers[mode, 1]
-            highest = max(highest, log_probability[mode])
-        for mode in range(len(probability)):
-            probability[mode] = np.exp(log_probability[mode] - highest)
-            total += probability[mode]
-        likelihood = highest + np.log(total)
-        for mode in range(len(probability)):
-            log_probability[mode] -= likelihood
-            probability[mode] /= total
-        return likelihood
-
-    return update
-
-
 # The probabilities of modes
 
 
-@lru_cache(maxsize=16)
-def transition_matrix(modes: int) -> Function:
-    """`fill_transition(rates, duration_s, transition)`: fills Pi = expm(rates dt), by uniformisation.
-
-    With L dt added to its diagonal, L the fastest rate at which a mode is left, the matrix has no
-    negative entry, so that no digit is lost; exp(-L dt) takes it back. The duration is halved until the
-    series is short, and the result squared as often; what that leaves of the rows' sums is one.
-    """
-    changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
-    rate_of = tuple(
-        tuple(changes.index((begin, end)) if begin != end else -1 for end in range(modes))
-        for begin in range(modes)
-    )
-    identity = tuple(tuple(float(i == j) for j in range(modes)) for i in range(modes))
-
-    def fill_transition(rates: Floats, duration_s: float, transition: Floats) -> None:
-        leaving = tuple(total(tuple(rates[each] for each in row if each >= 0)) for row in rate_of)
-        fastest = max(*leaving)
-        span_s, doublings = duration_s, 0
-        while fastest * span_s > LONGEST:
-            span_s, doublings = 0.5 * span_s, doublings + 1
-        a = tuple(
-            tuple(
-                span_s * (rates[rate_of[i][j]] if i != j else fastest - leaving[i]) for j in range(modes)
-            )
-            for i in range(modes)
-        )
-        p = identity
-        for power in range(TERMS, 0, -1):  # I + A (I + A / 2 (I + A / 3 ...))
-            scale, times = 1.0 / power, matrix_product(a, p)
-            p = tuple(
-                tuple(identity[i][j] + scale * times[i][j] for j in range(modes)) for i in range(modes)
-            )
-        factor = np.exp(-fastest * span_s)
-        p = tuple(tuple(factor * each for each in row) for row in p)
-        for _ in range(doublings):
-            p = matrix_product(p, p)
-        for i, row in enumerate(p):
-            whole = total(row)
-            for j, entry in enumerate(row):
-                transition[i, j] = entry / whole
-
-    return fill_transition
-
-
-def matrix_product(left: Matrix, right: Matrix) -> Matrix:
-    """The product of two matrices."""
-    return tuple(
-        tuple(
-            total(tuple(row[k] * right[k][j] for k in range(len(right)))) for j in range(len(right[0]))
-        )
-        for row in left
-    )
-
-
-def mixing_weights(modes: int) -> Function:
-    """`fill_weights(probability, log_probability, memory)`: the probabilities become c.
-
-    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still tell
-    it; a mode that none with any probability leads to keeps its own Gaussian.
-    """
-
-    def weigh_by_logarithms(end: int, log_probability: Floats, memory: InteractingMemory) -> float:
-        weights, transition = memory.weights, memory.transition
-        highest, total = -np.inf, 0.0
-        for begin in range(modes):
-            weights[end, begin] = 1.0 if begin == end else 0.0
-            if transition[begin, end] > 0.0:
-                highest = max(highest, log_probability[begin])
-        if highest == -np.inf:
-            return highest
-        for begin in range(modes):
-            weights[end, begin] = transition[begin, end]
-            if transition[begin, end] > 0.0:
-                weights[end, begin] *= np.exp(log_probability[begin] - highest)
-            total += weights[end, begin]
-        for begin in range(modes):
-            weights[end, begin] /= total
-        return highest + np.log(total)
-
-    def fill_weights(probability: Floats, log_probability: Floats, memory: InteractingMemory) -> None:
-        weights, predicted = memory.weights, memory.predicted
-        for end in range(modes):
-            total = 0.0
-            for begin in range(modes):
-                weights[end, begin] = probability[begin] * memory.transition[begin, end]
-                total += weights[end, begin]
-            if total < TINY:
-                predicted[end] = weigh_by_logarithms(end, log_probability, memory)
-                continue
-            predicted[end] = np.log(total)
-            for begin in range(modes):
-                weights[end, begin] /= total
-        for mode in range(modes):
-            log_probability[mode] = predicted[mode]
-            probability[mode] = np.exp(predicted[mode])
-
-    return fill_weights
-
-
-def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
-    """Make the two halves of mixing the Gaussians of all modes.
-
-    Returns `to_common_tangent(mean, covariance, probability, memory)`, which carries them to the tangent
-    space of the likeliest, and `mix(weights, memory, mean, covariance)`, which fills mean and covariance
-    of a mixture of them.
-    """
-    add, subtract, flat = boxplus(kinds), boxminus(kinds), is_flat(kinds)
-    reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
-    n, t = len(kinds), tangent_size(kinds)
-
-    def to_common_tangent(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
-        likeliest = likeliest_of(probability)
-        centre, away = memory.centre, memory.away
-        for row in range(n):
-            centre[row] = mean[likeliest, row]
-        for mode in range(len(probability)):
-            carried = memory.carried[mode]
-            subtract(mean[mode], centre, away, mode)
-            for row in range(t):
-                for column in range(t):
-                    carried[row, column] = covariance[mode, row, column]
-            if not flat:
-                reset_back(away[mode], carried)
-                reset_back(away[mode], carried.T)
-
-    def mix(weights: Floats, memory: Any, mean: Floats, covariance: Floats) -> None:
-        away, carried, shift = memory.away, memory.carried, memory.shift
-        for row in range(t):
-            entry = 0.0
-            for mode in range(len(weights)):
-                entry += weights[mode] * away[mode, row]
-            shift[row] = entry
-        for row in range(t):
-            for column in range(row + 1):
-                entry = 0.0
-                for mode in range(len(weights)):
-                    spread = (away[mode, row] - shift[row]) * (away[mode, column] - shift[column])
-                    entry += weights[mode] * (carried[mode, row, column] + spread)
-                covariance[row, column] = covariance[column, row] = entry
-        for row in range(n):
-            mean[row] = memory.centre[row]
-        add(mean, shift)
-        if not flat:
-            reset(shift, covariance)
-            reset(shift, covariance.T)
-
-    return to_common_tangent, mix
-
-
-def likeliest_of(probability: Floats) -> int:
-    """The first mode than which none is more probable."""
-    likeliest = 0
-    for mode in range(1, len(probability)):
-        if probability[mode] > probability[likeliest]:
-            likeliest = mode
-    return likeliest
-
-
-class SmoothingMemory(NamedTuple):
-    """What smoothing of one core works in: Pi (M, M), and the ratios of smoothed and predicted (M,)."""
-
-    transition: Floats
-    ratio: Floats
-
-
-def smoothing_memory(modes: int) -> SmoothingMemory:
-    """Memory for the smoothing of so many modes' probabilities."""
-    return SmoothingMemory(np.empty((modes, modes)), np.empty(modes))
-
-
-@lru_cache(maxsize=16)
-def _smoothing(modes: int) -> Function:
-    return compile_over_runs(smoothing(modes), allocates=False, title="the smoother of modes")
-
-
-def smoothing(modes: int) -> Function:
-    """`smooth(run, ...)`: probabilities (n, M) given the data so far become those given all of the run.
-
-    mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).
-    """
-    fill_transition = transition_matrix(modes)
-
-    def smooth(
-        run: int,
-        offsets: Integers,
-        time_ns: Integers,
-        rates: Floats,
-        probability: Floats,
-        memory: SmoothingMemory,
-    ) -> None:
-        transition, ratio = memory
-        for row in range(offsets[run + 1] - 2, offsets[run] - 1, -1):
-            fill_transition(rates, (time_ns[row + 1] - time_ns[row]) * 1e-9, transition)
-            for end in range(modes):
-                predicted = 0.0
-                for begin in range(modes):
-                    predicted += probability[row, begin] * transition[begin, end]
-                ratio[end] = probability[row + 1, end] / predicted if predicted > 0.0 else 0.0
-            for begin in range(modes):
-                factor = 0.0
-                for end in range(modes):
-                    factor += transition[begin, end] * ratio[end]
-                probability[row, begin] *= factor
-
-    return smooth
-
-
 # As an estimator
-
-
-class MixtureFilter(Filter, ABC):
-    """A filter whose belief are several Gaussians, which tells their probabilities beside the state."""
-
-    @property
-    @abstractmethod
-    def names(self) -> Sequence[str]:
-        """What the Gaussians are of."""
-
-    def no_results(self, due: Integers, recorded: Integers, components: int) -> tuple[Any, Innovations]:
-        """Estimates and innovations to be filled in."""
-        (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
-        probability = np.empty((len(mean), len(self.names)))
-        return Mixtures(end, time_ns, mean, covariance, probability), innovations
-
-    def told(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
-        """The streams of the state and of the modes' probabilities."""
-        modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
-        return [self.states(Estimates(*mixtures[:4]), offsets), modes]
-
-    def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
-        """The stream of the modes' probabilities (n, M)."""
-        stream = make_stream(
-            f"/estimates/{self.name}/{name}",
-            schemas.MODE_PROBABILITIES,
-            time_ns,
-            metadata=named(dict.fromkeys(self.names, "linear")),
-            probability=probability,
-        )
-        return Ragged(stream, offsets)
 
 
 class InteractingFilter(MixtureFilter):
@@ -630,7 +221,7 @@ class InteractingFilter(MixtureFilter):
         (rates, _), count = self.chain, len(self.stage.modes)
         time_ns, probability = modes.stream.publish_time_ns, modes["probability"].copy()
         arguments = (modes.offsets, time_ns, rates, probability)
-        _smoothing(count)(modes.runs, *arguments, scratch=partial(smoothing_memory, count))
+        smoothing_over_runs(count)(modes.runs, *arguments, scratch=partial(smoothing_memory, count))
         return self.modes("smoothed_modes", time_ns, probability, modes.offsets)
 
 

@@ -23,9 +23,10 @@ from replay.inference.linear_algebra.gaussian import (
     no_innovation,
 )
 from replay.inference.linear_algebra.manifold import boxplus
-from replay.inference.model.model import Model, Sensor, trial_state
+from replay.inference.model.model import Model, Sensor
 from replay.inference.model.settings import trial_parameters
 from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
 from replay.inference.particles.particles import (
     Cloud,
     Clouds,
@@ -35,9 +36,9 @@ from replay.inference.particles.particles import (
     summing_up,
 )
 from replay.inference.particles.update import weighing
-from replay.inference.run.events import join_events, select_events
 from replay.inference.run.filtering import Filter, FilterState
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from replay.inference.run.timing import join_events, select_events
 
 MOST_PARTICLES = 1_000_000
 
@@ -198,7 +199,7 @@ class ParticleFilter(Filter):
         weight = np.empty((rows, particles))
         return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
 
-    def told(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
+    def output_streams(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
         """The streams of estimates and of the effective number, and where they are wanted particles."""
         model, (rows, particles) = self.stage.model, clouds.weight.shape
         stem = f"/estimates/{self.name}"

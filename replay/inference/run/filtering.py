@@ -1,6 +1,6 @@
 """A filter as a replay runs it: one model by one method, bound to the topics of a log."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -23,21 +23,7 @@ from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import (
-    Context,
-    add_output_times,
-    compensate_delays,
-    data_columns,
-    delays_of,
-    fill_control,
-    filter_events,
-    hold_control,
-    interpolate_control,
-    join_events,
-    output_times,
-    points_of,
-    select_events,
-)
+from replay.inference.run.events import Context, data_columns, filter_events, points_of
 from replay.inference.run.out_of_sequence import issued
 from replay.inference.run.recursion import (
     Estimates,
@@ -48,8 +34,19 @@ from replay.inference.run.recursion import (
     no_results,
     recursion,
 )
+from replay.inference.run.samples import sample_sets, seeded_generators
+from replay.inference.run.timing import (
+    add_output_times,
+    compensate_delays,
+    delays_of,
+    fill_control,
+    hold_control,
+    interpolate_control,
+    join_events,
+    output_times,
+    select_events,
+)
 from replay.sampling.samplers import Sampler
-from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 
 
 class FilterState(NamedTuple):
@@ -275,7 +272,7 @@ class Filter:
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events."""
         after, estimated, made = self.filtered(state, events)
-        states, *others = self.told(*estimated)
+        states, *others = self.output_streams(*estimated)
         return after, [issued(states, events, state.carried.time_ns), *others, *made]
 
     def filtered(
@@ -295,7 +292,7 @@ class Filter:
         settings = np.repeat(self.settings[None], runs, axis=0)
         generators = state.generators
         if any(each.redrawn for each in self.samplers):
-            generators = _seeded(generators, events, len(self.samplers), self.parameters.seed)
+            generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
         for part, sets in self.sets(generators, events):
             loop(
                 part.stop - part.start,
@@ -318,7 +315,7 @@ class Filter:
         self, generators: tuple[Any, ...], events: FilterEvents
     ) -> Iterator[tuple[slice, tuple[Any, ...]]]:
         """Runs, and what the steps get for them: the samples of all functions."""
-        return _sets(self.samplers, generators, events.offsets)
+        return sample_sets(self.samplers, generators, events.offsets)
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
@@ -343,7 +340,7 @@ class Filter:
         """The topic that the estimates are compared with."""
         return self.found.truth
 
-    def told(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
+    def output_streams(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
         """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 
@@ -381,32 +378,3 @@ class Filter:
 def _nis_bounds(probability: float, components: int) -> Floats:
     """The quantiles (components + 1,) of the NIS of so many components; nothing is always let in."""
     return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))
-
-
-def _seeded(generators: tuple[Any, ...], events: FilterEvents, count: int, seed: int) -> tuple[Any, ...]:
-    """Generators of every sampled function and run, from the seed and the run's first data."""
-    runs = len(events.offsets) - 1
-    before = generators or ((None,) * runs,) * count
-    return tuple(
-        seeded_by_data(each, events.data, events.offsets, seed, function)
-        for function, each in enumerate(before)
-    )
-
-
-def _sets(
-    samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
-) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
-    """Runs, and the samples of all functions for them; the largest randomised ones say how many runs."""
-    drawn = [index for index, each in enumerate(samplers) if each.redrawn]
-    if not drawn:
-        sets = tuple(next(sets_by_runs(each, (), offsets))[1] for each in samplers)
-        yield slice(0, len(offsets) - 1), sets
-        return
-    largest = max(drawn, key=lambda index: samplers[index].count * (samplers[index].dimension + 1))
-    for part, most in sets_by_runs(samplers[largest], generators[largest], offsets):
-        span = offsets[part.start : part.stop + 1]
-        others = (
-            most if index == largest else next(sets_by_runs(each, generators[index][part], span))[1]
-            for index, each in enumerate(samplers)
-        )
-        yield part, tuple(others)

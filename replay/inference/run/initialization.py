@@ -8,25 +8,34 @@ a plane that no channel states is the first geodetic fix. All of it is told, on 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic, make_stream, schemas
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Initialization, Initialized
 from replay.engine.streams.blocks import Block, Ragged, merge_events
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.results import gaussian_stream, named
-from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from replay.engine.vectors.tangent import tangent_components
 from replay.inference.model.binding import Found, measures_state
-from replay.inference.model.model import Sensor, Start
+from replay.inference.model.model import Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.run.events import Context, data_columns, filter_events, sensor_table
+from replay.inference.run.first_messages import (
+    Begun,
+    Fact,
+    diagonal_places,
+    first_of_runs,
+    of_runs,
+    run_count,
+    unknown,
+)
 from replay.inference.run.recursion import CONTROL, FilterEvents
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
@@ -98,16 +107,18 @@ class Initializer:
         """What is found in the first messages; raises BadInput where none of them can be used."""
         found: dict[str, Ragged] = {}
         told: list[Ragged] = []
-        facts: list[_Fact] = []
-        origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
+        facts: list[Fact] = []
+        origins = (
+            None if self.found.origin is None else np.tile(self.found.origin, (run_count(first), 1))
+        )
         for topic in self.found.geodetic if origins is None else ():
             fixes = first[topic.name]
-            time_ns, has_one, rows = _first_of(fixes, clock, None)
-            found[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            time_ns, has_one, rows = first_of_runs(fixes, clock, None)
+            found[topic.name] = of_runs(fixes.stream.take(rows[has_one]), has_one)
             origins = origins_of(found[topic.name])
             told.append(self._told_origin(found[topic.name]))
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
-            facts.append(_Fact(what, time_ns, has_one))
+            facts.append(Fact(what, time_ns, has_one))
         if not self.found.has_prior:
             prior, begun = self._prior(first, static, clock, origins)
             found[self.found.prior.name] = prior
@@ -122,12 +133,12 @@ class Initializer:
         static: Mapping[str, Ragged],
         clock: Clock,
         origins: Floats | None,
-    ) -> tuple[Ragged, list["_Fact"]]:
+    ) -> tuple[Ragged, list["Fact"]]:
         """The priors of all runs, and what is to be told of them."""
-        model, runs = self.stage.model, _runs(first)
+        model, runs = self.stage.model, run_count(first)
         mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
-        begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
+        begun = Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
         if model.finds_start:
             facts = self._found(first, static, origins, begun)
         elif self._measuring:
@@ -140,7 +151,7 @@ class Initializer:
             facts = [aligned, *others, self._unaligned(aligned, begun)]
         has_begun = begun.time_ns < FOREVER_NS
         facts += [
-            _Fact(self._assumption(name, number), begun.time_ns, has_begun)
+            Fact(self._assumption(name, number), begun.time_ns, has_begun)
             for name, number in self.assumed.items()
         ]
         stream = gaussian_stream(
@@ -150,9 +161,9 @@ class Initializer:
             begun.covariance[has_begun],
             named(model.state),
         )
-        return _of_runs(stream, has_begun), facts
+        return of_runs(stream, has_begun), facts
 
-    def _unaligned(self, aligned: "_Fact", begun: "_Begun") -> "_Fact":
+    def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
         """That fixes did not tell all where a run begins without."""
         [measured] = [sensor.measured for _, sensor, _ in self._measuring]
         names = ", ".join(name for name in self.stage.model.state if name not in measured)
@@ -160,7 +171,7 @@ class Initializer:
             f"{names}: unknown at the start, since with these noise densities the path between the "
             "first fixes does not tell it; state the densities of your sensors first, or give a prior"
         )
-        return _Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
+        return Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
 
     def _assumption(self, name: str, number: float) -> str:
         """The sentence for a parameter that is assumed, with what it means where the model says that."""
@@ -172,22 +183,22 @@ class Initializer:
     def _without(self) -> str:
         return f"the log has no prior ({self.found.prior.name}): it begins"
 
-    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "Begun") -> list["Fact"]:
         """Begin all runs at their first control: the frame of what has no sensor is where it begins."""
         for topic in self._starting:
-            found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
+            found_ns, has_one, _ = first_of_runs(first[topic.name], clock, None)
             begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
         begun.covariance[:] *= CERTAIN**2
         where = "at zero, where its frame is"
-        return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+        return [Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
 
     def _found(
         self,
         first: Mapping[str, Ragged],
         static: Mapping[str, Ragged],
         origins: Floats | None,
-        begun: "_Begun",
-    ) -> list["_Fact"]:
+        begun: "Begun",
+    ) -> list["Fact"]:
         """Begin all runs where the model finds them; raises BadInput where it finds none."""
         model = self.stage.model
         assert model.start is not None
@@ -205,7 +216,7 @@ class Initializer:
             begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
             begun.covariance[run], how[run] = started.covariance, started.how
         return [
-            _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
             for words in dict.fromkeys(filter(None, how))
         ]
 
@@ -231,28 +242,28 @@ class Initializer:
         first: Mapping[str, Ragged],
         static: Mapping[str, Ragged],
         origins: Floats | None,
-    ) -> list["_Fact"]:
+    ) -> list["Fact"]:
         """What the model suspects of the first messages of runs whose prior is known."""
         given, parameters = self._given(first, static, origins)
         said = [
             check_prior({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
-            for run in range(_runs(first))
+            for run in range(run_count(first))
         ]
-        time_ns, _, _ = _first_of(next(iter(given.values())), "publish_time", None)
+        time_ns, _, _ = first_of_runs(next(iter(given.values())), "publish_time", None)
         return [
-            _Fact(text, time_ns, np.array([text in of_run for of_run in said]))
+            Fact(text, time_ns, np.array([text in of_run for of_run in said]))
             for text in dict.fromkeys(text for of_run in said for text in of_run)
         ]
 
     def _at_first(
-        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
-    ) -> list["_Fact"]:
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
+    ) -> list["Fact"]:
         """Begin all runs at their first message that measures components of the state."""
         chosen = np.full(len(begun.time_ns), -1)
         for number, _, topic in self._measuring:
             ragged = first[topic.name]
             table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
-            found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
+            found_ns, has_one, rows = first_of_runs(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
                 begun.time_ns[run], chosen[run] = found_ns[run], number
                 begun.mean[run], sigma = self._reference(number, table.data[rows[run]])
@@ -260,7 +271,7 @@ class Initializer:
         if (chosen < 0).all():
             raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
         return [
-            _Fact(
+            Fact(
                 f"{self._without} at the first message of {topic.name}", begun.time_ns, chosen == number
             )
             for number, _, topic in self._measuring
@@ -273,7 +284,7 @@ class Initializer:
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
         size = len(sensor.measured)
         for place, (name, variance) in enumerate(
-            zip(sensor.measured, data[size + _diagonal(size)], strict=True)
+            zip(sensor.measured, data[size + diagonal_places(size)], strict=True)
         ):
             if not np.isnan(data[place]):
                 mean[list(model.state).index(name)] = data[place]
@@ -282,8 +293,8 @@ class Initializer:
         return mean, sigma
 
     def _aligned(
-        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
-    ) -> "_Fact":
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
+    ) -> "Fact":
         """Begin runs just after the first fixes that, with the path between them, tell all."""
         numbers = [number for number, _, _ in self._measuring]
         sensors = tuple(self.found.sensors[number] for number in numbers)
@@ -300,7 +311,7 @@ class Initializer:
             if solved is not None:
                 begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
                 is_aligned[run] = True
-        return _Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
+        return Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
 
     def _align(
         self, events: FilterEvents, run: int, stage: Stage, settings: Floats
@@ -357,7 +368,7 @@ class Initializer:
         told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
         return Ragged(told, fixes.offsets)
 
-    def _told(self, facts: list["_Fact"]) -> list[Ragged]:
+    def _told(self, facts: list["Fact"]) -> list[Ragged]:
         """What was assumed, on the topic `started`: a message for each sentence and run."""
         if not facts:
             return []
@@ -371,60 +382,3 @@ class Initializer:
             texts,
         )
         return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]
-
-
-class _Begun(NamedTuple):
-    """Where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; means and covariances."""
-
-    time_ns: Integers
-    mean: Floats
-    covariance: Floats
-
-
-class _Fact(NamedTuple):
-    """A sentence, when it is told (runs,), and in which runs (runs,)."""
-
-    text: str
-    time_ns: Integers
-    is_so: Booleans
-
-
-def _diagonal(size: int) -> Integers:
-    """Where the diagonal stands among the rows of a lower triangle."""
-    rows = np.arange(1, size + 1)
-    return np.cumsum(rows) - 1
-
-
-def _runs(first: Mapping[str, Ragged]) -> int:
-    return next(iter(first.values())).runs
-
-
-def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
-    sigmas = start.sigmas if start else {}
-    kinds = list(state.values())
-    mean = np.zeros(len(kinds))
-    for kind, columns in manifold_blocks(kinds):
-        if kind in ("axis", "quaternion"):
-            mean[columns.start] = 1.0
-    names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([sigmas.get(name, np.nan) for name in names])
-
-
-def _first_of(
-    ragged: Ragged, clock: Clock, usable: Booleans | None
-) -> tuple[Integers, Booleans, Integers]:
-    """The first usable message of every run (runs,): its stamp, whether there is one, its row."""
-    every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
-    place = np.searchsorted(every, ragged.offsets)
-    has_one = place[1:] > place[:-1]
-    rows = np.zeros(ragged.runs, np.int64)
-    rows[has_one] = every[place[:-1][has_one]]
-    time_ns = np.zeros(ragged.runs, np.int64)
-    time_ns[has_one] = ragged.stream.times(clock)[rows[has_one]]
-    return time_ns, has_one, rows
-
-
-def _of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """A stream of one message for each of some runs."""
-    return Ragged(stream, np.append(0, np.cumsum(has_one)))

@@ -9,12 +9,12 @@ told when no message can change it any more.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from recorders.log import make_stream, schemas
-from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.streams.results import ALL_WELL, failures_of
@@ -25,10 +25,18 @@ from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import data_columns, filter_events
+from replay.inference.run.events import filter_events
+from replay.inference.run.history import (
+    History,
+    KeptMessages,
+    Structure,
+    copying_rows,
+    most_within,
+    no_history,
+    structure_of,
+)
 from replay.inference.run.recursion import (
     CONTROL,
-    NOTHING,
     FilterEvents,
     Innovations,
     RecursionState,
@@ -37,118 +45,6 @@ from replay.inference.run.recursion import (
     processing,
 )
 from replay.sampling.sets import sets_by_runs
-
-BEFORE_ALL_NS = np.iinfo(np.int64).min
-Structure = tuple[tuple[str, Any], ...]
-
-
-class KeptMessages(NamedTuple):
-    """Messages in order, and what they did; first axis = run and message.
-
-    Attributes:
-        time_ns, source, data, target_id: see `recursion.FilterEvents`; the last of uint32.
-        position: in the file.
-        after: what was carried after the message.
-        has_innovation: whether it was an update, and so has an innovation.
-        difference, covariance, numbers: see `steps.InnovationRecord`.
-    """
-
-    time_ns: Integers
-    source: Integers
-    data: Floats
-    target_id: Any
-    position: Integers
-    after: RecursionState
-    has_innovation: Booleans
-    difference: Floats
-    covariance: Floats
-    numbers: Floats
-
-
-class History(NamedTuple):
-    """What is kept of the latest messages.
-
-    Attributes:
-        start_ns: (runs,) stamps of the priors.
-        first, counts: (runs,) which rows are a run's: run r has C rows of `kept`, of which `counts[r]`
-            are filled, from row r C + first[r] on. What was carried after the first of them is where
-            the others are repeated from.
-        kept: (runs C).
-    """
-
-    start_ns: Integers
-    first: Integers
-    counts: Integers
-    kept: KeptMessages
-
-    @property
-    def capacity(self) -> int:
-        """How many rows every run has."""
-        return len(self.kept.time_ns) // max(len(self.first), 1)
-
-    @property
-    def rows(self) -> Integers:
-        """The filled rows, run by run."""
-        begin = np.arange(len(self.first)) * self.capacity + self.first
-        before = np.cumsum(self.counts) - self.counts
-        return np.repeat(begin - before, self.counts) + np.arange(self.counts.sum())
-
-    @property
-    def offsets(self) -> Integers:
-        """Run r has the rows offsets[r]:offsets[r + 1] of `rows`."""
-        return np.append(0, np.cumsum(self.counts))
-
-    def with_room(self, capacity: int) -> "History":
-        """A copy with so many rows for every run, of which the filled ones are the first."""
-        rows, runs = self.rows, np.arange(len(self.first))
-        places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
-
-        def moved(column: Any) -> Any:
-            if isinstance(column, tuple):
-                made: Any = type(column)
-                return made(*map(moved, column))
-            wider = np.zeros((len(runs) * capacity, *column.shape[1:]), column.dtype)
-            wider[places] = column[rows]
-            return wider
-
-        return self._replace(
-            first=np.zeros_like(self.first), counts=self.counts.copy(), kept=moved(self.kept)
-        )
-
-
-def _no_history(stage: Stage, carried: RecursionState) -> History:
-    """The priors alone, before all messages."""
-    runs, innovation_size, (width, _) = (
-        len(carried.time_ns),
-        len(innovation_components(stage.sensors)),
-        data_columns(stage),
-    )
-    kept = KeptMessages(
-        np.full(runs, BEFORE_ALL_NS),
-        np.full(runs, NOTHING),
-        np.zeros((runs, width)),
-        np.zeros(runs, np.uint32),
-        np.full(runs, -1),
-        carried,
-        np.zeros(runs, bool),
-        *(
-            np.zeros((runs, *shape))
-            for shape in ((innovation_size,), (innovation_size, innovation_size), (3,))
-        ),
-    )
-    return History(carried.time_ns, np.zeros(runs, np.int64), np.ones(runs, np.int64), kept)
-
-
-def _most_within(history: History, events: FilterEvents, window_ns: int) -> int:
-    """The most messages of a run that lie within a window, of those kept and those that come."""
-    most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
-    for run, (begin, end) in enumerate(zip(events.offsets[:-1], events.offsets[1:], strict=True)):
-        before_ns = kept_ns[kept[run] + 1 : kept[run + 1]]
-        time_ns = np.sort(np.concatenate([before_ns, events.time_ns[begin:end]]))
-        through = np.searchsorted(time_ns, time_ns + window_ns, side="right")
-        most = max(most, int((through - np.arange(len(time_ns))).max(initial=0)))
-    return most
-
 
 # The loop
 
@@ -298,29 +194,6 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
     return follow
 
 
-def structure_of(rows: Any) -> Structure:
-    """Of a NamedTuple of arrays, or of such NamedTuples, the names and numbers of axes."""
-    return tuple(
-        (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
-        for name, column in zip(rows._fields, rows, strict=True)
-    )
-
-
-@lru_cache(maxsize=64)
-def copying_rows(structure: Structure) -> Function:
-    """`copy(source, i, target, j)`: row i of a NamedTuple of arrays into row j of another."""
-    columns = tuple(name for name, of in structure if not isinstance(of, tuple))
-    groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
-
-    def copy(source: Any, i: int, target: Any, j: int) -> None:
-        for name in columns:
-            getattr(target, name)[j] = getattr(source, name)[i]
-        for name, copy_group in groups:
-            copy_group(getattr(source, name), i, getattr(target, name), j)
-
-    return copy
-
-
 # As an estimator
 
 
@@ -337,7 +210,7 @@ class OutOfSequenceFilter:
     def start(self, static: Mapping[str, Ragged]) -> Any:
         """The state at every run's prior."""
         state = self.inner.start(static)
-        return state._replace(kept=_no_history(self.inner.stage, state.carried))
+        return state._replace(kept=no_history(self.inner.stage, state.carried))
 
     def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
         """Filter a block, its messages in the order in which they came."""
@@ -346,7 +219,7 @@ class OutOfSequenceFilter:
             inner.stage, inner.found, block, state.context, inner.settings
         )
         carried, before = copied(state.carried), state.kept
-        history = before.with_room(2 * (_most_within(before, events, self.window_ns) + 3))
+        history = before.with_room(2 * (most_within(before, events, self.window_ns) + 3))
         runs = len(history.first)
         run = np.repeat(np.arange(runs), np.diff(events.offsets))
         wants_estimate = events.wants_estimate & (events.time_ns >= history.start_ns[run])
@@ -371,7 +244,7 @@ class OutOfSequenceFilter:
             np.zeros(runs, np.int64),
             scratch=partial(steps.memory, sets),
         )
-        states, *others = inner.told(*filled(estimates, due))
+        states, *others = inner.output_streams(*filled(estimates, due))
         made = [issued(states, events, history.start_ns), *others]
         made += [inner.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != state.carried.failure).any():

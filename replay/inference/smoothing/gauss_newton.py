@@ -68,7 +68,7 @@ class Ended(NamedTuple):
 
     passes: Integers
     converged: Integers
-    told: Floats
+    output_streams: Floats
 
 
 @lru_cache(maxsize=64)
@@ -194,8 +194,8 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 if last:
                     return
                 largest, squares, settled = move(trajectory, kept, smoothed.mean, begin, end)
-                told = ended.told[run, passes]
-                told[0], told[1], told[2] = best, damping, largest
+                output_streams = ended.output_streams[run, passes]
+                output_streams[0], output_streams[1], output_streams[2] = best, damping, largest
                 ended.passes[run] += 1
                 if settled and damping == 0.0:
                     ended.converged[run] = 1

@@ -20,15 +20,10 @@ from replay.engine.streams.blocks import Ragged, copied, ragged_rows
 from replay.inference.kalman.methods import FILTERS, Method
 from replay.inference.kalman.steps import Gaussian, Steps
 from replay.inference.model.stage import Stage
-from replay.inference.run.events import (
-    data_columns,
-    join_events,
-    last_of_stamps,
-    output_times,
-    select_events,
-)
+from replay.inference.run.events import data_columns
 from replay.inference.run.filtering import FilterState
 from replay.inference.run.recursion import NOTHING, Estimates, FilterEvents, no_results
+from replay.inference.run.timing import join_events, last_of_stamps, output_times, select_events
 from replay.inference.smoothing import smoothers
 from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
 from replay.inference.smoothing.backward_pass import (
@@ -158,15 +153,15 @@ class IteratedSmoother(Smoother):
         if self.parameters.gate_probability == 1.0:
             return events
         source = events.source.copy()
-        told = np.zeros(len(source), bool)
+        output_streams = np.zeros(len(source), bool)
         for number, sensor in enumerate(self.stage.sensors):
             measured = events.data[:, : len(sensor.measured)]
-            told |= (source == number) & np.isfinite(measured).any(axis=1)
+            output_streams |= (source == number) & np.isfinite(measured).any(axis=1)
         [innovations] = [each for each in made if each.stream.topic.endswith("/innovation")]
         for run, (begin, end) in enumerate(pairwise(events.offsets)):
             accepted = innovations.of_run(run)["accepted"]
-            told[begin:end] &= events.time_ns[begin:end] >= start_ns[run]
-            rows = begin + np.flatnonzero(told[begin:end])[: len(accepted)]
+            output_streams[begin:end] &= events.time_ns[begin:end] >= start_ns[run]
+            rows = begin + np.flatnonzero(output_streams[begin:end])[: len(accepted)]
             source[rows[accepted == 0]] = NOTHING
         return events._replace(source=source)
 
@@ -228,7 +223,7 @@ class IteratedSmoother(Smoother):
         asked, some = self.parameters, np.diff(way.offsets) > 0
         last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
         passes, one = ended.passes, np.arange(len(some))
-        cost = ended.told[one, np.maximum(passes - 1, 0), 0]
+        cost = ended.output_streams[one, np.maximum(passes - 1, 0), 0]
         t = self.stage.model.tangent
         stated = {"start": asked.start, "damping": f"{asked.damping:g}", "loss": asked.loss}
         stated |= {} if asked.loss == "square" else {"loss_scale": f"{asked.loss_scale:g}"}
@@ -250,7 +245,7 @@ class IteratedSmoother(Smoother):
             last_ns[run],
             metadata=stated,
             iteration=number,
-            **dict(zip(("cost", "damping", "largest_step"), ended.told[made].T, strict=True)),
+            **dict(zip(("cost", "damping", "largest_step"), ended.output_streams[made].T, strict=True)),
         )
         return [
             Ragged(solution, np.append(0, np.cumsum(some))),

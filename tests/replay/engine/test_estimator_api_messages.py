@@ -18,7 +18,7 @@ from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.engine.api.functions import batch, each_run, recursive
 from replay.engine.api.inputs import Floats, Given, Messages, OneRun
-from replay.engine.api.outputs import Estimates, Measured, Results, Told
+from replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.compiling.kernel_cache import load
 from replay.engine.replaying.estimator import Estimator
@@ -198,7 +198,7 @@ def solved(shape: tuple[int, ...]) -> Estimator[Any]:
         seen = streams["range"]
         mean = mean + streams.generator.normal()
         innovation = seen["range_m"][:, None] - mean
-        told = Told(seen.publish_time_ns[:1], {"by": np.array([2]), "metres": np.array([0.5])})
+        told = Diagnostics(seen.publish_time_ns[:1], {"by": np.array([2]), "metres": np.array([0.5])})
         spread = np.full((len(seen), 1, 1), 4.0)
         return Estimates(
             seen.publish_time_ns[-1:],
@@ -319,7 +319,7 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("replay.engine.compiling.kernels.notices._PATIENCE_S", 0.0)
+    monkeypatch.setattr("replay.engine.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
     for _ in range(2):
@@ -336,7 +336,7 @@ def test_long_compiling_is_said_once(
 def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
     """On standard error, as nothing else is there; not where the program logs in its own way."""
     code = (
-        "import sys, logging, replay.engine.compiling.kernels.notices as notices, numpy as np\n"
+        "import sys, logging, replay.engine.compiling.notices as notices, numpy as np\n"
         "from replay.engine.compiling.compile import compiled\n"
         "notices._PATIENCE_S = 0.0\n"
         "if sys.argv[1:]: logging.basicConfig()\n"

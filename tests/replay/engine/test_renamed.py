@@ -14,6 +14,11 @@ def nothing(*_: Any) -> None:
     """In place of a function that is not called."""
 
 
+def test_a_public_name_is_found_by_its_old_one() -> None:
+    with pytest.warns(FutureWarning, match="fuselog.Told is called fuselog.Diagnostics now"):
+        assert fl.Told is fl.Diagnostics
+
+
 @pytest.mark.parametrize(
     ("make", "old", "new"),
     [

@@ -11,7 +11,8 @@ from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate, rotate
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 STATE = {f"orientation_{part}": "quaternion" for part in "wxyz"} | {

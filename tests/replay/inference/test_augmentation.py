@@ -18,7 +18,8 @@ from replay.engine.streams.sources import MemorySource
 from replay.estimators.models.landmarks import RECKONING, ROBOT
 from replay.inference.model.augmentation import augmented
 from replay.inference.model.checking import check_model
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import (

@@ -13,7 +13,8 @@ from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import difference
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Control, Model, ModelParameters, Motion
+from replay.inference.model.model import Control, Model, Motion
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.modes.gaussian_sum import split, widest
 from tests.replay.inference.replays import outputs
 

@@ -16,7 +16,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing.bound import back_memory, smooth
 from replay.judging.consistency.bounds import Bounds, Output
 from tests.replay.inference import vehicle_a

@@ -14,7 +14,8 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.replaying.estimator import Recursive
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import bound, outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")

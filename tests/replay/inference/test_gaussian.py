@@ -25,7 +25,8 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import kalman_update
 from replay.inference.linear_algebra.gaussian import cholesky
-from replay.inference.model.model import Control, Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.stage import Stage, stage_of
 from replay.inference.run.recursion import fault_of
 from replay.sampling.samplers import unscented

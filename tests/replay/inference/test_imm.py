@@ -19,8 +19,9 @@ from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.all_methods import METHODS
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Switching
-from replay.inference.modes.imm import InteractingMemory, mixing, transition_matrix
+from replay.inference.model.model import Model, Motion, Sensor, Switching
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.modes.mixing import InteractingMemory, mixing, transition_matrix
 from replay.inference.run import filtering
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE

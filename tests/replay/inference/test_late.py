@@ -16,7 +16,8 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import MemorySource
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import bound
 from tests.replay.inference.test_imm import SWITCHING_A

@@ -13,7 +13,8 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.measurements import PLANE
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing.iterated import IteratedSmoother
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.test_smoothers import LEVEL, levels

@@ -16,8 +16,8 @@ from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-from replay.inference.run.events import add_output_times, output_times
 from replay.inference.run.recursion import no_results
+from replay.inference.run.timing import add_output_times, output_times
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.vehicle_a import VEHICLE_A

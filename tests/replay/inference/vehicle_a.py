@@ -12,7 +12,8 @@ from recorders.models.planar import range_bearing
 from recorders.recording import Recording
 from replay.engine.streams.measurements import PLANE
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 MEAN = np.array([0.0, 0.0, 0.0, 1.0, 0.2])

@@ -33,12 +33,12 @@ from replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
+from replay.engine.compiling.identity import digest_of, identity
 from replay.engine.compiling.kernels.arguments import describe, letters, value_of, with_types
-from replay.engine.compiling.kernels.identity import digest_of, identity
 from replay.engine.compiling.kernels.lowering import lower
-from replay.engine.compiling.kernels.notices import compiling
 from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
 from replay.engine.compiling.kernels.program import Program
+from replay.engine.compiling.notices import compiling
 
 _ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"
