@@ -1,4 +1,4 @@
-"""All methods by name, and the estimator of one model by one of them."""
+"""Lists all methods by name, and makes the estimator of one model by one of them."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""Estimators made of a model and a method, as a replay takes them."""
+"""Makes estimators of a model and a method, and binds them to the topics of a log."""
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""What a model says, as formulas: every function with its derivatives, by its components' names."""
+"""Writes a model's functions and their derivatives as formulas, by its components' names."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any

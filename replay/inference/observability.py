@@ -1,4 +1,4 @@
-"""Observability from a log: what the measurements of a window say of the state at its beginning.
+"""Measures observability from a log: what the measurements of a window say of the state at its start.
 
 The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, carried back by
 the derivatives Phi of the motion along one trajectory, the smoothed one. Scaled, D W D with D the

@@ -1,4 +1,4 @@
-"""What a model needs of a log, in words: for a list of models, and for a log that lacks something."""
+"""Says in words what a model requires of a log, in lists and for a log that lacks something."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

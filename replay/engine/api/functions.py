@@ -1,4 +1,4 @@
-"""Estimators from plain functions: what is alike in all of them, written once.
+"""Makes estimators from plain functions: binding, outputs and failures are the same for all of them.
 
 `recursive` makes an estimator of a function that follows one run through its messages, compiled or not;
 `batch` of one that solves whole streams. Both find their topics, once for every robot or other prefix

@@ -1,4 +1,4 @@
-"""What estimators from plain functions are given: whole streams, one run of them, a block's messages."""
+"""Defines what estimators from plain functions are given: streams, one run, a block's messages."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

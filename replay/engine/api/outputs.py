@@ -1,4 +1,4 @@
-"""What estimators from plain functions fill or return, and the output topics that are made of it."""
+"""Defines what estimators from plain functions fill or return, and makes output topics of it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

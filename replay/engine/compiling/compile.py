@@ -1,4 +1,4 @@
-"""Loops over runs of plain functions, compiled and shared among the cores.
+"""Compiles functions of one run into loops over all runs, which the cores share.
 
 A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
 arrays is written in LLVM's text by ourselves (`replay.engine.compiling.kernels`), in milliseconds; any

@@ -1,4 +1,4 @@
-"""Gathers what a kernel is made of: the sources of its functions and of all that they call."""
+"""Gathers the sources of a kernel's functions and of all that they call, for numba."""
 
 import ast
 import copy

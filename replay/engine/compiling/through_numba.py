@@ -1,4 +1,4 @@
-"""Kernels that make arrays, compiled by numba together with all that they call, once per source text.
+"""Compiles kernels that make arrays through numba, with all that they call, once per source text.
 
 numba's own disk cache finds module-level functions only, does not notice that a function from another
 file has changed, and stops on a damaged file. So the sources of a kernel and of everything it calls

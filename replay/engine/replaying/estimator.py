@@ -1,4 +1,4 @@
-"""What an estimator is to a replay: its parameters, the topics it binds to, and what is asked of it.
+"""Defines an estimator as a replay sees it: its parameters, its topics, and how it is called.
 
 An estimator is bound to topics and turns ragged streams into ragged streams. A recursive one is handed
 the blocks of its topics one after another and carries a state from block to block; a batch one gets

@@ -1,4 +1,4 @@
-"""Messages that come late: left out, waited for, or gone back for.
+"""Handles messages that arrive late: drops them, waits for them, or goes back for them.
 
 In the order of arrival (log time) the stamps at which things were measured (publish time) go back
 wherever a message was late. `taking_late` makes of an estimator one that is handed its messages as they

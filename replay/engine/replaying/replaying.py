@@ -1,4 +1,4 @@
-"""The replay: one time-ordered pass over the runs of an ensemble, several estimators at once."""
+"""Replays the runs of an ensemble in one time-ordered pass, through several estimators at once."""
 
 import sys
 from collections import defaultdict

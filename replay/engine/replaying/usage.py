@@ -1,4 +1,4 @@
-"""What became of the measurements that an estimator was given: used, gated, skipped, or nothing at all.
+"""Counts what became of an estimator's measurements: used, gated, skipped, or without effect.
 
 It is counted from what goes in and comes out, for any estimator: messages by topic, innovations, and
 what the estimator says that it skipped.

@@ -1,4 +1,4 @@
-"""Ragged columns: the streams of many runs laid end to end, and their merged order of events."""
+"""Lays the streams of many runs end to end in ragged columns, and merges their events in time order."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The prior rule: components by name, and a run without a usable prior fails alone."""
+"""Reads priors by component names; a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""What estimators say, as streams: states, innovations, what was passed over, and who failed."""
+"""Makes streams of what estimators return: states, innovations, skipped messages, failures."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""A vector's components by the names that its channel states; their order never matters."""
+"""Matches a vector's components by the names that its channel states; their order never matters."""
 
 from collections.abc import Mapping, Sequence
 from typing import cast

@@ -1,4 +1,4 @@
-"""Components that are no vector space: angles, axes and orientations, and their errors in tangent space.
+"""Compares and interpolates angles, axes and orientations in their tangent space.
 
 Every component of a state has a kind. The two of an axis, and the four of a quaternion, stand side by
 side and are equal to their negatives; their error is the rotation from truth to estimate in the body's

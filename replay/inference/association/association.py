@@ -1,4 +1,4 @@
-"""Which detection of a scan is of which track: the nearest, the best map, or all maps, weighted.
+"""Associates the detections of a scan with tracks: by the nearest, the best joint map, or all of them.
 
 A map sends every track to a detection of its own or to none; the detections left over are clutter. With
 Poisson clutter of density lambda it has the weight

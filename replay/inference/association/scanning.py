@@ -1,4 +1,4 @@
-"""Unordered scans of any sensors, and what one says of tracks: the parts of a tracker that see.
+"""Predicts what a scan measures of tracks, and updates them by it: the sensors' part of a tracker.
 
 A kind of sensors says what it measures of a target, how probable a detection is and how dense clutter.
 With probabilities b_j of a scan's detections and b_0 of none, a track's mean moves by the mean of the

@@ -1,4 +1,4 @@
-"""Scans of detections in columns, and the kinds of sensors that give them."""
+"""Holds unordered scans of detections in columns, and describes the kinds of sensors that give them."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The way back over tracks: each estimate of a track, given the detections that came later too.
+"""Smooths tracks backwards: each estimate of a track, given later detections too.
 
 Which detections are a track's stays as the tracker found it; given that, its states are a chain of
 Gaussians that one motion ties together, and `replay.inference.smoothing.backward_pass` goes back over

@@ -1,4 +1,4 @@
-"""The tracker of many targets, put together from parts that do not know each other.
+"""Tracks many targets: predicts, associates, updates, begins and ends tracks scan by scan.
 
 A model's motion moves every track, that of each mode where it has several (an IMM inside); sensors say
 what a scan measures of a track (see `replay.inference.association.scanning`); an association says how

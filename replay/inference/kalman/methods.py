@@ -1,4 +1,4 @@
-"""Methods: how the state of any model is estimated, and the filters among them.
+"""Defines what a method is, and the Kalman filters among them: `ekf`, `iekf`, `ukf`, `lrkf`, `analytic`.
 
 Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing but the model's functions;
 `ukf` and `lrkf:SAMPLING` sample them; `analytic` takes the exact moments where the model knows them.

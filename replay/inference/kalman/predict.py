@@ -1,4 +1,4 @@
-"""The prediction: a Gaussian through a model's motion, by its derivative, and the motion's noise."""
+"""Predicts a Gaussian through a model's motion by its Jacobian, and adds the motion's noise."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Statistical linear regression: a Gaussian through a function at weighted samples of it.
+"""Passes a Gaussian through a function by statistical linear regression at weighted samples.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
 (24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent

@@ -1,4 +1,4 @@
-"""The steps of a recursive Gaussian filter, made for one model: what a method puts together.
+"""Defines the steps of a recursive filter, which methods make for one model, and their memory.
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
 `linear_sensor`), by samples (`replay.inference.kalman.regression`), or by moments that the model knows.

@@ -1,4 +1,4 @@
-"""The update: a Gaussian through a model's sensor by its derivative, the innovation, the Kalman gain."""
+"""Updates a Gaussian by a sensor: linearises it, forms the innovation, applies the Kalman gain."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""The algebra of recursive Gaussian filters: scalar loops over small arrays, in place.
+"""Computes with Gaussians in place: Cholesky factors, innovations, the Kalman gain, covariances.
 
 Means lie in the state's own space, covariances in its tangent space and are symmetric by construction.
 Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.

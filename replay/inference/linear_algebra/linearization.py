@@ -1,4 +1,4 @@
-"""The derivatives of a model's functions, between the tangent spaces of what they take and return.
+"""Takes derivatives of a model's functions between the tangent spaces of their arguments and results.
 
 A function is traced (`replay.tracing`), and the exact derivatives of its graph are what a kernel fills
 into the arrays of its workspace.

@@ -1,4 +1,4 @@
-"""States on their manifold, and the tangent space in which steps and covariances are.
+"""Moves and compares states on their manifold: boxplus, boxminus, and the right Jacobian.
 
 Kinds and tangent space as in `replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z) plus a
 rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i

@@ -1,4 +1,4 @@
-"""Weighted samples: the points that a factor of a covariance makes of them, their means and covariances.
+"""Forms weighted samples from a covariance's factor, and their means and covariances.
 
 All sums stay in registers: arrays might overlap, for all that a compiler knows. A kernel reads the whole
 of a tuple that changes wherever its name stands, so that such a tuple is gone through, not indexed.

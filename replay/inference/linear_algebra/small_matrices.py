@@ -1,4 +1,4 @@
-"""Linear algebra of a few components, for estimators of one's own: scalar loops that work in place.
+"""Offers linear algebra of a few components to estimators of one's own: scalar loops, in place.
 
 They are called from a compiled `follow` (see `replay.engine.api.functions.recursive`) and make no
 arrays: what they work in is made there once, before the loop over the messages. Covariances stay

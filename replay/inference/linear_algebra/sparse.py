@@ -1,4 +1,4 @@
-"""Covariances through matrices of which it is known where they are zero or one.
+"""Propagates covariances through matrices whose zeros and ones are known in advance.
 
 A `Pattern` has for each row of a matrix its entries that may differ from zero: the column, and the entry
 itself where it is known. What is left out are products with zero: sums keep their order.

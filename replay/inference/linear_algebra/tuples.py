@@ -1,4 +1,4 @@
-"""Between the tuples that a model's functions take and return, and the arrays that kernels work in.
+"""Converts between the tuples of a model's functions and the arrays that kernels work in.
 
 A kernel has no index into a tuple that it does not know while it is compiled: what goes through one is a
 loop over something known, which is written out (`range_of`).

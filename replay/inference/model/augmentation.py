@@ -1,4 +1,4 @@
-"""Parameters as part of the state: a sensor's bias, a scale factor, a time offset that is estimated too.
+"""Augments a state by parameters of its model: a sensor's bias, a scale factor, a time offset.
 
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior

@@ -1,4 +1,4 @@
-"""Where a log has what a model needs: its topics, by the names that the model has for them.
+"""Finds the topics of a log that serve a model, by the model's names for them.
 
 One binding for all models: the topics of a model are looked for under every prefix that has its prior,
 as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is left out.

@@ -1,4 +1,4 @@
-"""Whether a model is what it says of itself: for the tests of who writes one.
+"""Checks that a model is what it declares, by trying its functions: for the tests of its author.
 
 `check_model` tries a model's functions at random states: derivatives, what is declared linear or an
 angle, numbers of components, variances. What it finds is one sentence with the function's file and line.

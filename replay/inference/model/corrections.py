@@ -1,4 +1,4 @@
-"""How an update moves a state by a step of its tangent space, and what becomes of the covariance.
+"""Moves a state and its covariance by a step of the tangent space, after an update or a smoother's step.
 
 Components move by themselves (`manifold.boxplus`), unless a model says how they bend together
 (`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that

@@ -1,4 +1,4 @@
-"""How what is added to a state moves: a random walk, or one that comes back to its mean.
+"""Models how an added component moves: a random walk, or a first-order Gauss-Markov process.
 
 The latter is a first-order Gauss-Markov process: Gelb, Applied Optimal Estimation, 1974, section 3.6.
 """

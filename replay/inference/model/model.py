@@ -1,4 +1,4 @@
-"""What a model is: how a state moves and what sensors say of it, nothing of how it is estimated.
+"""Defines a model: how a state moves, and what sensors measure of it.
 
 A model is written once, as plain component-first functions: they take tuples of components and return
 tuples, and run on arrays as well. Every method (see `replay.inference.kalman.methods`) estimates the

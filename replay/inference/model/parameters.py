@@ -1,4 +1,4 @@
-"""The numbers among a model's parameters, as its functions get them."""
+"""Defines the options of every model, and the numbers that its functions read."""
 
 from collections import namedtuple
 from functools import cache, lru_cache

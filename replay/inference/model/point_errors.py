@@ -1,4 +1,4 @@
-"""Errors that last, of what is measured about each point of a map, as part of the state.
+"""Augments a state by lasting errors of what is measured about each point of a map.
 
 Measurement noise that is not white: ranges to one anchor, or between an anchor and a tag, err alike for
 seconds. A transformation of models: the state gets a component for each point or pair of points, which

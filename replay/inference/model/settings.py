@@ -1,4 +1,4 @@
-"""The numbers that a model's functions read: given as parameters, or stated by a log's channels."""
+"""Collects the numbers that a model's functions read: from parameters, or from a log's channels."""
 
 from collections.abc import Mapping
 from functools import lru_cache

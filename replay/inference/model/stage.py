@@ -1,4 +1,4 @@
-"""A model as a method takes it: its functions traced, with the motion and the sensors that are used."""
+"""Prepares a model for a method: traces the functions of its motion and of the sensors at hand."""
 
 import sys
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""How a model begins in a log that has no prior."""
+"""Defines how a model begins in a log that has no prior."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

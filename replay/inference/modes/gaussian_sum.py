@@ -1,4 +1,4 @@
-"""The Gaussian sum filter, or bank: narrow Gaussians from a prior too wide in an angle for one of them.
+"""Filters a Gaussian sum (`bank`): narrow Gaussians from a prior too wide in an angle for one of them.
 
 The prior is split across the widest direction of its angles, such as an unknown heading, into Gaussians
 side by side. Each is filtered by itself; every message weighs them by its likelihood, and what is told

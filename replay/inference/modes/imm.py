@@ -1,4 +1,4 @@
-"""Interacting multiple models: a filter for each of a model's modes, and how probable each mode is.
+"""Filters by interacting multiple models: one filter for each mode, and the modes' probabilities.
 
 Over dt seconds a thing goes from mode i to mode j with probability Pi_ij, Pi = expm(rates dt). To every
 later stamp the modes' Gaussians are mixed,

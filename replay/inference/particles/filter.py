@@ -1,4 +1,4 @@
-"""The particle filter as an estimator, which a run's first measurement seeds, and as a method."""
+"""Runs the particle filter as an estimator, seeded by a run's first measurement, and as a method."""
 
 from collections.abc import Mapping
 from functools import lru_cache

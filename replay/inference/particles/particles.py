@@ -1,4 +1,4 @@
-"""The bootstrap particle filter: many states, each moved with noise of its own and then weighed.
+"""Predicts and resamples the bootstrap particle filter: every particle moves with noise of its own.
 
 Wherever noise enters, by addition, through the control or by the motion itself, it is drawn. What was
 measured weighs the particles by its likelihood; they are resampled before a prediction where few of them

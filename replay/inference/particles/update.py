@@ -1,4 +1,4 @@
-"""The update of particles: each is weighed by the likelihood of what was measured."""
+"""Updates particles: weighs each by the likelihood of what was measured."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A log's messages as the recursion takes them: rows of numbers in time order, whatever the model."""
+"""Turns a log's messages into events: rows of numbers in time order, whatever the model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

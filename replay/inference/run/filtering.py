@@ -1,4 +1,4 @@
-"""A filter as a replay runs it: one model by one method, bound to the topics of a log."""
+"""Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The first messages of every run: which they are, and what is found and reported of them."""
+"""Finds the first messages of every run, and describes what they determine."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""Where a filter begins in a log that does not say so, and where its plane lies.
+"""Initializes a filter in a log without a prior, and finds the origin of its plane.
 
 A log without a prior gets one at the first message that measures the state, see `model.Start`. It is so
 much wider than that message that the message itself, used like any other, is what counts. The origin of

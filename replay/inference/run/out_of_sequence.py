@@ -1,4 +1,4 @@
-"""Going back for messages that come late: what a filter then believes is what it would have in order.
+"""Processes out-of-sequence measurements: the belief afterwards equals that of in-order processing.
 
 Of every message within a window the filter keeps the message, what it carried after it, and how the
 message fitted the prediction. A late message is put where it belongs by its stamp and its place in the

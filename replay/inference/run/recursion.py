@@ -1,4 +1,4 @@
-"""The one recursion: through the messages of a run in time, whatever the model and the method.
+"""Goes through the events of a run in time: the one recursion for all models and methods.
 
 One prediction per distinct stamp, one update per message in the order given; a control message changes
 what drives the next prediction. Messages before the state's own time say nothing. The run ends where its

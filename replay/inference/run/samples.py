@@ -1,4 +1,4 @@
-"""Samples of randomised filters: generators of every run, and the sets that its events use."""
+"""Draws the samples of randomised filters: a generator for every run, a set for every event."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any

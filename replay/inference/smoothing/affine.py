@@ -1,4 +1,4 @@
-"""The affine filter about a trajectory: how a pass of Gauss-Newton goes forward.
+"""Filters about a trajectory with affine steps: the forward pass of Gauss-Newton.
 
 With motion and sensors linearised at the latest states x_k of a run, the unknowns are the tangent
 vectors d_k from there, which lie in flat space:

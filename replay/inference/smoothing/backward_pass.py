@@ -1,4 +1,4 @@
-"""The way back over a filter: its estimates, corrected by all that was measured later.
+"""Corrects a filter's estimates by later measurements: the Rauch-Tung-Striebel backward pass.
 
 A filter goes forward. At every stamp that has an estimate, a node, it leaves its Gaussian and what ties
 it to the node before; from the last node the way leads back. For a step from k to k + 1 with the

@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao bound: what the measurements say of the state along its true course.
+"""Computes the posterior Cramer-Rao bound: the information of the measurements along the true states.
 
 At every node, a stamp that has an estimate, stands what the extended Kalman filter would have that
 linearises at the truth, of the filter (`bound`) or of the smoother (`bound:smoother`): the covariance

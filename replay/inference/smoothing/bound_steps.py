@@ -1,4 +1,4 @@
-"""The steps of a filter that linearises at the true states."""
+"""Predicts and updates the covariance of a filter that linearises at the true states."""
 
 from typing import Any, NamedTuple
 

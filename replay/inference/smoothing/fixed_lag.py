@@ -1,4 +1,4 @@
-"""The way back a fixed lag behind a filter, without going over the whole lag for every estimate.
+"""Smooths at a fixed lag behind a filter, in constant work per node whatever the lag.
 
 The lag is a window of steps that slides: as they compose, whatever brackets are put, a queue made of two
 stacks has the composition of all its steps at hand, at two compositions a node however many nodes the

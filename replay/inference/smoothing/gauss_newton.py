@@ -1,4 +1,4 @@
-"""Gauss-Newton on all states of a run, damped where a step would raise the cost.
+"""Minimises the cost of all states of a run by damped Gauss-Newton steps.
 
 What is minimised, over the state at the prior's time and at every stamp after it, is
 

@@ -1,4 +1,4 @@
-"""The iterated smoother: the states of a whole run that are most probable, given all measurements.
+"""Finds the most probable states of a whole run, given all measurements: the iterated smoother.
 
 It keeps the events of a run, smooths them once as the extended smoother does, and from there searches
 the trajectory of the least cost; see `replay.inference.smoothing.gauss_newton`.

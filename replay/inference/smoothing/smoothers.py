@@ -1,4 +1,4 @@
-"""Smoothers: filters that keep their nodes, and at the end, or a lag behind, go back over them.
+"""Runs smoothers: filters that keep their nodes and pass back over them, at the end or at a lag.
 
 The steps that a filter leaves, and the way back over them, are in
 `replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in

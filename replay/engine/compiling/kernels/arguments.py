@@ -1,4 +1,4 @@
-"""What a kernel is called with: described for its key, packed as words, and loaded in the kernel.
+"""Describes a kernel's arguments for its key, packs them as words, and loads them in the kernel.
 
 NumPy's own structure of an array says where its numbers and its sizes are; its address is the word.
 """

@@ -1,4 +1,4 @@
-"""Expressions of a kernel: what is known is worked out as Python would, the rest are instructions."""
+"""Lowers expressions: what is known is evaluated as Python would, the rest becomes instructions."""
 
 import ast
 import operator

@@ -1,4 +1,4 @@
-"""The frame of a function that is lowered: its blocks, and the places in memory of its variables."""
+"""Keeps the frame of a function that is lowered: its blocks, and its variables' places in memory."""
 
 from types import FunctionType
 from typing import Any

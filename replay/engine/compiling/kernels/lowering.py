@@ -1,4 +1,4 @@
-"""Goes through a function's source once and writes what it does as LLVM's text.
+"""Lowers a function: goes through its source once and writes what it does as LLVM's text.
 
 Statements are here, expressions in `expressions`. A name that gets one value before all its uses is that
 value; any other is a place in memory, of which LLVM makes registers. What is known already is worked

@@ -1,4 +1,4 @@
-"""Kernels as machine code: made by LLVM, kept on disk, loaded, and called with arrays as they are.
+"""Makes machine code of kernels through LLVM, keeps and loads it, and calls it with NumPy's arrays.
 
 A kernel is compiled for the kinds and sizes of its arguments: of arrays that a core works in all sizes
 are known, of all others those behind the first axis, up to 64 (see `_described`). Its key is all that it

@@ -1,4 +1,4 @@
-"""The scope of a function that is lowered: what its names stand for, and where in its source it is."""
+"""Looks up what a lowered function's names stand for, and where in its source it is."""
 
 import builtins
 from itertools import count
