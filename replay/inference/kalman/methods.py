@@ -61,7 +61,7 @@ SETTLED = 1e-12  # of the iterated update: the largest component of the last ste
 
 
 class MethodParameters(Parameters):
-    """Options of every method.
+    """Defines the options of every method.
 
     `every_s` asks for estimates at this interval too, besides those at the sensors' stamps. `mode` is
     the motion to use of a model that has several. `estimate` names parameters that become part of the
@@ -96,7 +96,7 @@ class RegressionParameters(MethodParameters):
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One way to estimate the state of any model.
+    """Describes one way to estimate the state of any model.
 
     Attributes:
         summary: what it is, in one line.
@@ -136,7 +136,7 @@ def _iterated(stage: Stage) -> Steps:
 
 
 def iterated_update(stage: Stage, number: int) -> Function:
-    """The update linearised anew at every iterate, until it settles: Gauss-Newton on the posterior.
+    """Make the update that linearises at every iterate until it settles: Gauss-Newton on the posterior.
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
     gate is tested at the prediction, and so is how much the measurement counts; innovation and
@@ -153,7 +153,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
     def relinearise(
         mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
     ) -> None:
-        """The innovation by the Jacobian at mean (+) step, as one about the mean."""
+        """Form the innovation by the Jacobian at mean (+) step, as one about the mean."""
         innovation, step, rows = work.innovations[number], work.step, work.rows
         step_to(mean, work)
         linearise(read_state(work.state), read_reference(data), parameters, work)
@@ -212,7 +212,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
 
 
 def _sampled(stage: Stage) -> Steps:
-    """Regression at samples; what is linear is passed on exactly instead."""
+    """Make steps by regression at samples; what is linear is passed on exactly."""
     model, motion = stage.model, stage.motion
     dimensions: list[int] = []
     shapes: list[tuple[int, tuple[str, ...]]] = []
@@ -305,7 +305,7 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
 
 
 def _lacks_slopes(model: Model) -> str:
-    """A sensor whose linearised components depend on one another at every state, in noise and all.
+    """Name a sensor whose linearised components depend on one another at every state, in noise and all.
 
     As those of a point and its square do: the innovation covariance is then singular.
     """
@@ -359,12 +359,12 @@ FILTERS: Mapping[str, Method] = {
 
 
 def no_steps(stage: Stage) -> Steps:
-    """For a method whose steps are those of one that `Method.made_for` makes for its parameters."""
+    """Refuse to make steps: for a method that `Method.made_for` makes for its parameters."""
     raise AssertionError("the method was not made for its parameters")
 
 
 def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
-    """The name and the variant of a filter for a method to rest on, such as "lrkf:s2kf-50".
+    """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that rests on it.
 
     Raises BadInput where there is no such filter; `use` says what for.
     """
@@ -378,7 +378,7 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
 
 @lru_cache(maxsize=64)
 def filter_with(name: str, variant: str) -> Method:
-    """A filter whose variant is set, as in `lrkf:s2kf-50`."""
+    """Set the variant of a filter, as in `lrkf:s2kf-50`."""
     chosen = FILTERS[name]
     sampling = chosen.sampling
     if not variant or sampling is None:

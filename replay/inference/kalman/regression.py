@@ -34,7 +34,7 @@ MEANS = 30  # at most so many steps to an intrinsic mean
 
 @varying(0, points=1, weights=1)
 class SampleMemory(NamedTuple):
-    """Samples of N(0, I), and what a regression at them works in; N = t + noises.
+    """Holds samples of N(0, I), and the arrays of a regression at them; N = t + noises.
 
     Attributes:
         points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
@@ -61,7 +61,7 @@ class SampleMemory(NamedTuple):
 def sample_memory(
     sets: SampleSets, kinds: Sequence[str], noises: int, outputs: Sequence[str]
 ) -> SampleMemory:
-    """Memory for the regression of a function of a state and its noise."""
+    """Make memory for the regression of a function of a state and its noise."""
     _, count, dimension = sets.points.shape
     values = tangent_size(outputs)
     return SampleMemory(
@@ -79,7 +79,7 @@ def sample_memory(
 def regression(
     function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
 ) -> Function:
-    """The regression of `function(state, noise, arguments)` at samples.
+    """Make the regression of `function(state, noise, arguments)` at weighted samples.
 
     Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
     takes the set of samples number `sample_index`, fills `memory.centre` with the intrinsic mean of the
@@ -140,7 +140,7 @@ def regression(
 
 @lru_cache(maxsize=64)
 def settling(kinds: tuple[str, ...]) -> Function:
-    """`settle(weights, values, centre, shift)`: moves a centre to the intrinsic mean of values.
+    """Make `settle(weights, values, centre, shift)`: it moves a centre to the intrinsic mean of values.
 
     The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
     afterwards.
@@ -168,7 +168,7 @@ def _no_variances(*_: Any) -> tuple[float, ...]:
 
 
 def sampled_motion(stage: Stage, number: int) -> Function:
-    """Prediction by regression at the samples `work.samples[number]`.
+    """Make the prediction by regression at the samples `work.samples[number]`.
 
     Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
     """
@@ -220,7 +220,7 @@ def _moved(motion: Motion) -> Function:
 
 
 def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
-    """`innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
+    """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(_measured(sensor), model.kinds, sensor.noises, kinds)

@@ -33,14 +33,14 @@ NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Gaussian(NamedTuple):
-    """What is believed of the states, first axis = run: means (runs, n), covariances (runs, t, t)."""
+    """Holds a Gaussian of every run, first axis = run: means (runs, n), covariances (runs, t, t)."""
 
     mean: Floats
     covariance: Floats
 
 
 class Steps(NamedTuple):
-    """A recursive filter of one model, as the recursion takes it.
+    """Holds the steps of a recursive filter of one model, as the recursion calls them.
 
     Attributes:
         memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
@@ -64,7 +64,7 @@ class Steps(NamedTuple):
 
 
 class InnovationRecord(NamedTuple):
-    """What an update tells of itself: one row of the results.
+    """Holds the innovation of one update: one row of the results.
 
     Attributes:
         difference, covariance: (slots,), (slots, slots) the innovation; a sensor fills its own slots.
@@ -77,7 +77,7 @@ class InnovationRecord(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What the steps of one core work in.
+    """Holds the arrays that the steps of one core work in.
 
     Attributes:
         state: (n,), the moved state.
@@ -109,7 +109,12 @@ class Workspace(NamedTuple):
 
 
 def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
-    """A workspace for a model with the sensors at hand."""
+    """Make the workspace of a model with the sensors at hand.
+
+    Args:
+        stage: the model, with n components of the state, t of the tangent space, m of a sensor at most.
+        samples: the memories of `regression`, motion first, one for each of `Steps.sampled`.
+    """
     model, t = stage.model, stage.model.tangent
     m = max((len(sensor.measured) for sensor in stage.sensors), default=0)
     noises = max([stage.motion.noises, *(sensor.noises for sensor in stage.sensors)])
@@ -139,10 +144,18 @@ def gaussian_filter(
     memory: Callable[[tuple[Any, ...]], Any] | None = None,
     sampled: tuple[int, ...] = (),
 ) -> Steps:
-    """The steps of a filter whose belief is one Gaussian.
+    """Make the steps of a filter whose belief is one Gaussian.
 
-    `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` and the updates
-    alike take one run's mean and covariance.
+    Args:
+        stage: the model as a method takes it.
+        predict: `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` moves
+            one run's mean (n,) and covariance (t, t) in place; returns whether all is well.
+        updates: for every sensor, `update(mean, covariance, data, parameters, gate, sample_index, work,
+            record)`; see `kalman_update`.
+        memory: (sets) -> the workspace; `workspace(stage)` unless given.
+        sampled: see `Steps.sampled`.
+
+    Returns the steps, which pass over gaps of the control where the motion has a `gap_noise`.
     """
     gap_noise = stage.motion.gap_noise
     if gap_noise is not None:
@@ -175,7 +188,7 @@ def gaussian_filter(
 
 
 def _predicting_gap(model: Model, gap_noise: Function, predict_driven: Function) -> Function:
-    """The prediction that, where the control is NaN, keeps the mean and adds to the covariance."""
+    """Make the prediction that, where the control is NaN, keeps the mean and adds the gap noise."""
     read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
 
     def predict(

@@ -33,7 +33,7 @@ from replay.inference.model.stage import Stage
 
 
 class Reading(NamedTuple):
-    """How a sensor's message stands in an event's data: measured, what it is about, its own noise."""
+    """Says how a sensor's message stands in an event's data: measurement, reference, its own noise."""
 
     width: int
     measured: Function
@@ -42,7 +42,7 @@ class Reading(NamedTuple):
 
 
 def reading(sensor: Sensor) -> Reading:
-    """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
+    """Find where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
     m, reference = len(sensor.measured), sensor.reference_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
     return Reading(
@@ -51,7 +51,7 @@ def reading(sensor: Sensor) -> Reading:
 
 
 def sensor_noise(sensor: Sensor) -> Function:
-    """`add(spread, data, parameters, work)`: the measurement noise onto a covariance (m, m)."""
+    """Make `add(spread, data, parameters, work)`: it adds the measurement noise R to S (m, m)."""
     m = len(sensor.measured)
     if sensor.covariance:
         read, add_message = reading(sensor).noise, adding_noise(m)
@@ -79,7 +79,7 @@ def sensor_noise(sensor: Sensor) -> Function:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> Function:
-    """`linearise(state, reference, parameters, work)`: fills `predicted`, `rows` and `noise_gain`."""
+    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`."""
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
 
@@ -122,9 +122,14 @@ def linear_sensor(stage: Stage, number: int) -> Function:
 
 
 def linear_innovation(sensor: Sensor, number: int) -> Function:
-    """`compare(covariance, data, parameters, work)`: the innovation of a linearised measurement.
+    """Make the function that forms the innovation of a linearised measurement.
 
-    From the workspace's `predicted` and `rows`, v = y - h, C = P H' and S = H C + R.
+    Args:
+        sensor: the sensor, with m measured components.
+        number: its number, which says where its innovation stands in the workspace.
+
+    Returns `compare(covariance, data, parameters, work)`: from the workspace's `predicted` h (m,) and
+    `rows` H (m, t), it fills v = y - h, C = P H' and S = H C + R.
     """
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
     add_noise = sensor_noise(sensor)
@@ -150,11 +155,16 @@ def linear_innovation(sensor: Sensor, number: int) -> Function:
 
 
 def whitening(sensor: Sensor, number: int) -> Function:
-    """`whiten_residual(data, parameters, work)`: a linearised measurement in units of its noise.
+    """Make the function that expresses a linearised measurement in units of its noise.
 
-    From the workspace's `predicted` and `rows`, with R = L L': the innovation's difference becomes
-    L^-1 (y - h), its cross-covariance H' L^-T. Returns how many components were measured, and the square
-    of the residual, NaN where R is not positive definite.
+    Args:
+        sensor: the sensor, with m measured components.
+        number: its number, which says where its innovation stands in the workspace.
+
+    Returns `whiten_residual(data, parameters, work)`. From the workspace's `predicted` and `rows`, with
+    R = L L', the innovation's difference becomes L^-1 (y - h), its cross-covariance H' L^-T. It returns
+    how many components were measured, and the square of the residual, NaN where R is not positive
+    definite.
     """
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
     add_noise = sensor_noise(sensor)
@@ -178,7 +188,7 @@ def whitening(sensor: Sensor, number: int) -> Function:
 
 
 def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
-    """All components that these sensors measure, by name with their kinds: those of the innovations."""
+    """List all components that these sensors measure, by name with kinds: those of the innovations."""
     components: dict[str, str] = {}
     for sensor in sensors:
         for name, kind in sensor.measured.items():
@@ -190,7 +200,7 @@ def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
 
 
 def writing_innovation(stage: Stage, number: int) -> Function:
-    """`write_innovation(innovation, record)`: sensor `number`'s, at the places of its components."""
+    """Make `write_innovation(innovation, record)`: sensor `number`'s, at its components' places."""
     components = list(innovation_components(stage.sensors))
     places = tuple(components.index(name) for name in stage.sensors[number].measured)
 
@@ -206,12 +216,21 @@ def writing_innovation(stage: Stage, number: int) -> Function:
 
 
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
-    """The Kalman update by sensor `number`, after `innovate` has filled its innovation.
+    """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
-    in may still count less, see `gaussian.inflation`.
+    is where none is left. What the gate lets in may still count less, see `gaussian.inflation`.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        innovate: `innovate(mean, covariance, data, parameters, sample_index, work)` fills the innovation
+            v (m,), S (m, m), C (t, m) of the sensor; returns whether the covariance was one.
+
+    Returns `update(mean, covariance, data, parameters, gate, sample_index, work, record)`, in place, for
+    a mean (n,), a covariance (t, t) and bounds of the NIS `gate` (m + 1,) by the number of components.
+    It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
     """
     model, m, write_innovation = (
         stage.model,
@@ -266,7 +285,7 @@ def write_numbers(
     accepted: bool,
     factor: float,
 ) -> None:
-    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is.
+    """Write the NIS, the log-likelihood (zero where the gate is shut) and whether it is open.
 
     The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
     """

@@ -15,7 +15,7 @@ LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 
 class Innovation(NamedTuple):
-    """How a measurement differs from its prediction.
+    """Holds how a measurement differs from its prediction.
 
     Attributes:
         difference: v (m,), NaN where the measurement has no such component.
@@ -29,16 +29,21 @@ class Innovation(NamedTuple):
 
 
 def no_innovation(states: int, components: int) -> Innovation:
-    """Memory for an innovation."""
+    """Make memory for an innovation of m components of a state with t tangent components."""
     return Innovation(
         np.empty(components), np.empty((components, components)), np.empty((states, components))
     )
 
 
 def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
-    """Fill the lower factor of the leading block; False where it is not positive definite (or NaN).
+    """Fill the lower Cholesky factor L of the leading block of a matrix, A = L L'.
 
-    Both arguments may be the same array.
+    Args:
+        factor: (n, n) filled; may be the matrix itself.
+        matrix: A (n, n), symmetric in its first `size` rows and columns.
+        size: of the leading block.
+
+    Returns False where the block is not positive definite (or NaN).
     """
     for column in range(size):
         for row in range(column, size):
@@ -55,9 +60,9 @@ def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 
 
 def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
-    """The same of a positive semidefinite matrix: what is below a pivot of about zero is zero.
+    """Fill the lower factor of a positive semidefinite block: below a pivot of about zero it is zero.
 
-    False where it is none (or NaN).
+    Args as for `cholesky`. Returns False where the block is indefinite (or NaN).
     """
     for column in range(size):
         smallest = 1e-15 * size * matrix[column, column]
@@ -76,7 +81,7 @@ def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 
 
 def wrap(difference: float, is_angle: bool) -> float:
-    """The difference, in [-pi, pi) where it is one of angles."""
+    """Wrap a difference of angles to [-pi, pi); any other stays as it is."""
     if is_angle and not abs(difference) < np.pi:
         return wrap_angle(difference)
     return difference
@@ -121,7 +126,7 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
 
 
 def inflation(squared: float, size: int, parameters: Any) -> float:
-    """How many times larger the covariance of an innovation counts, of a NIS and so many components.
+    """Compute how many times larger the covariance of an innovation counts, from its NIS and size.
 
     To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
     a Kalman update still. 1 where no option of `replay.inference.model.parameters.ModelParameters` is
@@ -150,7 +155,7 @@ def inflation(squared: float, size: int, parameters: Any) -> float:
 
 
 def inflate(innovation: Innovation, size: int, factor: float) -> None:
-    """Make the covariance of a whitened innovation so many times larger."""
+    """Multiply the covariance of a whitened innovation of `size` components by a factor, in place."""
     root = np.sqrt(factor)
     for i in range(size):
         innovation.difference[i] /= root
@@ -159,7 +164,7 @@ def inflate(innovation: Innovation, size: int, factor: float) -> None:
 
 
 def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
-    """Fill `step` with K v of a whitened innovation; the cross-covariance C becomes W = C L^-T.
+    """Fill `step` (t,) with K v of a whitened innovation; its cross-covariance C becomes W = C L^-T.
 
     So K v = W L^-1 v, and K S K' = W W'.
     """
@@ -175,7 +180,7 @@ def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
 
 
 def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
-    """P becomes P - W W', with W as `kalman_step` leaves it."""
+    """Downdate P (t, t) to P - W W', with the first columns of W (t, m) as `kalman_step` leaves it."""
     for row in range(len(covariance)):
         for column in range(row + 1):
             entry = covariance[row, column]
@@ -187,7 +192,7 @@ def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
 def scalar_update(
     mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
 ) -> None:
-    """The Kalman update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
+    """Update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
     share = difference / variance
     for row in range(len(cross)):
         mean[row] += cross[row] * share
@@ -198,7 +203,7 @@ def scalar_update(
 
 
 def multiply(left: Floats, right: Floats, product: Floats) -> None:
-    """Fill `product` with that of two square matrices."""
+    """Fill `product` (n, n) with that of two square matrices."""
     for row in range(len(product)):
         for column in range(len(product)):
             entry = 0.0
@@ -208,7 +213,7 @@ def multiply(left: Floats, right: Floats, product: Floats) -> None:
 
 
 def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
-    """Make F A of A, by way of `product`."""
+    """Multiply A (n, n) by F from the left in place, by way of `product`."""
     multiply(left, matrix, product)
     for row in range(len(matrix)):
         for column in range(len(matrix)):
@@ -216,7 +221,7 @@ def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
 
 
 def propagate_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
-    """P becomes F P F', by way of `product`."""
+    """Propagate P (t, t) to F P F' in place, by way of `product`, which becomes F P."""
     size = len(covariance)
     multiply(transition, covariance, product)
     for row in range(size):
@@ -234,7 +239,7 @@ def predict_constant_velocity(
     layout: tuple[int, int],
     noise: tuple[float, float, float],
 ) -> None:
-    """Move positions at constant velocity for a while, in place.
+    """Predict positions and velocities at constant velocity, in place.
 
     Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
     a variance of the position, a covariance of both, and a variance of the velocity.
@@ -256,7 +261,7 @@ def predict_constant_velocity(
 
 
 def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
-    """P becomes P + G diag(variances) G', for a gain G whose columns go with the variances."""
+    """Add G diag(variances) G' to P (t, t), for a gain G (t, k) and variances (k,) of its columns."""
     for row in range(len(covariance)):
         for column in range(row + 1):
             entry = covariance[row, column]

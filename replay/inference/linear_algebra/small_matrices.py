@@ -32,19 +32,19 @@ __all__ = ["UpdateMemory", "cholesky", "predict", "solve", "update", "update_mem
 
 
 class UpdateMemory(NamedTuple):
-    """What `update` works in; afterwards the innovation is used up."""
+    """Holds what `update` works in; afterwards the innovation is used up."""
 
     innovation: Innovation
     step: Floats
 
 
 def update_memory(states: int, components: int) -> UpdateMemory:
-    """Memory for updates of so many states by up to so many measured components."""
+    """Make memory for updates of so many states by up to so many measured components."""
     return UpdateMemory(no_innovation(states, components), np.empty(states))
 
 
 def solve(matrix: Floats, right: Floats, size: int) -> bool:
-    """Make x of b in place, A x = b, by Cholesky's factor of the leading block, which overwrites A.
+    """Solve A x = b in place, by Cholesky's factor of the leading block, which overwrites A.
 
     Args:
         matrix: A (n, n), symmetric positive definite in its first `size` rows and columns.
@@ -69,7 +69,7 @@ def solve(matrix: Floats, right: Floats, size: int) -> bool:
 def predict(
     mean: Floats, covariance: Floats, transition: Floats, noise: Floats, product: Floats
 ) -> None:
-    """Make F x of x, and F P F' + Q of P, in place.
+    """Predict in place: x becomes F x, and P becomes F P F' + Q.
 
     Args:
         mean: x (n,).
@@ -101,7 +101,7 @@ def update(
     memory: UpdateMemory,
     gate: float = float("inf"),
 ) -> float:
-    """The Kalman update in place: x + K v and P - K S K' with S = H P H' + R and K = P H' S^-1.
+    """Update in place: x + K v and P - K S K', with S = H P H' + R and K = P H' S^-1.
 
     Args:
         mean: x (n,).

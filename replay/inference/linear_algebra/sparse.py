@@ -14,7 +14,7 @@ Pattern = tuple[tuple[tuple[int, float | None], ...], ...]
 
 
 def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) -> Pattern | None:
-    """The pattern of a matrix of so many rows, from its entries by place (None where one varies)."""
+    """Make the pattern of a matrix of so many rows from its entries by place (None where one varies)."""
     if known is None:
         return None
     return tuple(
@@ -24,7 +24,7 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
 
 
 def propagating_covariance(pattern: Pattern | None) -> Function:
-    """`move(covariance, transition, product)`: P becomes F P F', by way of the product F P."""
+    """Make `move(covariance, transition, product)`: P (t, t) becomes F P F'; `product` becomes F P."""
     if pattern is None:
         return propagate_covariance
     rows = tuple(enumerate(pattern))
@@ -50,7 +50,7 @@ def propagating_covariance(pattern: Pattern | None) -> Function:
 
 
 def adding_through(pattern: Pattern | None) -> Function:
-    """`add(covariance, gain, variances)`: P becomes P + G diag(variances) G'."""
+    """Make `add(covariance, gain, variances)`: P becomes P + G diag(variances) G'."""
     if pattern is None:
         return add_through
     columns: list[dict[int, Any]] = [dict(entries) for entries in pattern]

@@ -13,7 +13,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class GaussMarkov(NamedTuple):
-    """What is known of a component.
+    """Describes a first-order Gauss-Markov process, or a random walk.
 
     Attributes:
         sigma: its standard deviation at first.
@@ -29,7 +29,7 @@ class GaussMarkov(NamedTuple):
 def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
-    """Parameters of a model with those of the walks of these components."""
+    """Add to a model's parameters those of the processes of these components."""
     processes: dict[str, Any] = {
         f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }
@@ -37,12 +37,12 @@ def with_gauss_markov_parameters(
 
 
 def remaining_share(name: str, duration_s: Any, parameters: Any) -> Any:
-    """The share of a component's distance from its mean that is left after a step."""
+    """Compute the share of a component's distance from its mean that is left after a step."""
     return np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
 
 
 def added_variance(name: str, duration_s: Any, parameters: Any) -> Any:
-    """The variance that a step adds to it."""
+    """Compute the variance that a step adds to a component."""
     walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
     returned = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
     return walked + returned * getattr(parameters, f"sigma_{name}") ** 2

@@ -23,7 +23,7 @@ FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """What measurements are about, by number: the fixed points of a topic of the log.
+    """Describes a map: fixed points of a topic, to which measurements refer by number.
 
     Attributes:
         topic: the map's.
@@ -44,14 +44,14 @@ class Map:
 
     @property
     def size(self) -> int:
-        """How many components a point has."""
+        """Count the components of a point."""
         return len(self.components)
 
 
 @renamed(instead="fallbacks")
 @dataclass(frozen=True, eq=False)
 class Control:
-    """What drives the motion.
+    """Describes what drives the motion.
 
     Attributes:
         topic: its name, under the prefix of what is estimated.
@@ -84,7 +84,7 @@ class Control:
 @renamed(lost="gap_noise")
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the state moves.
+    """Describes how the state moves.
 
     Attributes:
         move: (state, control, duration_s, parameters) -> state. Where `noises` says how many numbers of
@@ -116,14 +116,14 @@ class Motion:
     moments: Function | None = None
 
     def triangle(self, tangent: int) -> int:
-        """How many numbers `noise` returns where it is no variances alone."""
+        """Count the numbers that `noise` returns where these are a lower triangle."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
 
 @dataclass(frozen=True, eq=False)
 class Switching:
-    """How a thing changes from mode to mode: a Markov chain in continuous time.
+    """Describes how a target changes from mode to mode: a Markov chain in continuous time.
 
     Attributes:
         rates: (parameters) -> how often per second it changes from the first mode to each of the others,
@@ -138,7 +138,7 @@ class Switching:
 @renamed(about="reference")
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What a sensor measures of the state.
+    """Describes what a sensor measures of the state.
 
     Attributes:
         topic: its name, under the prefix of what is estimated; a slash in front makes it everybody's.
@@ -193,7 +193,7 @@ class Sensor:
 
     @property
     def maps(self) -> tuple[Map, ...]:
-        """The maps of the points that a message is about."""
+        """List the maps of the points that a message refers to."""
         return (
             self.reference
             if isinstance(self.reference, tuple)
@@ -204,12 +204,12 @@ class Sensor:
 
     @property
     def control_start(self) -> int:
-        """How many numbers of `reference` come before those of the control: the points' components."""
+        """Count the numbers of `reference` before those of the control: the points' components."""
         return sum(each.size for each in self.maps)
 
     @property
     def reference_size(self) -> int:
-        """How many numbers `measure` gets as `reference`: points, control, fields, points' numbers."""
+        """Count the numbers of `reference`: points, control, fields, the points' numbers."""
         controls = len(self.control.components) if self.control else 0
         numbers = len(self.maps) if self.is_numbered else 0
         return self.control_start + controls + sum(self.fields.values()) + numbers
@@ -217,7 +217,7 @@ class Sensor:
 
 @lru_cache(maxsize=64)
 def fix_sensor(places: tuple[int, ...]) -> Sensor:
-    """The sensor of position fixes, of a state that has x, y and perhaps z in these places."""
+    """Make the sensor of position fixes, of a state that has x, y and perhaps z in these places."""
 
     def position(state: Any, reference: Any, parameters: Any) -> Any:
         return tuple(state[place] for place in places)
@@ -239,7 +239,7 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """How a state is corrected where one direction of its error, such as a heading, bends all others.
+    """Describes how a state is corrected where one direction of its error, as of a heading, bends others.
 
     A belief that is wide in that direction is no ellipsoid: given how far the state is off along it, the
     mean of the rest moves on a curve. `slope` (t,) is the tangent there, P d / d' P d with the
@@ -262,7 +262,7 @@ class Correction:
 @renamed(estimable="augmentable")
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model of one kind of thing; a log may hold several of them, each under its own prefix.
+    """Describes a model of one kind of target; a log may hold several, each under its own prefix.
 
     Attributes:
         summary: what it is, in one line.
@@ -335,7 +335,7 @@ class Model:
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """The sensors, and that of position fixes unless the model has one of its own."""
+        """List the sensors, with that of position fixes unless the model has one of its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
         has_position = names[:2] == list(POSITION[:2])
         has_own = any(sensor.topic == FIX for sensor in self.sensors)
@@ -346,25 +346,25 @@ class Model:
 
     @property
     def finds_start(self) -> bool:
-        """Whether the model finds where to start itself, see `Start.find`."""
+        """Tell whether the model finds its own start, see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of the state's components."""
+        """List the kinds of the state's components."""
         return tuple(self.state.values())
 
     @property
     def size(self) -> int:
-        """How many components the state has."""
+        """Count the components of the state."""
         return len(self.state)
 
     @property
     def tangent(self) -> int:
-        """How many its tangent space has: an orientation has four components and three."""
+        """Count those of its tangent space: an orientation has four components and three."""
         return tangent_size(self.kinds)
 
     @property
     def controls(self) -> int:
-        """How many components the control has."""
+        """Count the components of the control."""
         return len(self.control.components) if self.control else 0

@@ -11,7 +11,7 @@ from recorders.parameters import Parameters
 
 @cache
 def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
-    """The parameters that model functions may read: all that are numbers."""
+    """List the parameters that model functions may read: all that are numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")
     return tuple(
@@ -23,12 +23,12 @@ def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def settings_type(names: tuple[str, ...]) -> type[Any]:
-    """The NamedTuple that model functions get as their parameters."""
+    """Make the NamedTuple that model functions get as their parameters."""
     return namedtuple("Settings", names)
 
 
 class ModelParameters(Parameters):
-    """Options of every model.
+    """Defines the options of every model.
 
     A parameter that is none is what the channels of the log state: the sensor's own first, then those
     of control, prior and the other sensors.

@@ -12,7 +12,7 @@ from replay.engine.renamed import renamed
 @renamed(suspect="check_prior")
 @dataclass(frozen=True, eq=False)
 class Start:
-    """What is assumed of a log that has no prior: it was not made for the model.
+    """Describes what is assumed of a log that has no prior: it was not made for the model.
 
     It begins at the first message that measures components of the state by their names, a fix or a pose
     with its covariance. What that does not measure is zero, and as uncertain as is said here. With no
@@ -42,7 +42,7 @@ class Start:
 
 
 class Started(NamedTuple):
-    """The start of a run: its stamp, mean (n,), covariance (t, t), and how it was found, in words."""
+    """Holds the start of a run: its stamp, mean (n,), covariance (t, t), and in words how it was found."""
 
     time_ns: int
     mean: Floats

@@ -25,13 +25,13 @@ from replay.inference.run.timing import last_of_stamps, select_events, where_wan
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
+    """Holds the points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
 
     keys: Integers
     places: Floats
 
     def rows(self, run: Integers, number: Integers) -> Integers:
-        """The rows of the points with these numbers in these runs; -1 where there is none."""
+        """Find the rows of the points with these numbers in these runs; -1 where there is none."""
         keys = (run << 32) + number
         if len(self.keys) == 0:
             return np.full(len(keys), -1)
@@ -39,13 +39,13 @@ class Points:
         return np.where(self.keys[rows] == keys, rows, -1)
 
     def at(self, rows: Integers) -> Floats:
-        """The places (m, d) of rows as `rows` gives them; NaN where there is none."""
+        """Look up the places (m, d) of rows as `rows` gives them; NaN where there is none."""
         nowhere = np.full((1, self.places.shape[1]), np.nan)  # what has no row takes the last one
         return np.concatenate([self.places, nowhere])[rows]
 
 
 def points_of(ragged: Ragged, asked: Map) -> Points:
-    """The points of all runs; raises BadInput where they lack a component."""
+    """Collect the points of all runs; raises BadInput where they lack a component."""
     places = read_vectors(ragged.stream, asked.point, asked.components)
     run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
     keys = (run << 32) + ragged[asked.number]
@@ -54,7 +54,7 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
 
 
 class Context(NamedTuple):
-    """What messages are read against: the points of every map by its topic, and the plane's origins.
+    """Holds what messages are read against: every map's points by its topic, and the planes' origins.
 
     The origins (runs, 3) are latitude, longitude and altitude; None where no fix needs them.
     """
@@ -65,7 +65,7 @@ class Context(NamedTuple):
 
 @lru_cache(maxsize=64)
 def data_columns(stage: Stage) -> tuple[int, int]:
-    """How many numbers an event has, and the first of the control's among them."""
+    """Count the numbers of an event, and find the first of the control's among them."""
     width, control = (
         max((reading(sensor).width for sensor in stage.sensors), default=0),
         stage.model.control,
@@ -77,7 +77,17 @@ def data_columns(stage: Stage) -> tuple[int, int]:
 def filter_events(
     stage: Stage, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
-    """A block's messages as the recursion takes them, and which of them lack their covariance."""
+    """Turn a block's messages into events of the recursion.
+
+    Args:
+        stage: the model with the sensors at hand.
+        found: its topics.
+        block: the messages of these topics, in all runs.
+        context: maps and origins.
+        settings: (1 + sensors, fields), see `settings_of`.
+
+    Returns the events, and which messages (n,) of the block have no covariance and are left out.
+    """
     merged, control = block.events, stage.model.control
     width, start = data_columns(stage)
     uses: list[tuple[str, Table]] = []
@@ -113,7 +123,7 @@ def filter_events(
 
 
 class Table(NamedTuple):
-    """One topic's messages: data (n, width), source, what they are about, who lacks a covariance."""
+    """Holds one topic's messages: data (n, width), source, reference, and which lack a covariance."""
 
     data: Floats
     source: Integers
@@ -122,7 +132,7 @@ class Table(NamedTuple):
 
 
 def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
-    """The messages of a topic as what another sensor measures by them, and their places among all.
+    """Turn a topic's messages into what another sensor measures by them, with their places among all.
 
     One of which nothing is measured does not come again.
     """
@@ -138,7 +148,7 @@ def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple
 
 
 def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents]]) -> FilterEvents:
-    """Events with others after those at whose places they are."""
+    """Insert other events after those at whose places they are."""
     places, others = zip(*again, strict=True)
     order = np.argsort(np.concatenate([np.arange(len(events.time_ns)), *places]), kind="stable")
     offsets, *columns = zip(events, *others, strict=True)
@@ -146,7 +156,7 @@ def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
-    """The numbers of a control in the columns of its components; NaN where they come from elsewhere."""
+    """Read a control into the columns of its components; NaN where they come from elsewhere."""
     count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
     read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
@@ -160,9 +170,18 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
 
 
 def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
-    """The messages of sensor `number`: measured, what it is about, its covariance; see `steps.reading`.
+    """Read the messages of a sensor: measurement, reference and covariance; see `update.reading`.
 
-    A message that lacks its covariance, or of which all is NaN, is as if it had not come.
+    A message without a covariance, or of which all is NaN, counts as none.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        ragged: its messages in all runs.
+        context: maps and origins.
+        settings: (1 + sensors, fields), see `settings_of`.
+
+    Raises BadInput where a field has another width than the model declares.
     """
     sensor, (width, _) = stage.sensors[number], data_columns(stage)
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
@@ -214,7 +233,7 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
 
 
 def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
-    """What messages measure, their covariances and which of them lack one."""
+    """Read measurements, their covariances and which of them lack one."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
     assert sensor.read is not None
@@ -229,7 +248,7 @@ def _fields(stream: Stream, names: Sequence[str]) -> Floats:
 
 
 def _field(stream: Stream, name: str, size: int) -> Floats:
-    """A field of numbers or vectors (n, size); raises BadInput where it has another width."""
+    """Read a field of numbers or vectors (n, size); raises BadInput where it has another width."""
     if not len(stream):  # vectors have no width here
         return np.empty((0, size))
     numbers = np.asarray(stream[name], float).reshape(len(stream), -1)
@@ -241,7 +260,7 @@ def _field(stream: Stream, name: str, size: int) -> Floats:
 
 
 def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) -> Floats:
-    """What a model's own function reads of a topic; BadInput where that is not as wide as it says."""
+    """Call a model's own function of a topic; raises BadInput where its array has another shape."""
     if not len(ragged):  # vectors have no width here
         return np.empty((0, components))
     numbers = np.asarray(read(ragged.stream), float)

@@ -50,7 +50,7 @@ from replay.sampling.samplers import Sampler
 
 
 class FilterState(NamedTuple):
-    """What a filter carries from block to block.
+    """Holds what a filter carries from block to block.
 
     Attributes:
         carried: see `recursion.RecursionState`.
@@ -73,13 +73,13 @@ class FilterState(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _steps(stage: Stage, method: Method) -> Steps:
-    """The steps that the loop over the runs is made of."""
+    """Make the steps of the loop over the runs."""
     return method.steps(stage)
 
 
 @lru_cache(maxsize=64)
 def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
-    """The loop over the runs, and its steps."""
+    """Make the loop over the runs, compiled when first called, and its steps."""
     steps = _steps(stage, method)
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
@@ -88,7 +88,7 @@ def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
 
 
 def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
-    """Of every sampled function; raises BadInput where the sampling is none of its dimension."""
+    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size."""
     if method.sampling is None:
         return ()
     sampling = method.sampling(parameters)
@@ -97,7 +97,7 @@ def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler,
 
 @dataclass(frozen=True)
 class Filter:
-    """One bound filter: `start`, `run` and `finish` of `replay.engine.replaying.estimator.Recursive`.
+    """Runs one bound filter: `start`, `run` and `finish` of an `estimator.Recursive`.
 
     Attributes:
         name: what its output topics begin with, after `/estimates/`.
@@ -116,13 +116,13 @@ class Filter:
     samplers: tuple[Sampler, ...]
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
-        """The topics of a log that it starts from: the prior, where there is one, and the maps."""
+        """List the topics of a log that it starts from: the prior, where there is one, and the maps."""
         maps = (each.topic for sensor in self.stage.sensors for each in sensor.maps)
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """The state at every run's prior; a run whose prior cannot be used takes no part."""
+        """Make the state at every run's prior; a run whose prior cannot be used takes no part."""
         model = self.stage.model
         time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
@@ -139,7 +139,7 @@ class Filter:
         return FilterState(carried, context, (), waiting, np.zeros(len(mean), np.int64))
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
-        """The origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
+        """Find the origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
@@ -177,7 +177,7 @@ class Filter:
         return state, [*made, *self.not_driven(events)]
 
     def not_driven(self, events: FilterEvents) -> list[Ragged]:
-        """What was not used since it was measured in a gap of the control, where that may have some."""
+        """List measurements that were skipped in a gap of the control, where that may have some."""
         control = self.stage.model.control
         if control is None or not control.gap or not _steps(self.stage, self.method).resumes_after_gap:
             return []
@@ -197,7 +197,7 @@ class Filter:
         return [Ragged(stream, ragged_rows(in_gap, events.offsets))]
 
     def passed_over(self, block: Block, without_covariance: Booleans) -> list[Ragged]:
-        """What was not used since it lacks a covariance, if any topic may."""
+        """List messages that were skipped since they lack a covariance, if any topic may."""
         control = self.stage.model.control
         drops_controls = control is not None and control.interpolated
         if not drops_controls and not any(sensor.covariance for sensor in self.stage.sensors):
@@ -220,11 +220,11 @@ class Filter:
         return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """What still waits for messages that do not come any more."""
+        """Filter what still waits for messages that do not come any more."""
         return self.ended(state)[1]
 
     def ended(self, state: FilterState) -> tuple[FilterState, list[Ragged]]:
-        """The state after what waits for messages that do not come any more, and its outputs."""
+        """Filter what waits for messages that do not come any more: the state and its outputs."""
         made: list[Ragged] = []
         if state.unsettled is not None:
             no_more = select_events(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
@@ -237,7 +237,7 @@ class Filter:
 
     @property
     def gap_ns(self) -> float:
-        """How long an interpolated control may be silent."""
+        """Read how long an interpolated control may be silent."""
         control = self.stage.model.control
         if control is None or not control.gap:
             return np.inf
@@ -246,18 +246,18 @@ class Filter:
 
     @cached_property
     def delays_ns(self) -> Integers:
-        """See `delays_of`."""
+        """Compute the delays of messages, see `delays_of`."""
         return delays_of(self.stage, self.settings)
 
     @property
     def initial(self) -> tuple[float, ...]:
-        """What drives the motion before the first message of the control."""
+        """Return what drives the motion before the first message of the control."""
         control = self.stage.model.control
         return (control.initial or (0.0,) * len(control.components)) if control else ()
 
     @property
     def why_in_sequence(self) -> str:
-        """Why it cannot go back for late messages; empty where it can."""
+        """Explain why it needs its messages in order; empty where it can take late ones."""
         control = self.stage.model.control
         if self.parameters.every_s is not None:
             return "there are no estimates between messages (every_s, --every) then"
@@ -314,18 +314,18 @@ class Filter:
     def sets(
         self, generators: tuple[Any, ...], events: FilterEvents
     ) -> Iterator[tuple[slice, tuple[Any, ...]]]:
-        """Runs, and what the steps get for them: the samples of all functions."""
+        """Iterate over runs and the samples of all functions for them."""
         return sample_sets(self.samplers, generators, events.offsets)
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Any, Innovations]:
-        """Estimates and innovations to be filled in, see `recursion.no_results`."""
+        """Make estimates and innovations to be filled in, see `recursion.no_results`."""
         return no_results(due, recorded, self.stage.model, innovation_size)
 
     @cached_property
     def gates(self) -> Floats:
-        """Bounds of the NIS (sensors + 1, largest measurement + 1), by the number of components.
+        """Compute bounds of the NIS (sensors + 1, largest measurement + 1), by the number of components.
 
         The last row is that of a gate that is open.
         """
@@ -337,15 +337,15 @@ class Filter:
 
     @property
     def truth(self) -> str:
-        """The topic that the estimates are compared with."""
+        """Name the topic that the estimates are compared with."""
         return self.found.truth
 
     def output_streams(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
-        """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""
+        """Make the streams of estimates; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
-        """The stream of estimates; run r owns offsets[r]:offsets[r + 1]."""
+        """Make the stream of states; run r owns offsets[r]:offsets[r + 1]."""
         model = self.stage.model
         stream = state_stream(
             f"/estimates/{self.name}/{model.output}",
@@ -358,7 +358,7 @@ class Filter:
         return Ragged(stream, offsets)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
-        """The stream of innovations, which needs a sensor; see `states`."""
+        """Make the stream of innovations, which needs a sensor; see `states`."""
         stream = innovation_stream(
             f"/estimates/{self.name}/innovation",
             innovations.time_ns,
@@ -376,5 +376,5 @@ class Filter:
 
 @lru_cache(maxsize=64)
 def _nis_bounds(probability: float, components: int) -> Floats:
-    """The quantiles (components + 1,) of the NIS of so many components; nothing is always let in."""
+    """Compute the quantiles (components + 1,) of the NIS by its components; zero are always let in."""
     return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))

@@ -13,7 +13,7 @@ from replay.inference.model.start import Start
 
 
 class Begun(NamedTuple):
-    """Where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; means and covariances."""
+    """Holds where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; Gaussians."""
 
     time_ns: Integers
     mean: Floats
@@ -21,7 +21,7 @@ class Begun(NamedTuple):
 
 
 class Fact(NamedTuple):
-    """A sentence, when it is told (runs,), and in which runs (runs,)."""
+    """Holds a sentence to be reported, its stamps (runs,), and the runs that it holds for (runs,)."""
 
     text: str
     time_ns: Integers
@@ -29,7 +29,7 @@ class Fact(NamedTuple):
 
 
 def diagonal_places(size: int) -> Integers:
-    """Where the diagonal stands among the rows of a lower triangle."""
+    """Find the diagonal among the rows of a lower triangle."""
     rows = np.arange(1, size + 1)
     return np.cumsum(rows) - 1
 
@@ -40,7 +40,7 @@ def run_count(first: Mapping[str, Ragged]) -> int:
 
 
 def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
+    """Make the mean (n,) and sigmas (t,) of a state that nobody knows; NaN where none is given."""
     sigmas = start.sigmas if start else {}
     kinds = list(state.values())
     mean = np.zeros(len(kinds))
@@ -54,7 +54,7 @@ def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floa
 def first_of_runs(
     ragged: Ragged, clock: Clock, usable: Booleans | None
 ) -> tuple[Integers, Booleans, Integers]:
-    """The first usable message of every run (runs,): its stamp, whether there is one, its row."""
+    """Find the first usable message of every run (runs,): its stamp, whether there is one, its row."""
     every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
     place = np.searchsorted(every, ragged.offsets)
     has_one = place[1:] > place[:-1]
@@ -66,5 +66,5 @@ def first_of_runs(
 
 
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """A stream of one message for each of some runs."""
+    """Lay out a stream of one message for each of some runs."""
     return Ragged(stream, np.append(0, np.cumsum(has_one)))

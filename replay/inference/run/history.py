@@ -20,7 +20,7 @@ Structure = tuple[tuple[str, Any], ...]
 
 
 class KeptMessages(NamedTuple):
-    """Messages in order, and what they did; first axis = run and message.
+    """Holds messages in order, and the belief after each; first axis = run and message.
 
     Attributes:
         time_ns, source, data, target_id: see `recursion.FilterEvents`; the last of uint32.
@@ -43,7 +43,7 @@ class KeptMessages(NamedTuple):
 
 
 class History(NamedTuple):
-    """What is kept of the latest messages.
+    """Holds the latest messages of every run.
 
     Attributes:
         start_ns: (runs,) stamps of the priors.
@@ -60,23 +60,23 @@ class History(NamedTuple):
 
     @property
     def capacity(self) -> int:
-        """How many rows every run has."""
+        """Count the rows of every run."""
         return len(self.kept.time_ns) // max(len(self.first), 1)
 
     @property
     def rows(self) -> Integers:
-        """The filled rows, run by run."""
+        """List the filled rows, run by run."""
         begin = np.arange(len(self.first)) * self.capacity + self.first
         before = np.cumsum(self.counts) - self.counts
         return np.repeat(begin - before, self.counts) + np.arange(self.counts.sum())
 
     @property
     def offsets(self) -> Integers:
-        """Run r has the rows offsets[r]:offsets[r + 1] of `rows`."""
+        """Return offsets by which run r has the rows offsets[r]:offsets[r + 1] of `rows`."""
         return np.append(0, np.cumsum(self.counts))
 
     def with_room(self, capacity: int) -> "History":
-        """A copy with so many rows for every run, of which the filled ones are the first."""
+        """Copy it with so many rows for every run, of which the filled ones are the first."""
         rows, runs = self.rows, np.arange(len(self.first))
         places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
 
@@ -94,7 +94,7 @@ class History(NamedTuple):
 
 
 def no_history(stage: Stage, carried: RecursionState) -> History:
-    """The priors alone, before all messages."""
+    """Make the history before all messages: the priors alone."""
     runs, innovation_size, (width, _) = (
         len(carried.time_ns),
         len(innovation_components(stage.sensors)),
@@ -117,7 +117,7 @@ def no_history(stage: Stage, carried: RecursionState) -> History:
 
 
 def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
-    """The most messages of a run that lie within a window, of those kept and those that come."""
+    """Count the most messages of a run that lie within a window, of those kept and those that come."""
     most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
     for run, (begin, end) in enumerate(zip(events.offsets[:-1], events.offsets[1:], strict=True)):
         before_ns = kept_ns[kept[run] + 1 : kept[run + 1]]
@@ -128,7 +128,7 @@ def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
 
 
 def structure_of(rows: Any) -> Structure:
-    """Of a NamedTuple of arrays, or of such NamedTuples, the names and numbers of axes."""
+    """Describe a NamedTuple of arrays, or of such NamedTuples: their names and numbers of axes."""
     return tuple(
         (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
         for name, column in zip(rows._fields, rows, strict=True)
@@ -137,7 +137,7 @@ def structure_of(rows: Any) -> Structure:
 
 @lru_cache(maxsize=64)
 def copying_rows(structure: Structure) -> Function:
-    """`copy(source, i, target, j)`: row i of a NamedTuple of arrays into row j of another."""
+    """Make `copy(source, i, target, j)`: row i of a NamedTuple of arrays to row j of another."""
     columns = tuple(name for name, of in structure if not isinstance(of, tuple))
     groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
 

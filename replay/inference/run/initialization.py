@@ -45,7 +45,7 @@ CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows whe
 
 @dataclass(frozen=True)
 class Initializer:
-    """What a filter looks for in the first messages of a log.
+    """Finds where a filter begins from the first messages of a log.
 
     Attributes:
         name: what its output topics begin with, after `/estimates/`.
@@ -63,7 +63,7 @@ class Initializer:
 
     @property
     def initialization(self) -> Initialization | None:
-        """How it is found; None where the log states all."""
+        """Return how the start is found; None where the log states all."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
@@ -77,7 +77,7 @@ class Initializer:
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """The sensors that measure the state itself, with their numbers; none of a thing without."""
+        """List the sensors that measure the state itself, with their numbers."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
@@ -86,7 +86,7 @@ class Initializer:
 
     @property
     def _starting(self) -> list[Topic]:
-        """The topics whose first message is where to begin."""
+        """List the topics whose first message says where to begin."""
         control = [] if self.found.control is None else [self.found.control]
         drives = [*control, *(topic for _, topic in self.found.fallbacks)]
         if self.stage.model.finds_start:
@@ -96,7 +96,7 @@ class Initializer:
 
     @property
     def _aligns(self) -> bool:
-        """Whether fixes alone have to tell the whole state, and can."""
+        """Tell whether fixes alone have to determine the whole state, and can."""
         model = self.stage.model
         sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
         return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
@@ -104,7 +104,13 @@ class Initializer:
     def find(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock
     ) -> Initialized:
-        """What is found in the first messages; raises BadInput where none of them can be used."""
+        """Find starts in the first messages; raises BadInput where none of them can be used.
+
+        Args:
+            first: the first messages of every run, by topic.
+            static: the topics that the filter starts from, by name.
+            clock: by which the replay stamps estimates.
+        """
         found: dict[str, Ragged] = {}
         told: list[Ragged] = []
         facts: list[Fact] = []
@@ -134,7 +140,7 @@ class Initializer:
         clock: Clock,
         origins: Floats | None,
     ) -> tuple[Ragged, list["Fact"]]:
-        """The priors of all runs, and what is to be told of them."""
+        """Make the priors of all runs, and the facts to be reported of them."""
         model, runs = self.stage.model, run_count(first)
         mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
@@ -164,7 +170,7 @@ class Initializer:
         return of_runs(stream, has_begun), facts
 
     def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
-        """That fixes did not tell all where a run begins without."""
+        """Report that fixes did not determine all, where a run begins without."""
         [measured] = [sensor.measured for _, sensor, _ in self._measuring]
         names = ", ".join(name for name in self.stage.model.state if name not in measured)
         text = (
@@ -174,7 +180,7 @@ class Initializer:
         return Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
 
     def _assumption(self, name: str, number: float) -> str:
-        """The sentence for a parameter that is assumed, with what it means where the model says that."""
+        """Write the sentence for a parameter that is assumed, with its meaning if the model gives it."""
         meaning = " ".join((self.stage.model.parameters.model_fields[name].description or "").split())
         said = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
         return f"{said} ({meaning.rstrip('.')})" if meaning else said
@@ -223,7 +229,7 @@ class Initializer:
     def _given(
         self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Any]:
-        """The first messages and the maps, by the model's names for their topics, and the parameters."""
+        """Collect first messages and maps by the model's names for their topics, and the parameters."""
         model, control = self.stage.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
@@ -243,7 +249,7 @@ class Initializer:
         static: Mapping[str, Ragged],
         origins: Floats | None,
     ) -> list["Fact"]:
-        """What the model suspects of the first messages of runs whose prior is known."""
+        """Check the prior of runs against their first messages, as the model does."""
         given, parameters = self._given(first, static, origins)
         said = [
             check_prior({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
@@ -278,7 +284,7 @@ class Initializer:
         ]
 
     def _reference(self, number: int, data: Floats) -> tuple[Floats, Floats]:
-        """The mean and the much wider sigmas of a state that one message tells of."""
+        """Compute the mean and the much wider sigmas of a state that one message measures."""
         model, sensor = self.stage.model, self.stage.sensors[number]
         mean, sigma = unknown(model.state, model.start)
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
@@ -316,7 +322,7 @@ class Initializer:
     def _align(
         self, events: FilterEvents, run: int, stage: Stage, settings: Floats
     ) -> tuple[int, Floats, Floats] | None:
-        """Stamp, mean and covariance of a run at the last of its first fixes; None where they end."""
+        """Align a run: stamp, mean and covariance at the last of its first fixes; None if they end."""
         model = stage.model
         assert model.start is not None
         assert model.start.align is not None
@@ -359,7 +365,7 @@ class Initializer:
         return "; ".join(complaints)
 
     def _told_origin(self, fixes: Ragged) -> Ragged:
-        """The origins as fixes, on a topic of their own."""
+        """Make the stream of origins, as fixes on a topic of their own."""
         stream = fixes.stream
         columns: dict[str, Any] = {
             name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")
@@ -369,7 +375,7 @@ class Initializer:
         return Ragged(told, fixes.offsets)
 
     def _told(self, facts: list["Fact"]) -> list[Ragged]:
-        """What was assumed, on the topic `started`: a message for each sentence and run."""
+        """Make the stream `started` of what was assumed: a message for each sentence and run."""
         if not facts:
             return []
         texts, times, which = zip(*facts, strict=True)

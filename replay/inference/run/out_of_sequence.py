@@ -59,7 +59,7 @@ def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Funct
 
 
 def reprocessing(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
-    """The loop over the events of one run in the order in which they came; see `recursion.recursion`.
+    """Make the loop over the events of one run in the order of arrival; see `recursion.recursion`.
 
     `structure` is that of `KeptMessages`.
     """
@@ -138,7 +138,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
             innovations.end[run] = result + 1
 
     def newest_estimated(last: int, kept: KeptMessages) -> int:
-        """The last row of the newest stamp at which there are estimates."""
+        """Find the last row of the newest stamp at which there are estimates."""
         row = last
         while passes_controls and kept.source[row] == CONTROL:
             row -= 1
@@ -199,7 +199,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
 
 @dataclass(frozen=True)
 class OutOfSequenceFilter:
-    """A filter that goes back by up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
+    """Runs a filter that reprocesses up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
 
     `inner` is an `estimators.Filter`, and the states are of its type.
     """
@@ -208,12 +208,12 @@ class OutOfSequenceFilter:
     window_ns: int
 
     def start(self, static: Mapping[str, Ragged]) -> Any:
-        """The state at every run's prior."""
+        """Make the state at every run's prior."""
         state = self.inner.start(static)
         return state._replace(kept=no_history(self.inner.stage, state.carried))
 
     def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
-        """Filter a block, its messages in the order in which they came."""
+        """Filter a block, its messages in the order of arrival."""
         inner, sensors = self.inner, self.inner.stage.sensors
         events, without_covariance = filter_events(
             inner.stage, inner.found, block, state.context, inner.settings
@@ -254,7 +254,7 @@ class OutOfSequenceFilter:
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:
-        """The innovations that might still have changed."""
+        """Put out the innovations that might still have changed."""
         history: History = state.kept
         has_innovation = history.kept.has_innovation[history.rows]
         rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
@@ -266,7 +266,7 @@ class OutOfSequenceFilter:
         return [self.inner.innovations(innovations, offsets)]
 
     def reprocessed(self, events: FilterEvents, repeated: Integers) -> Ragged:
-        """The late messages, and how many updates each had repeated."""
+        """List the late messages, and how many updates each had repeated."""
         is_late = repeated > 0
         stream = make_stream(
             f"/estimates/{self.inner.name}/rewound",
@@ -279,7 +279,7 @@ class OutOfSequenceFilter:
 
 
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
-    """Estimates whose log times are the moments at which the events that called for them were taken.
+    """Stamp estimates with the log times at which the events that called for them arrived.
 
     Every run has one for each event that is due, from its prior's stamp on, or only the first of these.
     """

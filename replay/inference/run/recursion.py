@@ -37,7 +37,7 @@ NOTHING = -2
 
 
 class FilterEvents(NamedTuple):
-    """The events of all runs in order: run r owns offsets[r]:offsets[r + 1].
+    """Holds the events of all runs in order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
@@ -61,7 +61,7 @@ class FilterEvents(NamedTuple):
 
 
 class RecursionState(NamedTuple):
-    """What the recursion carries from block to block; first axis = run.
+    """Holds what the recursion carries from block to block; first axis = run.
 
     Attributes:
         belief: the method's own.
@@ -79,7 +79,7 @@ class RecursionState(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The estimates as the recursion fills them in: those of run r end before row `end[r]`."""
+    """Holds estimates as the recursion fills them in: those of run r end before row `end[r]`."""
 
     end: Integers
     time_ns: Integers
@@ -88,7 +88,7 @@ class Estimates(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """The innovations as the recursion fills them in, see `Estimates` and `steps.InnovationRecord`."""
+    """Holds innovations as the recursion fills them in, see `Estimates` and `steps.InnovationRecord`."""
 
     end: Integers
     time_ns: Integers
@@ -104,7 +104,7 @@ ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
 def no_results(
     due: Integers, recorded: Integers, model: Model, innovation_size: int
 ) -> tuple[Estimates, Innovations]:
-    """Results to be filled in: run r has the rows due[r]:due[r + 1] and recorded[r]:recorded[r + 1].
+    """Make results to be filled in: run r has the rows from due[r] and recorded[r] up to the next run's.
 
     All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
     every page by itself, and that takes as long as half of a small filter.
@@ -132,7 +132,7 @@ def no_results(
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
-    """What was filled in of results that began at these offsets, laid end to end, and its offsets."""
+    """Cut results down to what was filled in, laid end to end, and return their offsets."""
     end, *columns = results
     rows, kept = filled_rows(offsets, end)
     if isinstance(rows, slice):
@@ -142,7 +142,15 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
 
 
 def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """What one event does to a run, `process(run, event, events, ...)`; see `recursion`."""
+    """Make the function that processes one event of a run; see `recursion`.
+
+    Args:
+        stage: the model as the method takes it.
+        steps: the method's steps for it.
+        settings_of: `settings_of(settings, row)` makes a row's parameters.
+
+    Returns `process(run, event, events, settings, gates, carried, innovations, memory)`.
+    """
     predict = steps.predict
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
@@ -151,7 +159,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     controls = stage.model.controls
 
     def drive(run: int, data: Floats, carried: RecursionState) -> None:
-        """The control from this event on, of what it has; an interpolated one stands at the end."""
+        """Take over the control that an event has; an interpolated one stands at the end of its data."""
         first = len(data) - controls if interpolated else 0
         for k in range(controls):
             if not np.isnan(data[first + k]):
@@ -225,7 +233,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """The loop over the events of one run, for `replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over the events of one run, for `replay.engine.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
     """
@@ -264,7 +272,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def fault_of(mean: Floats, covariance: Floats) -> int:
-    """Why an estimate is none: it is not finite, or a variance is negative; ALL_WELL where it is one."""
+    """Find why an estimate is none: it is not finite, or a variance is negative; else ALL_WELL."""
     total = 0.0
     for row in range(len(mean)):
         total += mean[row]
@@ -280,7 +288,7 @@ def fault_of(mean: Floats, covariance: Floats) -> int:
 
 
 def choosing(updates: tuple[Function, ...]) -> Function:
-    """`update(source, ...)`: the update of the sensor with this number."""
+    """Make `update(source, ...)`: it calls the update of the sensor with this number."""
 
     def update(source: int, *arguments: Any) -> int:
         for number in range_of(len(updates)):

@@ -14,7 +14,7 @@ from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 def seeded_generators(
     generators: tuple[Any, ...], events: FilterEvents, count: int, seed: int
 ) -> tuple[Any, ...]:
-    """Generators of every sampled function and run, from the seed and the run's first data."""
+    """Seed generators of every sampled function and run, by the seed and the run's first data."""
     runs = len(events.offsets) - 1
     before = generators or ((None,) * runs,) * count
     return tuple(
@@ -26,7 +26,7 @@ def seeded_generators(
 def sample_sets(
     samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
 ) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
-    """Runs, and the samples of all functions for them; the largest randomised ones say how many runs."""
+    """Iterate over runs and their samples; the largest random function says how many runs at once."""
     drawn = [index for index, each in enumerate(samplers) if each.redrawn]
     if not drawn:
         sets = tuple(next(sets_by_runs(each, (), offsets))[1] for each in samplers)

@@ -16,7 +16,7 @@ EARLY = 1000  # of the times asked for: a prior of longer before is one of anoth
 
 
 def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
-    """Which of the last events of their stamps want an estimate: not where the control's are all."""
+    """Tell which of the last events of their stamps want an estimate: none of the control alone."""
     control = stage.model.control
     if control is None or control.estimates or not stage.sensors:
         return events.wants_estimate
@@ -27,7 +27,7 @@ def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
 
 
 def delays_of(stage: Stage, settings: Floats) -> Integers:
-    """How long before their stamps messages were measured, in ns, by an event's source.
+    """Compute how long before their stamps messages were measured, in ns, by an event's source.
 
     (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
     """
@@ -41,7 +41,7 @@ def delays_of(stage: Stage, settings: Floats) -> Integers:
 def compensate_delays(
     stage: Stage, events: FilterEvents, delays_ns: Integers, *, is_end: bool
 ) -> tuple[FilterEvents, FilterEvents]:
-    """Events at the times at which they were measured, in order; and those still to wait.
+    """Move events to the times at which they were measured, in order; returns those that wait as well.
 
     What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
     something older may come.
@@ -61,14 +61,14 @@ def compensate_delays(
 
 
 def last_of_stamps(events: FilterEvents) -> Booleans:
-    """Whether the next event of the run has another stamp, or was taken at another time."""
+    """Tell whether the next event of the run has another stamp, or arrived at another time."""
     return last_of_equals(events.offsets, events.time_ns, *events.arrival.T[:1])
 
 
 def output_times(
     offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
 ) -> FilterEvents:
-    """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
+    """Make events that are only times: run r owns offsets[r]:offsets[r + 1]."""
     count = len(time_ns)
     nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
     reference, arrival = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
@@ -76,7 +76,7 @@ def output_times(
 
 
 def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
-    """The events of both in time, run by run; at equal stamps those of the first go first."""
+    """Join two sequences of events in time, run by run; at equal stamps those of the first go first."""
     first, second = _with_arrivals(first, second), _with_arrivals(second, first)
     runs = len(first.offsets) - 1
     run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
@@ -88,7 +88,7 @@ def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
 
 
 def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
-    """Events that say when they came if others do: times alone come at their stamps."""
+    """Add arrivals to events where others have them: times of output alone arrive at their stamps."""
     if events.arrival.shape[1] >= other.arrival.shape[1]:
         return events
     time_ns = events.time_ns
@@ -96,7 +96,7 @@ def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
 
 
 def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
-    """Some of the events."""
+    """Select some of the events."""
     columns: Any = (column[chosen] for column in events[1:])
     return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
 
@@ -104,7 +104,7 @@ def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
 def interpolate_control(
     events: FilterEvents, controls: int, gap_ns: float = np.inf
 ) -> tuple[FilterEvents, FilterEvents]:
-    """Events with the control at their stamps, linear between messages; and those still to wait.
+    """Interpolate the control at events, linear between messages; returns those that wait as well.
 
     What comes after a run's last control message waits for the next, with that message before it. From
     one message that comes more than a gap before the next, up to that, the control is NaN.
@@ -128,7 +128,7 @@ def interpolate_control(
 
 
 def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
-    """Events whose control is known, with its numbers where sensors read them."""
+    """Fill the known control of events where sensors read it."""
     data = events.data.copy()
     for number, sensor in enumerate(stage.sensors):
         if sensor.control is not None:
@@ -139,7 +139,7 @@ def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
 
 
 def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
-    """Events that wait for a control message that does not come: the last one holds, for up to a gap.
+    """Hold the last control for events that wait for one that does not come, for up to a gap.
 
     `initial` holds in a run in which there was none.
     """
@@ -157,7 +157,7 @@ def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float =
 def add_output_times(
     events: FilterEvents, start_ns: Integers, next_output: Integers, every_ns: int
 ) -> tuple[FilterEvents, Integers]:
-    """Events, and between them one every so often, at which an estimate is wanted.
+    """Add regular times of output between events, at which an estimate is wanted.
 
     From the prior on, or, where that is more than EARLY such times before the run's first event, from
     there on.
