@@ -239,7 +239,7 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Describes how a state is corrected where one direction of its error, as of a heading, bends others.
+    """Describes how a state is corrected where one direction of its error, a heading's, bends others.
 
     A belief that is wide in that direction is no ellipsoid: given how far the state is off along it, the
     mean of the rest moves on a curve. `slope` (t,) is the tangent there, P d / d' P d with the

@@ -42,7 +42,7 @@ class Start:
 
 
 class Started(NamedTuple):
-    """Holds the start of a run: its stamp, mean (n,), covariance (t, t), and in words how it was found."""
+    """Holds the start of a run: its stamp, mean (n,), covariance (t, t), and how it was found."""
 
     time_ns: int
     mean: Floats

@@ -301,7 +301,7 @@ def test_all_runs_at_once_are_one_call() -> None:
     given: dict[str, Any] = {
         "parameters": Parameters,
         "streams": {"range": schemas.RANGE},
-        "whole": {"prior": schemas.GAUSSIAN_ESTIMATE},
+        "static": {"prior": schemas.GAUSSIAN_ESTIMATE},
         "components": X,
         "start": start,
     }
