@@ -333,7 +333,7 @@ def _first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> tuple[MemorySource, list[str]]:
     """What the estimator reads of a log, of a long one its first MOST_MESSAGES, in memory."""
-    topics = dict.fromkeys([*streamed, *(topic for each in bound for topic in each.whole)])
+    topics = dict.fromkeys([*streamed, *(topic for each in bound for topic in each.static)])
     streams = source.read([topic for topic in topics if topic in source.topics])
     stamps_ns = np.concatenate([streams[topic].publish_time_ns for topic in streamed])
     notes = []

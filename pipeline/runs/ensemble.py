@@ -274,7 +274,7 @@ def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str
     for each in bound:
         own = found.setdefault(each.name.partition("/")[0], {})
         values = each.parameters.model_dump() if each.parameters is not None else {}
-        for topic in (*each.streams, *each.whole):
+        for topic in (*each.streams, *each.static):
             metadata = source.topics[topic].metadata if topic in source.topics else {}
             for name in (name for name, value in values.items() if value is None and name in metadata):
                 own.setdefault(name, {}).setdefault(metadata[name], topic)

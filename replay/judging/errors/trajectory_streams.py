@@ -7,7 +7,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.trajectories import Trajectory
 from replay.engine.vectors.components import stated_components
-from replay.engine.vectors.tangent import tangent_components, things
+from replay.engine.vectors.tangent import manifold_blocks, tangent_components
 from replay.judging.errors.alignment import HEADING
 from replay.judging.errors.evaluation import POSITION
 from replay.judging.errors.trajectories import POSE_KINDS
@@ -31,7 +31,7 @@ def trajectory_of(stream: Stream) -> Trajectory | None:
         if name in names:
             position_m[:, axis] = state[:, names.index(name)]
     rotation = None
-    turns = [columns for kind, columns in things(kinds) if kind == "quaternion"]
+    turns = [columns for kind, columns in manifold_blocks(kinds) if kind == "quaternion"]
     if len(turns) == 1:
         rotation = Rotation.from_quat(state[:, turns[0]], scalar_first=True).as_matrix()
     elif components.get(HEADING) == "angle":

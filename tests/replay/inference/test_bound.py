@@ -17,7 +17,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing.bound import back_memory, smooth
 from replay.judging.consistency.bounds import Bounds, Output
 from tests.replay.inference import vehicle_a
@@ -53,7 +54,7 @@ def stiff_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return 0.0, 0.0, parameters.density * duration_s, parameters.density * duration_s
 
 
-def measure(state: Any, about: Any, parameters: Any) -> Any:
+def measure(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[1]
 
 
