@@ -35,7 +35,8 @@ def test_the_demo_runs_from_the_wheel_in_another_folder() -> None:
         (wheel,) = dist.glob("*.whl")
         venv.create(bare)
         scripts, packages = (
-            Path(sysconfig.get_path(kind, "venv", {"base": str(bare)})) for kind in ("scripts", "purelib")
+            Path(sysconfig.get_path(kind, "venv", {"base": str(bare)}))
+            for kind in ("scripts", "purelib")
         )
         python = scripts / "python"
         run(
@@ -60,7 +61,9 @@ def link_to_what_is_required(packages: Path) -> None:
     linked, asking = set[str](), list(distributions(path=[str(packages)]))
     while asking:
         for required in map(Requirement, asking.pop().requires or []):
-            if required.name in linked or (required.marker and not required.marker.evaluate({"extra": ""})):
+            if required.name in linked or (
+                required.marker and not required.marker.evaluate({"extra": ""})
+            ):
                 continue
             linked.add(required.name)
             asking.append(distribution(required.name))
