@@ -22,7 +22,7 @@ LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
 
 
 class Row(NamedTuple):
-    """A line of the table `coverage`.
+    """Holds a line of the table `coverage`.
 
     Attributes:
         estimator: its label.
@@ -44,12 +44,12 @@ class Row(NamedTuple):
 
     @property
     def unused(self) -> int:
-        """How many came to nothing, though they were not gated."""
+        """Count how many came to nothing, though they were not gated."""
         return 0 if self.used is None else self.messages - self.used - (self.gated or 0)
 
     @property
     def sentence(self) -> str:
-        """What is said of them; empty where all came to something, or the estimator says why not."""
+        """Write a sentence on them; empty where all had an effect, or the estimator says why not."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -141,7 +141,7 @@ class Usage:
         self.doubtful = other.doubtful | self.doubtful
 
     def rows(self) -> Iterator[Row]:
-        """What became of its measurements: of each topic, or of all where innovations are of several."""
+        """Count what became of measurements: by topic, or all where innovations are of several."""
         label, topics = self.name.partition("/")[0], sorted(self.measured)
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
@@ -171,7 +171,7 @@ def _infinite(stream: Stream) -> np.ndarray:
 
 
 def _repeated(stream: Stream) -> np.ndarray:
-    """The messages that are in all the same as the one before; NaN is as good as NaN."""
+    """Return the messages that are in all the same as the one before; NaN is as good as NaN."""
     found = np.zeros(len(stream), bool)
     if len(stream) > 1:
         same = np.diff(stream.publish_time_ns) == 0

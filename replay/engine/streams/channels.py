@@ -17,7 +17,7 @@ def stated(
     *,
     needed: bool = True,
 ) -> float:
-    """The first number of this name that one of the channels states; NaN where none needs to.
+    """Return the first number of this name that one of the channels states; NaN where none needs to.
 
     Where it stands for a parameter, that is of the type `parameters`. Raises BadInput where none states
     it though it is needed, it is no number, or the parameter does not take it.
@@ -45,13 +45,13 @@ def _number(topic: str, name: str, text: str, parameters: type[Parameters] | Non
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
-    """A parameter; where it is None, what one of the channels states for it. Errors as `stated`."""
+    """Return a parameter; where it is None, what a channel states for it. Errors as `stated`."""
     value = getattr(values, name)
     return stated(topics, name, type(values)) if value is None else float(value)
 
 
 def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) -> dict[int, Topic]:
-    """The topics /STEM<N>/LEAF of a schema, by N in order."""
+    """Return the topics /STEM<N>/LEAF of a schema, by N in order."""
     found = {}
     for topic in topics.values():
         number = topic.name.removeprefix(f"/{stem}").removesuffix(f"/{leaf}")
@@ -64,7 +64,7 @@ def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) 
 def bindings(
     topics: Mapping[str, Topic], asked: Mapping[str, Schema], optional: Collection[str] = ()
 ) -> Iterator[tuple[str, dict[str, Topic]]]:
-    """Where a log has all the topics asked for, with their schemas: prefix, and topics as asked for.
+    """Find where a log has all the topics asked for, with their schemas: prefix, and topics by name.
 
     Those that are optional may be absent.
 
@@ -86,5 +86,5 @@ def bindings(
 
 
 def resolved(name: str, prefix: str) -> str:
-    """A topic's full name under a prefix; one with a slash in front is the same for all."""
+    """Return a topic's full name under a prefix; one with a slash in front is the same for all."""
     return name if name.startswith("/") or not name else f"{prefix}/{name}"

@@ -34,13 +34,13 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
 
 
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
-    """Whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
+    """Tell whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
     pivots = np.diagonal(_factors(covariance), axis1=-2, axis2=-1)
     return np.isfinite(pivots).all(axis=-1) & (pivots.shape[-1] > 0)
 
 
 def _factors(covariance: Array) -> Array:
-    """The lower Cholesky factors (..., n, n); NaN from where there is none on.
+    """Return the lower Cholesky factors (..., n, n); NaN from where there is none on.
 
     A component of infinite variance is one that is independent of all others.
     """

@@ -25,7 +25,7 @@ TANGENT_WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 1, "quaternio
 
 
 def are_kinds(kinds: Sequence[str]) -> bool:
-    """Whether these are kinds, with all components of every axis and quaternion side by side."""
+    """Tell whether these are kinds, with all components of every axis and quaternion side by side."""
     index = 0
     while index < len(kinds):
         width = WIDTHS.get(kinds[index])
@@ -45,7 +45,7 @@ def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
 
 
 def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
+    """Return names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
 
     A linear component or angle keeps its name; an axis has one "angle", a quaternion three components
     of kind "rotation".
@@ -75,7 +75,7 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
 
 
 def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
-    """States (n, components) on the shortest way from left to right, at weights (n,) from 0 to 1."""
+    """Interpolate states (n, components) the shortest way from left to right, at weights (n,)."""
     value = np.empty(left.shape)
     for kind, columns in manifold_blocks(kinds):
         here, there = left[:, columns], right[:, columns]
@@ -90,7 +90,7 @@ def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -
 def truth_at(
     truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
 ) -> Floats:
-    """The truth's state (n, d) at any stamps; see `states_at`."""
+    """Return the truth's state (n, d) at any stamps; see `states_at`."""
     return states_at(truth.publish_time_ns, truth["state"], time_ns, kinds, gap_limit_s)
 
 
@@ -101,7 +101,7 @@ def states_at(
     kinds: Sequence[str],
     gap_limit_s: float,
 ) -> Floats:
-    """States (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
+    """Return states (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
 
     NaN over gaps above the limit; a stamp that there is a state of exactly needs no neighbour.
     """
@@ -118,7 +118,7 @@ def states_at(
 
 
 def rotation_vector(x: Floats) -> Floats:
-    """The shortest rotations of unit complex numbers (n, 2), as angles (n, 1), or of quaternions (n, 4).
+    """Make the shortest rotations of unit complex numbers (n, 2), as angles, or of quaternions (n, 4).
 
     In rad; x and -x are the same, so that the angle of an axis lies in [-pi/2, pi/2].
     """

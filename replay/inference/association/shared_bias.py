@@ -22,7 +22,7 @@ from replay.inference.linear_algebra.gaussian import cholesky
 
 @varying(0, is_updated=1)
 class Pool(NamedTuple):
-    """What sharing k errors works in: matrices (k, k), vectors (k,), and a track's gain (t, k).
+    """Holds what sharing k errors works in: matrices (k, k), vectors (k,), and a track's gain (t, k).
 
     `is_updated` (tracks,) says which tracks a scan has updated.
     """
@@ -38,7 +38,7 @@ class Pool(NamedTuple):
 
 
 def pool_of(shared: int, tangent: int, places: int) -> Pool:
-    """Memory for so many errors, tangent components and tracks."""
+    """Make memory for so many errors, tangent components and tracks."""
     square = (shared, shared)
     return Pool(
         np.empty(square),

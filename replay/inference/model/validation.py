@@ -65,7 +65,7 @@ def check_switching(where: str, model: Model, parameters: Any) -> None:
 
 
 def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Floats]:
-    """The rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
+    """Return the rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
 
     Raises BadInput where a rate is negative, or the probabilities are none.
     """
@@ -116,7 +116,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
 
 
 def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
-    """A state at which to try functions: numbers that differ, unit vectors."""
+    """Return a state at which to try functions: numbers that differ, unit vectors."""
     found: list[float] = []
     while len(found) < len(kinds):
         kind = kinds[len(found)]

@@ -28,7 +28,7 @@ from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMe
 
 
 def weighing(stage: Stage, number: int) -> Function:
-    """The update by sensor `number`: every particle is weighed by the likelihood of what was measured.
+    """Make the update by sensor `number`: it weighs particles by the likelihood of the measurement.
 
     What is told of the innovation, its NIS and the gate are of the cloud's first two moments; the
     log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
@@ -77,7 +77,7 @@ def weighing(stage: Stage, number: int) -> Function:
 
 
 def _comparing(stage: Stage, number: int) -> Function:
-    """`compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
+    """Make `compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
     model, sensor = stage.model, stage.sensors[number]
     m, measure = len(sensor.measured), sensor.measure
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
@@ -138,7 +138,7 @@ def keep_predicted(own: SensorMemory) -> int:
 
 
 def is_told(own: SensorMemory, i: int, size: int) -> bool:
-    """Whether a particle predicts all components that are used."""
+    """Tell whether a particle predicts all components that are used."""
     for a in range(size):
         if np.isnan(own.differences[i, own.kept[a]]):
             return False
@@ -202,7 +202,7 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 
 
 def _likelihood(stage: Stage, number: int) -> Function:
-    """`likelihood(states, i, data, parameters, own, size)`: log p of what was measured, at particle i.
+    """Make `likelihood(states, i, data, parameters, own, size)`: log p of the measurement at particle i.
 
     The model's own, or that of Gaussian noise; NaN where the particle says nothing of it.
     """

@@ -201,7 +201,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
 class OutOfSequenceFilter:
     """Runs a filter that reprocesses up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
 
-    `inner` is an `estimators.Filter`, and the states are of its type.
+    `inner` is an `filtering.Filter`, and the states are of its type.
     """
 
     inner: Any

@@ -43,7 +43,7 @@ class FilterEvents(NamedTuple):
         offsets: (runs + 1,).
         time_ns: (n,).
         source: (n,) a sensor's number, CONTROL or NOTHING.
-        data: (n, width) the numbers of the message, see `steps.reading`; the control's where that is
+        data: (n, width) the numbers of the message, see `update.reading`; the control's where that is
             interpolated.
         wants_estimate: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
