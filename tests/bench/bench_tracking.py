@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runs.ensemble import replay_in_memory
+from pipeline.runs.recorded import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.streams.blocks import Block, gather, merge_events
 from replay.engine.streams.sources import MemorySource

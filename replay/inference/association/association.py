@@ -131,7 +131,7 @@ def existence_after(existence: float, none: float, detection_probability: float)
 
 
 def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda") -> Floats:
-    """Compute the probabilities of associations (tracks, 1 + n): of no detection, the first, the second...
+    """Compute the probabilities of associations (tracks, 1 + n): of none, the first, the second ...
 
     Args:
         detected: (tracks, n), the weights of pairs; 0 outside a gate.

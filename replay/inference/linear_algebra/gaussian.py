@@ -139,7 +139,7 @@ def inflation(squared: float, size: int, parameters: Any) -> float:
 
     >>> from types import SimpleNamespace
     >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)
-    >>> widening(36.0, 1, SimpleNamespace(**given)), widening(8.0, 1, SimpleNamespace(**given))
+    >>> inflation(36.0, 1, SimpleNamespace(**given)), inflation(8.0, 1, SimpleNamespace(**given))
     (4.0, 1.0)
     """
     factor = 1.0

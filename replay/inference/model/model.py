@@ -287,6 +287,7 @@ class Model:
 
     A thing on a line, whose range from the origin is measured:
 
+    >>> import numpy as np
     >>> from recorders.log import schemas
     >>> class OnALine(ModelParameters):
     ...     sigma_m: float = 0.1

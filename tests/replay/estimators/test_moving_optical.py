@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fuselog import make_stream, schemas
-from pipeline.runs.ensemble import record_ensemble, replay_in_memory
+from pipeline.runs.recorded import record_ensemble, replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.models.optical import bias_components

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_equal
 from scipy.stats import chi2
 
 import fuselog as fl
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.runs.ensemble import Part, record_ensemble, replay_ensemble, replay_parts
-from pipeline.runs.summary import error_charts
+from pipeline.output.summary import error_charts
+from pipeline.runs.ensemble import Part, replay_parts
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
-from pipeline.runs.ensemble import replay_ensemble
+from pipeline.runs.recorded import replay_ensemble
 from recorders.errors import BadInput
 from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
