@@ -142,7 +142,7 @@ def registered_models() -> dict[str, Model]:
 def _any_parameters(method: Method) -> type[Parameters]:
     """Collect all parameters of all models, none of them set, with a method's and the model's name.
 
-    What one model wants of a parameter is checked when the log has told which model it is.
+    What one model wants of a parameter is checked when it is known which model fits the log.
     """
     fields: dict[str, Any] = {"model": (str | None, None)}
     for model in registered_models().values():
@@ -296,7 +296,7 @@ def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topi
 def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """Make the estimator that goes back for late messages; raises BadInput where the filter cannot."""
+    """Make the estimator that reprocesses late messages; raises BadInput where the filter cannot."""
     reason = filtering.why_in_sequence
     if reason:
         raise BadInput(

@@ -292,7 +292,7 @@ def spectrum(information: Floats, scales: Floats) -> Spectrum:
 
 
 def in_words(told: Spectrum, components: Sequence[str]) -> str:
-    """Return what there is to say of the weakest direction."""
+    """Describe the weakest direction in a sentence."""
     largest = np.abs(told.direction).max(initial=0.0)
     moved = [
         f"{share:+.3g} {name}"

@@ -61,9 +61,9 @@ def recursive(
             estimates among them are priors: of the estimate's components, see `Given.prior`.
         components: the estimate's components by name, with their kinds.
         truth: the topic with the truth of what is estimated.
-        measured: the components of the innovations, where `follow` tells of them.
+        measured: the components of the innovations, where `follow` fills them.
         vectors: what is wanted of the vectors that topics of `streams` hold, by topic. What the log
-            does not say of them is refused; without an entry here vectors come as the log has them.
+            does not state of them is refused; without an entry here vectors come as the log has them.
         optional: which of `streams` and `static` a log may lack.
         outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
         draws: whether random numbers are drawn: `follow` then gets the run's own generator as its last
@@ -316,7 +316,7 @@ def _estimator(
 
 
 class _Carried(NamedTuple):
-    """Holds what a recursion carries from block to block; `told` (runs,) says whose failure was told.
+    """Holds what a recursion carries from block to block; `told` (runs,): whose failure was reported.
 
     A run's generator is None until there is a message, or where none is wanted.
     """

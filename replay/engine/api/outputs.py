@@ -21,7 +21,7 @@ DIVERGED = "the estimate is no longer finite: the filter diverged"
 
 
 class Results(NamedTuple):
-    """Holds what a recursion fills, one row for every message; a row of NaN says nothing.
+    """Holds what a recursion fills, one row for every message; a row of NaN is none.
 
     Attributes:
         mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
@@ -31,7 +31,7 @@ class Results(NamedTuple):
         accepted: (n,) whether a gate let the message in; 1 unless set.
         target: (n,) what the message was about; 0 unless set.
         further: (n, k) the fields of the further outputs that were named, after the sensor's clock, side
-            by side in order; a message is told of an output where its first field is a number.
+            by side in order; an output has a message where its first field is a number.
     """
 
     mean: Floats
@@ -79,7 +79,7 @@ class Estimates(NamedTuple):
         time_ns, mean, covariance: stamps (n,), means (n, d), covariances (n, t, t).
         solution: how it ended.
         innovations: of the measurements, where the batch names what is `measured`.
-        further: by name, what the batch's further `outputs` say.
+        further: by name, the batch's further `outputs`.
     """
 
     time_ns: Integers
@@ -114,7 +114,7 @@ class Outputs:
         return len(tangent_components(list(self.components), list(self.components.values())))
 
     def blank(self, rows: int) -> Results:
-        """Return results that say nothing."""
+        """Return results that are all NaN."""
         d, t, m = len(self.components), self.tangent, len(self.measured)
         width = sum(len(schema.fields) - 1 for schema in self.further.values())
         return Results(
@@ -195,7 +195,7 @@ class Outputs:
             yield Ragged(stream, np.searchsorted(rows, messages.offsets))
 
     def _of_run(self, estimates: Estimates) -> Iterator[Stream]:
-        """Return what is said of one run, in streams; raises BadInput where a shape is wrong."""
+        """Make the output streams of one run; raises BadInput where a shape is wrong."""
         time_ns, mean, covariance = self._checked(
             "", estimates[:3], ((), (len(self.components),), (self.tangent,) * 2)
         )

@@ -78,7 +78,7 @@ loop_of = _Loop
 
 
 def _compile(source: KernelSource, called: str, definition: str, title: str) -> Callable[..., Any]:
-    """Make the function `kernel` that calls one that a bundle holds; `title` says what it is."""
+    """Make the function `kernel` that calls one of a source; `title` names it."""
     for name, defined in source.definitions.items():
         if name not in vars(_PARTS):
             execute(defined, name, _PARTS)

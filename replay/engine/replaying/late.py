@@ -44,9 +44,9 @@ class Late(NamedTuple):
 
 
 def parse_late(text: str, *, arrival_order: bool) -> Late:
-    """Return what `drop`, `wait:SECONDS` or `rewind:SECONDS` says.
+    """Parse `drop`, `wait:SECONDS` or `rewind:SECONDS`.
 
-    Raises BadInput where it says nothing, or messages are not taken in the order of their arrival.
+    Raises BadInput where it has another form, or messages are not taken in the order of their arrival.
     """
     policy, _, seconds = text.partition(":")
     if policy not in POLICIES:
@@ -121,7 +121,7 @@ def _run(bound: Recursive, late: Late, state: _State, block: Block) -> tuple[_St
 
 
 def _finish(bound: Recursive, late: Late, state: _State) -> list[Ragged]:
-    """Return what was held back to the end, and what the estimator itself still has to say."""
+    """Return what was held back to the end, and the estimator's own last outputs."""
     made: list[Ragged] = []
     if state.waiting:
         nothing = {

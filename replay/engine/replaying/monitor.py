@@ -118,7 +118,7 @@ class RunMonitor:
         return passed
 
     def finish(self) -> list[Ragged]:
-        """Return all failures of all runs; what this noted is told where the estimator tells its own."""
+        """Return all failures of all runs: those found here beside the estimator's own."""
         told = {topic: join(parts) for topic, parts in self._told.items()}
         for run, reason in self._unable.items():
             if self._last_ns[run] >= 0:
@@ -139,7 +139,7 @@ class RunMonitor:
     def coverage(self) -> list[Ragged]:
         """For each case, how much of every run's span was estimated; none of a run without messages.
 
-        Nothing is said of outputs that are no estimates of a state, such as fused scores.
+        There is none for outputs that are no estimates of a state, such as fused scores.
         """
         rows = np.flatnonzero(self._last_ns >= 0)
         offsets = np.searchsorted(rows, np.arange(self.runs + 1))

@@ -32,7 +32,7 @@ _REFUSED = object()
 
 @dataclass
 class Report:
-    """Holds what there is to say of a replay beside its outputs.
+    """Reports on a replay beside its outputs.
 
     Attributes:
         seconds: how long each estimator worked, by label; compiling is part of a first use.
@@ -66,7 +66,7 @@ def replay(
         late: in the order of log time, what is done about messages whose publish times go back; else
             log time is taken for the time at which they were measured.
         block_messages: about how many messages of a run are in memory at once.
-        report: filled with what there is to say when all is done.
+        report: filled when all is done.
         is_part: whether there are more runs than these. Then it is no bad input that an estimator can
             follow none of them: they fail, and the report says so.
 

@@ -26,11 +26,11 @@ class Row(NamedTuple):
 
     Attributes:
         estimator: its label.
-        topic: the measurements; several where innovations do not say which of them they are of.
+        topic: the measurements; several where innovations do not name theirs.
         messages: how many there were.
         used, gated: how many gave an innovation that was taken, and one that was refused; None where
             the estimator states no innovations.
-        skipped: how many of them the estimator says that it left out.
+        skipped: how many of them the estimator reports as left out.
         why: of those that were not used, in words.
     """
 
@@ -64,11 +64,11 @@ class Usage:
         name: the bound estimator's.
         given: messages by topic.
         measured: the topics of measurements among these.
-        facts: by topic, how many messages there is something to say of.
+        facts: by topic, how many messages a fact is about.
         used, gated: innovations.
         skipped: what was left out, by reason.
         speaks: whether it gives innovations.
-        doubtful: what to say of a topic that it begins with.
+        doubtful: a sentence on a topic that it begins with.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Usage:
                     self._note_map(topic, ragged.of_run(run))
 
     def _note_map(self, topic: str, stream: Stream) -> None:
-        """Say where a landmark is at two places."""
+        """Report landmarks that are at two places."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
         apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1) * (np.diff(number) == 0)

@@ -29,7 +29,7 @@ class Failure(NamedTuple):
 
 
 def reason_of(error: Exception) -> str:
-    """Return what an exception says: the sentence itself where it is one of ours."""
+    """Return an exception's text: the sentence itself where it is one of ours."""
     if isinstance(error, BadInput) and error.__cause__ is None:
         return str(error)
     raised = error.__cause__ if isinstance(error, BadInput) else error

@@ -123,7 +123,7 @@ ASSOCIATIONS = {"nearest": nearest, "hungarian": hungarian, "jpda": jpda}
 def existence_after(existence: float, none: float, detection_probability: float) -> float:
     """Compute how probable it is that a track exists, after a scan that gave it no detection by `none`.
 
-    Musicki and Evans' (15): a miss tells against it by as much as its detection was probable.
+    Musicki and Evans' (15): a miss counts against it by as much as its detection was probable.
     """
     missed = 1.0 - detection_probability
     if_missed = missed * existence / (1.0 - detection_probability * existence)

@@ -72,7 +72,7 @@ def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
 
 
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Put together what the confirmed tracks of a run have learnt of the errors, and tell it to all.
+    """Fuse the errors that the confirmed tracks of a run have estimated, and give the result to all.
 
     The errors are the components of every track's state from `first` on, as many as are shared. Where
     associations were so ambiguous that nothing is left of what is known, all stays as it was.
@@ -107,7 +107,7 @@ def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
 
 
 def conform(run: int, place: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Give a track the errors that all share; what it says of its target given these stays."""
+    """Give a track the shared errors; its conditional estimate of the target given these stays."""
     shared_mean, shared = tracks.shared_mean[run], tracks.shared_covariance[run]
     mean, covariance = tracks.mean[run, place, 0], tracks.covariance[run, place, 0]
     size, t = len(shared_mean), len(covariance)

@@ -25,8 +25,8 @@ class Management(NamedTuple):
     """Holds a way to manage tracks.
 
     Attributes:
-        wait: (run, place, duration_s, tracks, parameters), what time alone says.
-        judge: (run, place, evidence, tracks, parameters), what a scan says; it may confirm a track.
+        wait: (run, place, duration_s, tracks, parameters), what time alone changes.
+        judge: (run, place, evidence, tracks, parameters), what a scan changes; it may confirm a track.
         is_over: (run, place, tracks, parameters) -> whether a track ends.
     """
 
@@ -36,7 +36,7 @@ class Management(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """Holds what a scan says of one track.
+    """Holds the evidence of a scan for one track.
 
     Attributes:
         detectable: how probable its detection in the gate is, if the target exists.
@@ -57,7 +57,7 @@ def is_silent(run: int, place: int, tracks: Tracks, p: Any) -> bool:
 
 
 def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
-    """Nothing: time alone says nothing."""
+    """Do nothing: time alone changes nothing."""
     return
 
 

@@ -227,7 +227,7 @@ def _compiled(tracker: Tracker) -> Callable[..., None]:
 def track_scans(
     tracker: Tracker, scans: Scans, settings: Floats, newborn: Newborn, before: Tracks
 ) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
-    """Return the tracks after the scans; and by batch, its scans and what was said of them.
+    """Track scans: the tracks after them; and by batch, its scans and their outputs.
 
     `settings` (sensors, names) are the parameters for each sensor.
     """

@@ -318,7 +318,7 @@ def _lacks_slopes(model: Model) -> str:
             try:
                 own = traced_sensor(model, sensor, number_fields(model.parameters))
                 sensor_derivative(model, own)(trial_state(model.kinds), reference, parameters, work)
-            except Exception:  # is said when the model is bound, see `validation.check_sensor`
+            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
                 return f"a regular linearisation of its sensor {sensor.topic}"

@@ -212,7 +212,7 @@ def _augmented(model: Model, names: Names) -> Model:
 
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """Return the motion, in which the parameters walk about or come back to what they were given as."""
+    """Return the motion, in which parameters are random walks or return to their given values."""
     n, t, noises = model.size, model.tangent, motion.noises
     given = motion.noise or _no_noise(t)
     state, parameters = trial_state(model.kinds), _traced(model)
@@ -230,7 +230,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         moved = list(move_own(state, control, *own, duration_s, parameters))
         for index, name in enumerate(names):
             stay = state[n + index]
-            if not angular[index]:  # an angle has no mean to come back to
+            if not angular[index]:  # an angle has no mean to return to
                 share = remaining_share(name, duration_s, parameters)
                 stay = share * stay + (1.0 - share) * getattr(parameters, name)
             moved.append(stay + entering[0][noises + index] if noises else stay)

@@ -56,7 +56,7 @@ def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) 
     """Make `move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
 
     Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
-    `product`. With `back` it is a step of a smoother's way back.
+    `product`. With `back` it is a step of a smoother's backward pass.
     """
     if correct is not None:
         step_together = _stepping(kinds, correct.back if back else correct.move)

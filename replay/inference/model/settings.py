@@ -62,7 +62,7 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
 
     What is not given is looked for in the channels of the control, the prior and the sensors; a sensor
     looks in its own first. Raises BadInput where none states a number that is used, or one that the
-    parameter does not allow, and where the model is not what it says.
+    parameter does not allow, and where the model is not what it declares.
     """
     model = stage.model
     names = number_fields(model.parameters)

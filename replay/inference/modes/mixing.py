@@ -107,7 +107,7 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
 def mixing_weights(modes: int) -> Function:
     """Make `fill_weights(probability, log_probability, memory)`: the probabilities become c.
 
-    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still tell
+    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still hold
     it; a mode that none with any probability leads to keeps its own Gaussian.
     """
 

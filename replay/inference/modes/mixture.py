@@ -72,8 +72,8 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
 
     `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
     measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
-    do not compare. The innovation that is told is that of the mixture, whose covariance has the spread
-    of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
+    do not compare. The innovation that is recorded is that of the mixture, whose covariance has the
+    spread of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
     """
     components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
     places = tuple(components.index(name) for name in measured)

@@ -277,7 +277,7 @@ def _lacks_likelihood(model: Model) -> str:
                     )
                     for k in range(3)
                 ]
-            except Exception:  # is said when the model is bound, see `validation.check_sensor`
+            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
                 continue
         if not np.allclose(at[2] - at[1], at[1] - at[0], rtol=1e-9, atol=1e-9, equal_nan=True):
             return f"a likelihood of its sensor {sensor.topic}"

@@ -30,9 +30,9 @@ from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMe
 def weighing(stage: Stage, number: int) -> Function:
     """Make the update by sensor `number`: it weighs particles by the likelihood of the measurement.
 
-    What is told of the innovation, its NIS and the gate are of the cloud's first two moments; the
+    The innovation that is recorded, its NIS and the gate are of the cloud's first two moments; the
     log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
-    and a particle that lacks another one keeps its share of the weight: nothing is said of it.
+    and a particle that lacks another one keeps its share of the weight.
     """
     sensor = stage.sensors[number]
     m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
@@ -204,7 +204,7 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 def _likelihood(stage: Stage, number: int) -> Function:
     """Make `likelihood(states, i, data, parameters, own, size)`: log p of the measurement at particle i.
 
-    The model's own, or that of Gaussian noise; NaN where the particle says nothing of it.
+    The model's own, or that of Gaussian noise; NaN where the particle does not predict it.
     """
     sensor = stage.sensors[number]
     if sensor.log_likelihood is None:

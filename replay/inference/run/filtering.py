@@ -58,7 +58,7 @@ class FilterState(NamedTuple):
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
         unsettled: events that wait for others which were measured before them and come later.
-        kept: what a smoother keeps for its way back, or a filter for late messages.
+        kept: what a smoother keeps for its backward pass, or a filter for late messages.
         next_output: (runs,) the number of the next extra estimate.
     """
 

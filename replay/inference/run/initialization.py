@@ -301,7 +301,7 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Begin runs just after the first fixes that, with the path between them, tell all."""
+        """Begin runs just after first fixes that, with the path between them, determine the state."""
         numbers = [number for number, _, _ in self._measuring]
         sensors = tuple(self.found.sensors[number] for number in numbers)
         found = self.found._replace(sensors=sensors)

@@ -205,7 +205,7 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
     return True
 
 
-# The way back
+# The backward pass
 
 
 class Later(NamedTuple):
@@ -317,6 +317,6 @@ def no_later(runs: int, n: int, t: int) -> Later:
 
 
 def back_memory(n: int, t: int) -> BackMemory:
-    """Make memory for the way back of states with n components, and t in the tangent space."""
+    """Make memory for the backward pass of states with n components, and t in the tangent space."""
     shapes = (n,), (t, t), (t, t), (t, t), (1, t), (n,), (t, t), (t,), (t,)
     return BackMemory(*(np.empty(shape) for shape in shapes))

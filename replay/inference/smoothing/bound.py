@@ -42,7 +42,7 @@ class BoundParameters(MethodParameters):
 
 
 class BackMemory(NamedTuple):
-    """Holds what the way back of one core works in: four matrices (t, t)."""
+    """Holds what the backward pass of one core works in: four matrices (t, t)."""
 
     predicted: Floats
     turned: Floats
@@ -51,7 +51,7 @@ class BackMemory(NamedTuple):
 
 
 def back_memory(t: int) -> BackMemory:
-    """Make memory for the way back of states with t components in the tangent space."""
+    """Make memory for the backward pass of states with t components in the tangent space."""
     return BackMemory(*(np.empty((t, t)) for _ in BackMemory._fields))
 
 
@@ -105,7 +105,7 @@ class BoundHistory(NamedTuple):
 
 
 class BoundFilter(Filter):
-    """Runs a filter that knows the truth, and tells of every step of it."""
+    """Runs a filter that knows the truth, and puts out every step of it."""
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
         """Return the topics of a log that it starts from; raises BadInput where it has no truth."""

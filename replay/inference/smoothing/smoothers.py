@@ -67,7 +67,7 @@ class Forward(NamedTuple):
 
 
 def parse_forward(text: str) -> Forward:
-    """Return what `SmootherParameters.forward` says; raises BadInput where it says nothing."""
+    """Parse `SmootherParameters.forward`; raises BadInput where it has another form."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
     rest_on = before.removesuffix(":")
     name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
@@ -123,7 +123,7 @@ class Waiting(NamedTuple):
 
 
 class Smoother(Filter):
-    """Runs a filter that keeps its nodes, and at the end, or a lag behind, goes back over them."""
+    """Runs a filter that keeps its nodes, and smooths them at the end, or a lag behind."""
 
     @cached_property
     def lag_ns(self) -> int:
@@ -173,7 +173,7 @@ class Smoother(Filter):
         return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """Return what waited for later messages, and what those say of all before them."""
+        """Filter what waited for later messages, and smooth all nodes that are left."""
         state, made = self.ended(state)
         if self.lag_ns == FOREVER_NS:
             return [*made, self.states(*self.gone_back(state.kept))]
