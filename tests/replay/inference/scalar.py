@@ -70,9 +70,10 @@ def simulate(seed: int) -> Floats:
     return np.array(found)
 
 
-def source(values: Sequence[float] | Floats) -> MemorySource:
-    """One value every second as a log in memory."""
+def source(values: Sequence[float] | Floats, first_later_ns: int = 0) -> MemorySource:
+    """One value every second as a log in memory; the first one later, which particles are seeded by."""
     stamps = EPOCH_NS + 10**9 * np.arange(1, len(values) + 1)
+    stamps[0] += first_later_ns
     prior = make_stream(
         "/prior",
         schemas.GAUSSIAN_ESTIMATE,
