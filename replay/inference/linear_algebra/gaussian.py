@@ -110,6 +110,10 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
     """Turn v into L^-1 v and S into L, S = L L'; returns v' S^-1 v and log det S.
 
     The first is NaN where S is not positive definite.
+
+    Args:
+        innovation: v (m,) and S (m, m), changed in place.
+        size: how many components stand in front, see `drop_missing`.
     """
     difference, factor, _ = innovation
     if not cholesky(factor, factor, size):
@@ -136,6 +140,11 @@ def inflation(squared: float, size: int, parameters: Any) -> float:
     - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,
       Gustafsson, ICASSP 2013. No less than 1: a small innovation makes no noise smaller;
     - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
+
+    Args:
+        squared: the NIS.
+        size: how many components the innovation has.
+        parameters: with the three options.
 
     >>> from types import SimpleNamespace
     >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)
@@ -243,6 +252,13 @@ def predict_constant_velocity(
 
     Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
     a variance of the position, a covariance of both, and a variance of the velocity.
+
+    Args:
+        mean: (n,).
+        covariance: (n, n).
+        duration_s: how long.
+        layout: see above.
+        noise: the three moments of every axis.
     """
     stride, apart = layout
     places = range(0, stride * (len(mean) // 2), stride)

@@ -96,7 +96,13 @@ class GaussianSumMemory(NamedTuple):
 
 
 def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
-    """Make the steps of a Gaussian sum of so many of these filters."""
+    """Make the steps of a Gaussian sum of so many of these filters.
+
+    Args:
+        stage: the model with the sensors at hand.
+        inner: the steps of the filter of one member.
+        members: how many there are at most.
+    """
     n, t = stage.model.size, stage.model.tangent
     innovation_size = len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
@@ -224,6 +230,10 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
     """Find the direction (t,) in which a covariance (t, t) is widest of all turns, and its variance.
 
     Where it is as wide in several, these are the first thing's, and nearest to the first of its axes.
+
+    Args:
+        kinds: of the state's components.
+        covariance: (t, t), in the tangent space.
     """
     direction, variance, begin = np.zeros(len(covariance)), -1.0, 0
     for kind, _ in manifold_blocks(kinds):

@@ -74,7 +74,12 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):
 
 
 def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
-    """Make the steps of an interacting multiple model whose modes have these filters."""
+    """Make the steps of an interacting multiple model whose modes have these filters.
+
+    Args:
+        stage: the model with all its modes, and the sensors at hand.
+        filters: the steps of every mode's filter, in the order of the modes.
+    """
     model, switching = stage.model, stage.model.switching
     assert switching is not None
     modes, n, t = len(filters), model.size, model.tangent

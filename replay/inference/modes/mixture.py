@@ -74,6 +74,11 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
     measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
     do not compare. The innovation that is recorded is that of the mixture, whose covariance has the
     spread of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        update_mode: the update of one Gaussian by it, see `Steps.updates`.
     """
     components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
     places = tuple(components.index(name) for name in measured)

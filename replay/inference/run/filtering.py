@@ -88,7 +88,13 @@ def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
 
 
 def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
-    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size."""
+    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size.
+
+    Args:
+        stage: the model as the method takes it.
+        method: whose `sampling` chooses samples.
+        parameters: the method's.
+    """
     if method.sampling is None:
         return ()
     sampling = method.sampling(parameters)

@@ -282,6 +282,11 @@ def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragge
     """Stamp estimates with the log times at which the events that called for them arrived.
 
     Every run has one for each event that is due, from its prior's stamp on, or only the first of these.
+
+    Args:
+        estimates: as the filter put them out.
+        events: of the block, with their arrivals.
+        start_ns: (runs,) stamps of the priors.
     """
     if not events.arrival.shape[1]:
         return estimates

@@ -83,7 +83,12 @@ class ForwardMemory(NamedTuple):
 
 
 def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
-    """Make the steps of a filter that leaves nodes; its `predict` fills `Workspace.product`."""
+    """Make the steps of a filter that leaves nodes; its `predict` fills `Workspace.product`.
+
+    Args:
+        stage: the model as the method takes it.
+        steps: those of the filter that goes forward.
+    """
     model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
     find_slope = sloping(model.kinds, model.correct)
 
@@ -163,7 +168,16 @@ def _with_memory(update: Function) -> Function:
 def compose(
     gain: Floats, rest: Floats, predictions: int, next_gain: Floats, next_rest: Floats, product: Floats
 ) -> None:
-    """Compose the steps so far with the next, which is used up: G G1, and A + G A1 G'."""
+    """Compose the steps so far with the next, which is used up: G G1, and A + G A1 G'.
+
+    Args:
+        gain: G (t, t) of the steps so far, changed in place.
+        rest: A (t, t) of the steps so far, changed in place.
+        predictions: how many steps there are so far; of none the next one is copied.
+        next_gain: G1 (t, t).
+        next_rest: A1 (t, t), used up.
+        product: (t, t) to work in.
+    """
     t = len(gain)
     if predictions == 0:
         for row in range(t):
@@ -184,6 +198,11 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
 
     A pivot of zero, but for round-off, is what A knows exactly: its row of X is zero, a solution where B
     is in the range of A. False where A is not positive semidefinite.
+
+    Args:
+        matrix: A (n, n), symmetric.
+        right: B (n, m), which becomes X.
+        factor: (n, n) to work in.
     """
     size, columns = len(matrix), right.shape[1]
     if not semidefinite_cholesky(factor, matrix, size):
@@ -238,7 +257,12 @@ def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> 
 
 
 def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
-    """Make the loop over the nodes of one run, from its last to its first."""
+    """Make the loop over the nodes of one run, from its last to its first.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
+    """
     move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)
 
