@@ -30,6 +30,10 @@ def run_key(seed: int, first: Iterable[NDArray]) -> Words:
     """Return a run's own key (2,): of a seed and its first data.
 
     So its numbers are the same on any number of cores, and whatever other runs there are.
+
+    Args:
+        seed: the parameter.
+        first: arrays of the run's first data.
     """
     words = [str(seed).encode(), *(part.tobytes() for part in first)]
     return np.frombuffer(sha256(b" ".join(words)).digest()[:16], np.uint64)
@@ -45,7 +49,12 @@ def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
 
 
 def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Return the block of four words with this number."""
+    """Return the block of four words with this number.
+
+    Args:
+        counter: the number of the block.
+        key: (2,) of the run.
+    """
     a, b, c, d = np.uint64(counter), np.uint64(0), np.uint64(0), np.uint64(0)
     k0, k1 = key[0], key[1]
     m0, m1 = np.uint64(_MULTIPLIERS[0]), np.uint64(_MULTIPLIERS[1])

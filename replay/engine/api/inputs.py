@@ -101,7 +101,12 @@ class OneRun(Mapping[str, Stream]):
 
 
 def generator_of(parameters: Any, first: Iterable[NDArray]) -> np.random.Generator:
-    """Return a counter-based generator (Philox), keyed by a seed and a run's first data."""
+    """Return a counter-based generator (Philox), keyed by a seed and a run's first data.
+
+    Args:
+        parameters: with a `seed`.
+        first: arrays of the run's first messages.
+    """
     key = run_key(getattr(parameters, "seed", 0), first)
     return np.random.Generator(np.random.Philox(key=key))
 
@@ -135,7 +140,13 @@ class Skipped(NamedTuple):
 def messages_of(
     block: Block, vectors: Mapping[str, Vectors], parameters: Any
 ) -> tuple[Messages, Skipped]:
-    """Return a block's messages, their fields as numbers; and those that lack a covariance."""
+    """Return a block's messages, their fields as numbers; and those that lack a covariance.
+
+    Args:
+        block: of all runs.
+        vectors: the vectors that are wanted of topics, by name.
+        parameters: the estimator's.
+    """
     events = block.events
     read = [
         numbers_of(ragged.stream, vectors.get(topic), parameters)

@@ -40,6 +40,10 @@ def compiled(
     are given by position. One that makes no arrays (`allocates=False`) is compiled in a twentieth of the
     time; it returns nothing, or one number of the kind that its annotation says.
     Raises BadInput, when called, where a source is not at hand.
+
+    Args:
+        function: plain Python over arrays and numbers.
+        allocates: whether it makes arrays.
     """
 
     @cache

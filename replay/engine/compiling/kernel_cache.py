@@ -39,7 +39,12 @@ _COLOURLESS = SimpleNamespace(
 
 @lru_cache(maxsize=64)
 def load(text: str, title: str) -> Callable[..., Any]:
-    """Make the function `kernel` of a module with this text; `title` is what to call it to a user."""
+    """Make the function `kernel` of a module with this text; `title` is what to call it to a user.
+
+    Args:
+        text: the source, in which `kernel` stands.
+        title: see above.
+    """
     versions = f"{sys.implementation.cache_tag} numba {numba.__version__} numpy {version('numpy')}"
     name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
     module = ModuleType(name)
@@ -52,7 +57,13 @@ def load(text: str, title: str) -> Callable[..., Any]:
 
 
 def execute(source: str, name: str, module: ModuleType) -> None:
-    """Define what a source defines in a module; `name` is its file in tracebacks."""
+    """Define what a source defines in a module; `name` is its file in tracebacks.
+
+    Args:
+        source: Python's text.
+        name: see above.
+        module: in which it is defined.
+    """
     exec(compile(source, name, "exec", __future__.annotations.compiler_flag), vars(module))
 
 

@@ -154,6 +154,10 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
     needs no name. The other settings are its parameters.
 
     Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+
+    Args:
+        label: see above.
+        settings: by name, with `kind` perhaps among them.
     """
     if not re.fullmatch(r"[\w:=-]+", label):
         raise BadInput(
@@ -181,6 +185,11 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
 
     Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
     of them must be stated alike.
+
+    Args:
+        label: of the estimator, see `configure`.
+        sources: the runs.
+        settings: its parameters by name, with `kind` perhaps among them.
     """
     estimator, parameters = configure(label, settings)
     first = sources[0]

@@ -47,6 +47,10 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
     """Parse `drop`, `wait:SECONDS` or `rewind:SECONDS`.
 
     Raises BadInput where it has another form, or messages are not taken in the order of their arrival.
+
+    Args:
+        text: as given on the command line.
+        arrival_order: whether messages are taken in the order of arrival.
     """
     policy, _, seconds = text.partition(":")
     if policy not in POLICIES:
@@ -75,6 +79,10 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
     """Make the estimator, handed its messages in the order of log time.
 
     Raises BadInput where it is none that goes through its messages in time, or it cannot go back.
+
+    Args:
+        bound: the estimator that wants its messages in order of their stamps.
+        late: what is done with late ones.
     """
     if not isinstance(bound, Recursive):
         raise BadInput(

@@ -83,9 +83,13 @@ def copied(carried: CarriedType) -> CarriedType:
 
 
 def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
-    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
+    """View the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
 
     An entry may be such a NamedTuple itself.
+
+    Args:
+        carried: a NamedTuple of arrays (runs, ...), or of such NamedTuples.
+        runs: which.
     """
     columns: Any = carried
     made: Any = type(carried)
@@ -95,7 +99,12 @@ def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
 
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the offsets that the chosen rows of ragged columns have, laid end to end."""
+    """Return the offsets that the chosen rows of ragged columns have, laid end to end.
+
+    Args:
+        chosen: (n,) which rows.
+        offsets: (runs + 1,) of all rows.
+    """
     if chosen.all():
         return offsets
     return np.concatenate([[0], np.cumsum(chosen)])[offsets]
@@ -132,7 +141,12 @@ def join(parts: Sequence[Ragged]) -> Ragged:
 
 
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
-    """Merge messages of the topics in time order, run by run; equal stamps keep the file's order."""
+    """Merge messages of the topics in time order, run by run; equal stamps keep the file's order.
+
+    Args:
+        streams: by topic, in all runs.
+        order: the clock.
+    """
     everything = list(streams.values())
     if len(everything) == 1:
         return _in_order(everything[0], order)

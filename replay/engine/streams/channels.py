@@ -45,13 +45,26 @@ def _number(topic: str, name: str, text: str, parameters: type[Parameters] | Non
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
-    """Return a parameter; where it is None, what a channel states for it. Errors as `stated`."""
+    """Return a parameter; where it is None, what a channel states for it. Errors as `stated`.
+
+    Args:
+        values: the parameters.
+        topics: asked in this order.
+        name: of the parameter.
+    """
     value = getattr(values, name)
     return stated(topics, name, type(values)) if value is None else float(value)
 
 
 def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) -> dict[int, Topic]:
-    """Return the topics /STEM<N>/LEAF of a schema, by N in order."""
+    """Return the topics /STEM<N>/LEAF of a schema, by N in order.
+
+    Args:
+        topics: of the log, by name.
+        stem: in front of the number.
+        leaf: behind it.
+        schema: that the topics have to have.
+    """
     found = {}
     for topic in topics.values():
         number = topic.name.removeprefix(f"/{stem}").removesuffix(f"/{leaf}")
@@ -86,5 +99,10 @@ def bindings(
 
 
 def resolved(name: str, prefix: str) -> str:
-    """Return a topic's full name under a prefix; one with a slash in front is the same for all."""
+    """Return a topic's full name under a prefix; one with a slash in front is the same for all.
+
+    Args:
+        name: as an estimator or model has it.
+        prefix: such as `/robot1`.
+    """
     return name if name.startswith("/") or not name else f"{prefix}/{name}"

@@ -37,7 +37,12 @@ def reason_of(error: Exception) -> str:
 
 
 def failure_stream(topic: str, failures: Sequence[Failure]) -> Stream:
-    """Return one message for each failure, on `topic`."""
+    """Return one message for each failure, on `topic`.
+
+    Args:
+        topic: to be written.
+        failures: when and why.
+    """
     if not failures:
         return empty_stream(topic, schemas.FAILURE, {REASONS: "[]"})
     reasons = list(dict.fromkeys(failure.reason for failure in failures))
@@ -57,7 +62,15 @@ def reason_stream(
     reason: NDArray[np.int64],
     reasons: Iterable[str],
 ) -> Stream:
-    """Return messages (n,) of a schema whose only field, `reason`, counts in a list of sentences."""
+    """Return messages (n,) of a schema whose only field, `reason`, counts in a list of sentences.
+
+    Args:
+        topic: to be written.
+        schema: with the field `reason`.
+        time_ns: (n,) stamps.
+        reason: (n,) numbers in the list.
+        reasons: the sentences.
+    """
     return make_stream(
         topic, schema, time_ns, metadata={REASONS: json.dumps(list(reasons))}, reason=reason
     )

@@ -70,6 +70,10 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
 
     What a fix lacks (its altitude, say) is NaN. Covariances (n, 9) are turned from the axes of the fix
     to those of the origin; a log may have them diagonal or full, of east and north alone or with up.
+
+    Args:
+        fixes: latitudes, longitudes and altitudes, in all runs.
+        origins: (runs, 3) latitudes, longitudes and altitudes, see `origins_of`.
     """
     stream = fixes.stream
     origin = origins[np.repeat(np.arange(fixes.runs), np.diff(fixes.offsets))]

@@ -60,6 +60,11 @@ def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
 
     The channel's metadata names them; positions of two or three numbers need no names. Raises BadInput
     where a component is missing, or the vectors have another width than the channel states.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        wanted: components by name, with their kinds.
     """
     if not len(stream):
         return np.empty((0, len(wanted)))
@@ -75,6 +80,13 @@ def read_fixes(
     `sigma` of every component stands where the covariance is unknown. A position in the plane serves
     where one in space is wanted: its height is NaN. Raises BadInput as `read_vectors`, and where the
     covariance has another width than the vector.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        covariance: the field of its covariance.
+        wanted: components by name, with their kinds.
+        sigma: of every component where a message states no covariance; None for unknown.
     """
     stream = _in_space(stream, field, covariance, wanted)
     value = read_vectors(stream, field, wanted)
@@ -103,6 +115,11 @@ def matrices(stream: Stream, field: str, covariance: str) -> Floats:
     """Read the covariances (n, d, d) of a vector field of d numbers, stated whole or as diagonals.
 
     Raises BadInput where they have another width.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        covariance: the field of its covariance.
     """
     size, width = stream[field].shape[1], stream[covariance].shape[1]
     if width == size**2:
@@ -119,6 +136,10 @@ def covariances_of(stream: Stream, wanted: Components) -> Floats:
     """Compute the covariances (n, t, t) of the wanted components of states, in the tangent space.
 
     Raises BadInput where the channel lacks one of the components.
+
+    Args:
+        stream: of states.
+        wanted: components by name, with their kinds.
     """
     at = match_tangent(stream.metadata, wanted, f"topic {stream.topic}")
     size = isqrt(stream["covariance"].shape[1])
@@ -144,6 +165,11 @@ def numbers_of(
     """Lay the fields after the sensor's clock side by side (n, width); which (n,) lack a covariance.
 
     Raises BadInput where vectors are not what is wanted.
+
+    Args:
+        stream: the messages.
+        vectors: how vector fields are read; None for as they are.
+        parameters: the estimator's.
     """
     fields = {} if vectors is None else vectors.fields
     columns = {entry.name: stream[entry.name] for entry in stream.schema}
@@ -164,7 +190,13 @@ def numbers_of(
 
 
 def check_width(stream: Stream, field: str, width: int) -> None:
-    """Raise BadInput where a vector field does not have so many numbers."""
+    """Raise BadInput where a vector field does not have so many numbers.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        width: how many numbers it has to have.
+    """
     if len(stream) and stream[field].shape[1] != width:
         raise BadInput(
             f"topic {stream.topic}: {field} has {stream[field].shape[1]} numbers; {width} are needed"

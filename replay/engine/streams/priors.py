@@ -46,6 +46,10 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
 
     Raises BadInput where the channel does not state the components (see `match_components`), or the
     vectors have other widths than it states.
+
+    Args:
+        prior: Gaussian estimates of all runs.
+        components: wanted, by name, with their kinds.
     """
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
@@ -104,7 +108,13 @@ def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where:
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
-    """Return priors that cannot be used, all for one reason."""
+    """Return priors that cannot be used, all for one reason.
+
+    Args:
+        runs: how many.
+        components: wanted, by name, with their kinds.
+        reason: why, as a sentence.
+    """
     size = len(tangent_components(list(components), list(components.values())))
     return Priors(
         np.zeros(runs, np.int64),

@@ -35,6 +35,14 @@ def state_stream(
     """Return means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space.
 
     `truth` is the topic that they are compared with; None where there is nothing to compare.
+
+    Args:
+        topic: to be written.
+        time_ns: (n,) stamps.
+        components: by name, with their kinds.
+        truth: the topic of the truth, "" for none.
+        mean: (n, d).
+        covariance: (n, t, t).
     """
     angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
     if angular:
@@ -48,7 +56,15 @@ def state_stream(
 def gaussian_stream(
     topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Return means (n, d) and covariances (n, t, t); what is no number ends its run, see `monitor`."""
+    """Return means (n, d) and covariances (n, t, t); what is no number ends its run, see `monitor`.
+
+    Args:
+        topic: to be written.
+        time_ns: (n,) stamps.
+        mean: (n, d).
+        covariance: (n, t, t).
+        metadata: of the channel.
+    """
     columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
     schema = schemas.GAUSSIAN_ESTIMATE
     return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)
@@ -122,7 +138,13 @@ def failures_of(
 
 
 def failures_by_run(topic: str, failures: Mapping[int, Failure], runs: int) -> Ragged:
-    """Return the failures of some of the runs, by their numbers, on `topic`/failure."""
+    """Return the failures of some of the runs, by their numbers, on `topic`/failure.
+
+    Args:
+        topic: of the estimator.
+        failures: by run.
+        runs: how many there are.
+    """
     failed = sorted(failures)
     stream = failure_stream(f"{topic}/failure", [failures[run] for run in failed])
     return Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))

@@ -63,7 +63,12 @@ class Source(Protocol):
 
 
 def is_sensed(source: Source, topic: str) -> bool:
-    """Tell whether a topic is the run's own, and columns: no estimates, no images."""
+    """Tell whether a topic is the run's own, and columns: no estimates, no images.
+
+    Args:
+        source: the run.
+        topic: the name.
+    """
     if topic.startswith("/estimates/"):
         return False
     try:
@@ -256,7 +261,12 @@ class MemorySource(_Readable):
 
 
 def is_in_order(runs: Ragged, order: Clock) -> bool:
-    """Tell whether every run's messages go by one of the clocks, and by their places in the file."""
+    """Tell whether every run's messages go by one of the clocks, and by their places in the file.
+
+    Args:
+        runs: the messages of a topic, in all runs.
+        order: the clock.
+    """
     clock, position = runs.stream.times(order), runs.stream.position
     ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
     if ordered.all():
@@ -267,7 +277,12 @@ def is_in_order(runs: Ragged, order: Clock) -> bool:
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
-    """Make a source of a recording with a log's positions: merged by log time, ties in order."""
+    """Make a source of a recording with a log's positions: merged by log time, ties in order.
+
+    Args:
+        recording: streams in memory.
+        run: what is known of it.
+    """
     streams = recording.streams
     ranks = np.empty(sum(map(len, streams)), np.int64)
     times = [stream.log_time_ns for stream in streams]

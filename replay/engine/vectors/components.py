@@ -64,6 +64,11 @@ def stated_components(stated: Mapping[str, str], wanted: Components, where: str)
 
     A channel without kinds means the wanted ones, and "linear" for what is not wanted. Raises BadInput
     where a name stands twice, or the kinds are none or not one for each name.
+
+    Args:
+        stated: the channel's metadata.
+        wanted: whose kinds hold where none are stated.
+        where: the topic, for errors.
     """
     names = [name for name in stated.get("components", "").split(",") if name]
     listed = stated.get("kinds", "")

@@ -13,10 +13,14 @@ ROUNDING = 1e-14
 
 
 def normalized_error_squared(error: Array, covariance: Array) -> Array:
-    """NEES or NIS e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
+    """Compute NEES or NIS e' P^-1 e of errors (..., n); leading axes broadcast.
 
     A component of infinite variance counts nothing. NaN where there are no components, where an error or
     a covariance is NaN, or where a covariance is not positive definite.
+
+    Args:
+        error: (..., n).
+        covariance: (..., n, n).
 
     >>> errors = np.array([[1.0, 2.0], [0.0, 1.0]])
     >>> normalized_error_squared(errors, np.diag([1.0, 4.0])).tolist()

@@ -62,6 +62,11 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
 
     Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
     list one that is asked for, one stands twice, or has no sigma.
+
+    Args:
+        label: the estimator's, for errors.
+        model: whose parameters are asked for.
+        parameters: with `estimate` and its options.
     """
     check_augmentable(f"estimator {label}", model)
     asked = parameters.estimate or []
@@ -133,7 +138,12 @@ def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
 
 
 def augmented_stage(stage: Stage, added: Added) -> Stage:
-    """Return the same of a model as a method takes it."""
+    """Return the same of a model as a method takes it.
+
+    Args:
+        stage: the model with the sensors at hand.
+        added: what is added to its state.
+    """
     names, errors = added.parameters, added.errors
     if names:
         model, sensors = stage.model, stage.sensors
@@ -149,7 +159,12 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
 
 
 def with_gauss_markov(settings: Floats, added: Added) -> Floats:
-    """Return numbers of motion and sensors with those that an augmented model has beside them."""
+    """Return numbers of motion and sensors with those that an augmented model has beside them.
+
+    Args:
+        settings: (1 + sensors, fields).
+        added: what is added to the state.
+    """
     numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
@@ -161,6 +176,13 @@ def begin(
 
     `stage` and `settings` are those of the model itself. Raises BadInput where a parameter that is to be
     estimated has no value.
+
+    Args:
+        label: the estimator's, for errors.
+        topic: of the prior.
+        stage: of the model itself.
+        added: what is added to its state.
+        settings: (1 + sensors, fields), of the model itself.
     """
     fields = number_fields(stage.model.parameters)
     means = np.array(

@@ -87,7 +87,13 @@ def serving(schema: Schema) -> tuple[str, ...]:
 def topics_of(
     model: Model, topics: Mapping[str, Topic], names: Mapping[str, str] | None = None
 ) -> list[Found]:
-    """Everything in a log that is of this model; `names` are topics by the model's names for them."""
+    """Find everything in a log that is of this model; `names` are topics by the model's names for them.
+
+    Args:
+        model: the model.
+        topics: of the log, by name.
+        names: see above.
+    """
     names = names or {}
     begins = [model.prior]
     if model.start is not None:

@@ -29,6 +29,10 @@ def sloping(kinds: Kinds, correct: Correction | None) -> Function:
     """Make `fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
 
     Where nothing bends it is left as it is.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
     """
     if correct is None:
 
@@ -89,6 +93,10 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
 
     Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
     from the mean's tangent space to the origin's.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
     """
     if correct is not None:
         t, read_state = tangent_size(kinds), tuple_of(len(kinds))

@@ -49,6 +49,11 @@ def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
     `range_m[3]` is the error of what is measured as range_m about point 3, `range_m[0:8]` are those
     about points 0 to 7, `range_m[0:8,0:3]` those of all pairs with points 0 to 2 of the second map.
     Raises BadInput where the model measures nothing of the kind.
+
+    Args:
+        where: the estimator and option, for errors.
+        model: with the sensors whose errors they are.
+        asks: the entry, such as `range_m[0:8]`.
     """
     found = re.fullmatch(r"(\w+)\[([^\[\]]*)\]", asks)
     if found is None:

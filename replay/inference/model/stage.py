@@ -52,6 +52,10 @@ def title_of(model: Model, summary: str) -> str:
     """Name the kernel of a method with this summary, for messages while it is compiled.
 
     The model has its registered name where it is one of those that are loaded, which imports nothing.
+
+    Args:
+        model: whose summary is part of it.
+        summary: the method's.
     """
     found = (
         (name, getattr(sys.modules.get(entry.module), entry.attr, None))

@@ -58,7 +58,13 @@ class ParticleParameters(MethodParameters):
 
 
 def particle_steps(stage: Stage, particles: int, resample_below: float) -> Steps:
-    """Make the steps of a bootstrap filter."""
+    """Make the steps of a bootstrap filter.
+
+    Args:
+        stage: the model as the method takes it.
+        particles: how many.
+        resample_below: the share of them; they are resampled where fewer are effective.
+    """
     model, motion, sensors = stage.model, stage.motion, stage.sensors
     n, t = model.size, model.tangent
     by_control = model.controls if motion.control_noise else 0

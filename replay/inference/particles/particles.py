@@ -150,7 +150,15 @@ def moving(stage: Stage, by_control: int) -> Function:
 
 
 def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
-    """Resample where the effective number of particles is too small; returns the counter after it."""
+    """Resample where the effective number of particles is too small; returns the counter after it.
+
+    Args:
+        states: (N, n).
+        weight: (N,).
+        key: (2,) of the run.
+        counter: of its generator.
+        memory: to work in.
+    """
     if not effective_number(weight) < memory.least_effective:
         return counter
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)

@@ -33,6 +33,10 @@ def weighing(stage: Stage, number: int) -> Function:
     The innovation that is recorded, its NIS and the gate are of the cloud's first two moments; the
     log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
     and a particle that lacks another one keeps its share of the weight.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
     """
     sensor = stage.sensors[number]
     m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
@@ -149,6 +153,12 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
     """Fill the innovation of the cloud: mean and covariance of the differences, and the noise.
 
     The differences are taken from that of the first particle which has one, where no angle is cut.
+
+    Args:
+        weight: (N,).
+        own: the sensor's memory, with differences and noise.
+        size: how many components are used.
+        angular: (m,) which are angles.
     """
     mean, spread, _ = own.innovation
     for j in range(len(mean)):
@@ -184,7 +194,7 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
 
 
 def factor_kept(own: SensorMemory, size: int) -> None:
-    """Make of the noise of the components that are used its factor, at the front, and log det.
+    """Factor the noise of the components that are used, at the front, with log det.
 
     That is NaN where the covariance is not positive definite.
     """
@@ -223,7 +233,7 @@ def _likelihood(stage: Stage, number: int) -> Function:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
 ) -> float:
-    """See `_likelihood`; the difference becomes L^-1 v. The noise itself widens, see `inflation`."""
+    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v."""
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):

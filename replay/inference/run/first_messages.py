@@ -58,7 +58,7 @@ def first_of_runs(
 
     Args:
         ragged: the messages of a topic, in all runs.
-        clock: by which they are ordered.
+        clock: by which the stamps are taken.
         usable: (n,) which of them may be used; all where it is None.
     """
     every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
