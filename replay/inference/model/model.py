@@ -7,7 +7,7 @@ state of every model that gives what the method needs.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -388,7 +388,7 @@ class Model:
     takes_fixes: bool = True
     by_name: bool = False
 
-    @property
+    @cached_property
     def all_sensors(self) -> tuple[Sensor, ...]:
         """The sensors, and that of position fixes unless the model has one of its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
