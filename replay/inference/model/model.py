@@ -404,7 +404,7 @@ class Model:
         """Whether the model finds where to start itself, see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[str, ...]:
         """The kinds of the state's components."""
         return tuple(self.state.values())
@@ -414,7 +414,7 @@ class Model:
         """How many components the state has."""
         return len(self.state)
 
-    @property
+    @cached_property
     def tangent(self) -> int:
         """How many its tangent space has: an orientation has four components and three."""
         return tangent_size(self.kinds)
