@@ -17,7 +17,7 @@ import numpy as np
 
 from replay.engine.arrays import Booleans, Floats, varying
 from replay.inference.association.tracks import Tracks
-from replay.inference.linear_algebra.gaussian import cholesky
+from replay.inference.linear_algebra.gaussian import invert
 
 
 @varying(0, is_updated=1)
@@ -50,25 +50,6 @@ def pool_of(shared: int, tangent: int, places: int) -> Pool:
         np.empty((tangent, shared)),
         np.empty(places, bool),
     )
-
-
-def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
-    """Fill the inverse of a symmetric matrix; False where it is not positive definite."""
-    size = len(matrix)
-    if not cholesky(factor, matrix, size):
-        return False
-    for column in range(size):
-        for row in range(size):
-            entry = 1.0 if row == column else 0.0
-            for k in range(row):
-                entry -= factor[row, k] * inverse[k, column]
-            inverse[row, column] = entry / factor[row, row]
-        for row in range(size - 1, -1, -1):
-            entry = inverse[row, column]
-            for k in range(row + 1, size):
-                entry -= factor[k, row] * inverse[k, column]
-            inverse[row, column] = entry / factor[row, row]
-    return True
 
 
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:

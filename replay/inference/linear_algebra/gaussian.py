@@ -80,6 +80,33 @@ def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
     return True
 
 
+def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
+    """Fill the inverse of a symmetric matrix A by its Cholesky factor.
+
+    Args:
+        matrix: A (n, n), which stays as it is.
+        inverse: (n, n) filled.
+        factor: (n, n) filled with the lower factor L, A = L L'.
+
+    Returns False where A is not positive definite.
+    """
+    size = len(matrix)
+    if not cholesky(factor, matrix, size):
+        return False
+    for column in range(size):
+        for row in range(size):
+            entry = 1.0 if row == column else 0.0
+            for k in range(row):
+                entry -= factor[row, k] * inverse[k, column]
+            inverse[row, column] = entry / factor[row, row]
+        for row in range(size - 1, -1, -1):
+            entry = inverse[row, column]
+            for k in range(row + 1, size):
+                entry -= factor[k, row] * inverse[k, column]
+            inverse[row, column] = entry / factor[row, row]
+    return True
+
+
 def wrap(difference: float, is_angle: bool) -> float:
     """Wrap a difference of angles to [-pi, pi); any other stays as it is."""
     if is_angle and not abs(difference) < np.pi:
