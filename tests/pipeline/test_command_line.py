@@ -326,7 +326,7 @@ HEAVY = (
     *("scipy.stats", "scipy.optimize", "scipy.integrate", "scipy.interpolate", "scipy.spatial"),
 )
 # What compiles and loads kernels.
-KERNELS = ("replay.engine.compiling.keeping", "replay.engine.compiling.inlining")
+KERNELS = ("replay.engine.compiling.kernel_cache", "replay.engine.compiling.inlining")
 
 
 @pytest.mark.parametrize(

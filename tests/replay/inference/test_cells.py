@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from replay.engine.streams.sources import MemorySource
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models

@@ -339,18 +339,18 @@ def test_the_cloud_has_the_moments_of_the_estimate() -> None:
 # Likelihoods of a model's own
 
 
-def heavy(state: Any, measured: Any, about: Any, parameters: Any) -> Any:
+def heavy(state: Any, measured: Any, reference: Any, parameters: Any) -> Any:
     """A Cauchy distribution."""
     away = (measured[0] - state[0]) / parameters.sigma_measured
     return -np.log(np.pi * parameters.sigma_measured * (1.0 + away * away))
 
 
-def normal(state: Any, measured: Any, about: Any, parameters: Any) -> Any:
+def normal(state: Any, measured: Any, reference: Any, parameters: Any) -> Any:
     away = (measured[0] - state[0]) / parameters.sigma_measured
     return -0.5 * (away * away + np.log(2.0 * np.pi)) - np.log(parameters.sigma_measured)
 
 
-def nowhere(state: Any, measured: Any, about: Any, parameters: Any) -> Any:
+def nowhere(state: Any, measured: Any, reference: Any, parameters: Any) -> Any:
     return -np.inf if measured[0] > 10.0 else 0.0 * state[0]
 
 
@@ -385,7 +385,7 @@ def test_a_measurement_that_no_particle_explains_ends_the_run() -> None:
 def test_a_particle_of_which_a_sensor_says_nothing_keeps_its_weight() -> None:
     """The sensor sees what is positive alone: the sum of the weights below zero stays as it was."""
 
-    def measure_above(state: Any, about: Any, parameters: Any) -> Any:
+    def measure_above(state: Any, reference: Any, parameters: Any) -> Any:
         return (state[0] if state[0] > 0.0 else np.nan,)
 
     model = replace(SCALAR, sensors=(replace(scalar.VALUE, measure=measure_above, linear=False),))
@@ -404,7 +404,7 @@ def test_what_a_model_lacks_and_bad_numbers_are_one_sentence() -> None:
     assert METHODS["particles"] is BOOTSTRAP
     assert BOOTSTRAP.lacks(SCALAR) == BOOTSTRAP.lacks(make_wheel()) == ""
 
-    def squared(state: Any, noise: Any, about: Any, parameters: Any) -> Any:
+    def squared(state: Any, noise: Any, reference: Any, parameters: Any) -> Any:
         return (state[0] + noise[0] ** 2,)
 
     bent = replace(SCALAR, sensors=(replace(scalar.VALUE, measure=squared, noises=1),))
