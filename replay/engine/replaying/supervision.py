@@ -93,7 +93,7 @@ class Watch:
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
-        self.usage.note_given(streams, self.whole)
+        self.usage.note_given(streams, self.whole, self._order)
         began = time.perf_counter()
         try:
             try:
@@ -128,6 +128,7 @@ class Watch:
 
     def finish(self) -> list[Ragged]:
         """All failures of all runs; what this noted is told where the estimator tells its own."""
+        self.usage.shares.end()
         told = {topic: join(parts) for topic, parts in self._told.items()}
         for run, reason in self._unable.items():
             if self._last_ns[run] >= 0:
