@@ -19,6 +19,7 @@ from pipeline.api import catalog
 from pipeline.api.catalog import Entry
 from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
+from pipeline.output.summary import summary_table
 from pipeline.runs.executors import crew_of, of_executor
 from pipeline.runs.experiment import (
     load_experiment,
@@ -28,7 +29,6 @@ from pipeline.runs.experiment import (
     run_experiment,
 )
 from pipeline.runs.sweeps import nested, over_of, points_of, run_sweep
-from pipeline.studies.toolkit.localization import summary_table
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, open_log, write_log
 from recorders.parameters import merge

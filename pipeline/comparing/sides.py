@@ -16,8 +16,8 @@ import pandas as pd
 
 from pipeline.api.replays import Replay, replay
 from pipeline.comparing.renamed import Renamed
+from pipeline.output.coverage import recounted, rows_of_side, stored_rows
 from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
-from pipeline.runs.coverage import recounted
 from pipeline.runs.ensemble import Progress, judge_logs, parts_of
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
 from pipeline.runs.experiment import Experiment, Setting, load_scenario
@@ -32,7 +32,7 @@ from replay.engine.replaying.replaying import BLOCK_MESSAGES
 from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.errors.evaluation import POSITION, split_topic
-from replay.judging.errors.trajectories import estimates_of
+from replay.judging.errors.trajectory_streams import estimates_of
 from replay.judging.errors.truths import Doubt
 from replay.judging.metrics.measuring import find_metrics
 from replay.judging.metrics.metrics import rmse_of
@@ -193,7 +193,7 @@ def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
     def side(label: str, name: str) -> Side:
         settings = settings_of(done.logs[0], label, stated.get(label, {}))
         found = measured(name, label, pairs, gap_limit_s, settings)
-        return replace(found, replay=done, coverage=_of_side(done.done.coverage, label, name))
+        return replace(found, replay=done, coverage=rows_of_side(done.done.coverage, label, name))
 
     return Given(name, list(done.settings), side, {run: log for run, (log, _) in pairs.items()})
 
@@ -231,7 +231,7 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
         found = measured(name, label, own, gap_limit_s, settings)
         logs, estimates = zip(*own.values(), strict=True)
         counted = recounted(estimates, logs, {label: stated.get(label, {})}, found.doubts)
-        return replace(found, coverage=_of_side(counted, label, name))
+        return replace(found, coverage=rows_of_side(counted, label, name))
 
     return Given(name_of(path), labels_of(first), side, {run: log for run, (log, _) in pairs.items()})
 
@@ -263,7 +263,7 @@ def of_result(folder: Path, progress: Progress) -> Given:
 
     def side(label: str, name: str) -> Side:
         kept = _stored(rows, times, label, name, _settings_of_result(result, label, stated))
-        kept = replace(kept, coverage=_of_side(_coverage_of_result(folder), label, name))
+        kept = replace(kept, coverage=rows_of_side(stored_rows(folder), label, name))
         try:
             again = _replayed(folder, result, progress, kept)
         except BadInput as error:
@@ -274,20 +274,6 @@ def of_result(folder: Path, progress: Progress) -> Given:
 
     labels = list(dict.fromkeys(rows["estimator"]))
     return Given(name_of(folder), labels, side)
-
-
-def _coverage_of_result(folder: Path) -> list[Row]:
-    """The table `coverage` of a result; older ones have none."""
-    path = folder / "tables" / "coverage.parquet"
-    if not path.is_file():
-        return []
-    table = read_table(path).astype(object)
-    return [Row(*row) for row in table.where(table.notna(), None)[[*Row._fields]].to_numpy().tolist()]
-
-
-def _of_side(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
-    """The lines of one estimator, under a side's name."""
-    return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 
 def _run_of_result(result: Result, number: int) -> str:

@@ -31,9 +31,9 @@ from pipeline.diagnosing.outputs import Outputs
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
-from pipeline.studies.toolkit.localization import summarise, summary_table
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.log.streams import concatenate
@@ -325,7 +325,7 @@ def _first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> tuple[MemorySource, list[str]]:
     """What the estimator reads of a log, of a long one its first MOST_MESSAGES, in memory."""
-    whole = dict.fromkeys(topic for each in bound for topic in each.whole)
+    whole = dict.fromkeys(topic for each in bound for topic in each.static)
     streams = source.read([topic for topic in whole if topic in source.topics])
     parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
     stamps_ns = np.empty(0, np.int64)

@@ -1,4 +1,4 @@
-"""Estimators made of a model and a method, as a replay takes them."""
+"""Makes estimators of a model and a method, and binds them to the topics of a log."""
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -23,24 +23,31 @@ from replay.inference.model.augmentation import (
     augmented_stage,
     begin,
     estimated,
-    with_walks,
+    with_gauss_markov,
 )
 from replay.inference.model.binding import Found, roles_of, topics_of
-from replay.inference.model.model import Model, ModelParameters, Motion
-from replay.inference.model.requirements import OWN_MODEL, elsewhere, names_state, nearest, needs_of
+from replay.inference.model.model import Model, Motion
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
     assumed_of,
     settings_of,
 )
 from replay.inference.model.stage import Stage, stage_of
+from replay.inference.requirements import (
+    OWN_MODEL,
+    elsewhere,
+    names_state,
+    nearest,
+    requirements_of,
+)
 from replay.inference.run.filtering import Filter, samplers_of
-from replay.inference.run.initialization import Beginning
-from replay.inference.run.out_of_sequence import Rewinding
+from replay.inference.run.initialization import Initializer
+from replay.inference.run.out_of_sequence import OutOfSequenceFilter
 
 
 @lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
-    """The parameters of a model and of a method, in one type."""
+    """Return the parameters of a model and of a method, in one type."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
     return _created(name, (method.parameters, model.parameters))
 
@@ -48,13 +55,13 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
 ) -> type[Any]:
-    """A type of parameters; it has no text of its own in which their meanings could be looked for."""
+    """Make a type of parameters, without a text of its own in which meanings could be looked for."""
     says_nothing = {"use_attribute_docstrings": False}
     return create_model(name, __base__=bases, __cls_kwargs__=says_nothing, **(fields or {}))
 
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
-    """A type of parameters with other defaults for some of them."""
+    """Make a type of parameters with other defaults for some of them."""
     fields: Any = {}
     for name, value in defaults.items():
         field = kind.model_fields[name]
@@ -63,7 +70,7 @@ def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> 
 
 
 def _accepted(field: FieldInfo) -> Any:
-    """What a parameter accepts: its type with its bounds."""
+    """Return what a parameter accepts: its type with its bounds."""
     bounds = tuple(field.metadata)
     return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
 
@@ -71,7 +78,7 @@ def _accepted(field: FieldInfo) -> Any:
 def modelled_by(
     model: Model, method: Method, name: str, settings: Mapping[str, Any] | None = None
 ) -> Estimator[Any]:
-    """The estimator of one model by a method of that name; `settings` are its own defaults.
+    """Make the estimator of one model by a method of that name; `settings` are its own defaults.
 
     Raises BadInput where the method cannot be set so, or the model lacks what it needs then.
     """
@@ -86,7 +93,7 @@ def modelled_by(
     of_name = f" ({name})" if settings else ""
     return Estimator(
         f"{model.summary}, {method.summary}{of_name}",
-        needs_of(model),
+        requirements_of(model),
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
@@ -94,12 +101,12 @@ def modelled_by(
 
 
 def of_any_model(method: Method) -> Estimator[Any]:
-    """The estimator that estimates, by one method, the state of the registered model that fits a log."""
+    """Make the estimator that estimates, by one method, the registered model that fits a log."""
     return _OfAnyModel(method)
 
 
 class _OfAnyModel(Estimator[Any]):
-    """What it needs and its parameters follow from all models; they are made when they are asked for."""
+    """Makes its requirements and parameters from all models when they are asked for."""
 
     def __init__(self, method: Method) -> None:
         vars(self).update(
@@ -110,18 +117,20 @@ class _OfAnyModel(Estimator[Any]):
         )
 
     @cached_property
-    def needs(self) -> str:
-        """What a log must have."""
-        return " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items())
+    def requirements(self) -> str:
+        """Return what a log must have."""
+        return " or ".join(
+            f"({name}) {requirements_of(model)}" for name, model in registered_models().items()
+        )
 
     @cached_property
     def parameters(self) -> type[Parameters]:
-        """Those of all models, and of the method."""
+        """Return those of all models, and of the method."""
         return _any_parameters(vars(self)["_method"])
 
 
 def registered_models() -> dict[str, Model]:
-    """The models by name; one that does not load is left out, and says why where it is named."""
+    """Return the models by name; one that does not load is left out, and says why where it is named."""
     found = {}
     for name in available("models"):
         with suppress(BadInput):
@@ -131,9 +140,9 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """All parameters of all models, none of them set, with those of a method and the model's name.
+    """Collect all parameters of all models, none of them set, with a method's and the model's name.
 
-    What one model wants of a parameter is checked when the log has told which model it is.
+    What one model wants of a parameter is checked when it is known which model fits the log.
     """
     fields: dict[str, Any] = {"model": (str | None, None)}
     for model in registered_models().values():
@@ -202,7 +211,7 @@ def _bind_fitting(
 def bind_model(
     label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
 ) -> list[Bound]:
-    """A filter for everything in the log that is of this model."""
+    """Return a filter for everything in the log that is of this model."""
     method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
@@ -226,21 +235,21 @@ def bind_model(
             raise BadInput(f"estimator {label}: {error}") from error
         name = label + found.prefix
         samplers = samplers_of(stage, method, parameters)
-        settings = with_walks(numbers, added)
+        settings = with_gauss_markov(numbers, added)
         made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
-        read = (*found.instead, *found.sensors)
+        read = (*found.fallbacks, *found.sensors)
         streams = (*control, *(topic.name for _, topic in read))
         assumed = assumed_of(label, own, found, parameters)
-        opening = Beginning(name, found, own, numbers, assumed).opening
-        whole = filtering.whole(topics)
+        initialization = Initializer(name, found, own, numbers, assumed).initialization
+        static = filtering.static(topics)
         priors = {found.prior.name: model.state}
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
-        made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, opening=opening, assumed=assumed)
-        bound.append(replace(made, rewinding=partial(_rewinding, made, filtering, begun)))
+        made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
+        made = replace(made, initialization=initialization, assumed=assumed)
+        bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 
 
@@ -263,7 +272,7 @@ def _check_topics(
 
 
 def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Floats | None:
-    """The origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
+    """Return the origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
 
     Raises BadInput where channels state different ones, or the first fix would have to be the origin
     though another sensor says where the thing is in a frame of its own.
@@ -284,21 +293,24 @@ def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topi
     return None
 
 
-def _rewinding(
+def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """The estimator that goes back for late messages; raises BadInput where the filter cannot."""
-    reason = filtering.cannot_rewind
+    """Make the estimator that reprocesses late messages; raises BadInput where the filter cannot."""
+    reason = filtering.why_in_sequence
     if reason:
         raise BadInput(
             f"estimator {bound.name}: --late rewind: {reason}; give --late drop or --late wait:SECONDS"
         )
-    back = Rewinding(filtering, window_ns)
+    back = OutOfSequenceFilter(filtering, window_ns)
     return replace(bound, start=begun(back.start), run=back.run, finish=back.finish)
 
 
 def _made_for(where: str, method: Method, parameters: Any) -> Method:
-    """The method that the parameters choose; BadInput that begins with `where`, if they choose none."""
+    """Choose the method that the parameters name.
+
+    BadInput that begins with `where`, if there is none.
+    """
     try:
         return method.made_for(parameters) if method.made_for else method
     except BadInput as error:
@@ -306,7 +318,7 @@ def _made_for(where: str, method: Method, parameters: Any) -> Method:
 
 
 def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
-    """The motion of this name, the model's own where none is given; BadInput for an unknown one."""
+    """Find the motion of this name, the model's own where none is given; BadInput for an unknown one."""
     if mode is None:
         return model.motion
     if not model.modes:

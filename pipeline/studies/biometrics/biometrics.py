@@ -14,8 +14,10 @@ from scipy.stats import norm
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, thinned
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.biometrics.claims import (
     CASES,
@@ -25,7 +27,6 @@ from pipeline.studies.biometrics.claims import (
     claims_of_bssr1,
     claims_of_simulation,
 )
-from pipeline.studies.toolkit.localization import summary_table
 from recorders.models.scores import TOPIC, comparisons_of, matchers_of
 from recorders.parameters import Parameters
 from replay.engine.replaying.estimator import configure

@@ -16,8 +16,10 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams, replay_in_memory
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.navigation.outages import (
     COASTED,
@@ -34,7 +36,6 @@ from pipeline.studies.navigation.outages import (
     windows_of,
     withheld,
 )
-from pipeline.studies.toolkit.localization import summary_table
 from recorders.errors import BadInput
 from recorders.importers.tables.mapping import adapted, read_mapping, recordings_in
 from recorders.parameters import Parameters

@@ -1,4 +1,4 @@
-"""What became of the measurements that an estimator was given: used, gated, skipped, or nothing at all.
+"""Counts what became of an estimator's measurements: used, gated, skipped, or without effect.
 
 It is counted from what goes in and comes out, for any estimator: messages by topic, innovations, and
 what the estimator says that it skipped.
@@ -23,15 +23,15 @@ LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
 
 
 class Row(NamedTuple):
-    """A line of the table `coverage`.
+    """Holds a line of the table `coverage`.
 
     Attributes:
         estimator: its label.
-        topic: the measurements; several where innovations do not say which of them they are of.
+        topic: the measurements; several where innovations do not name theirs.
         messages: how many there were.
         used, gated: how many gave an innovation that was taken, and one that was refused; None where
             the estimator states no innovations.
-        skipped: how many of them the estimator says that it left out.
+        skipped: how many of them the estimator reports as left out.
         why: of those that were not used, in words.
     """
 
@@ -45,12 +45,12 @@ class Row(NamedTuple):
 
     @property
     def unused(self) -> int:
-        """How many came to nothing, though they were not gated."""
+        """Count how many came to nothing, though they were not gated."""
         return 0 if self.used is None else self.messages - self.used - (self.gated or 0)
 
     @property
     def sentence(self) -> str:
-        """What is said of them; empty where all came to something, or the estimator says why not."""
+        """Write a sentence on them; empty where all had an effect, or the estimator says why not."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -65,11 +65,11 @@ class Usage:
         name: the bound estimator's.
         given: messages by topic.
         measured: the topics of measurements among these.
-        facts: by topic, how many messages there is something to say of.
+        facts: by topic, how many messages a fact is about.
         used, gated: innovations.
         skipped: what was left out, by reason.
         speaks: whether it gives innovations.
-        doubtful: what to say of a topic that it begins with.
+        doubtful: a sentence on a topic that it begins with.
         shares: the innovations by topic.
     """
 
@@ -84,16 +84,16 @@ class Usage:
     doubtful: dict[str, str] = field(default_factory=dict)
     shares: Attribution = field(default_factory=Attribution)
 
-    def note_start(self, whole: Mapping[str, Ragged]) -> None:
+    def note_start(self, static: Mapping[str, Ragged]) -> None:
         """Look at the streams that the estimator begins with."""
-        for topic, ragged in whole.items():
+        for topic, ragged in static.items():
             if ragged.stream.schema.full_name == LANDMARK:
                 self.given[topic] += len(ragged)
                 for run in range(ragged.runs):
                     self._note_map(topic, ragged.of_run(run))
 
     def _note_map(self, topic: str, stream: Stream) -> None:
-        """Say where a landmark is at two places."""
+        """Report landmarks that are at two places."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
         apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1) * (np.diff(number) == 0)
@@ -104,9 +104,9 @@ class Usage:
             )
 
     def note_given(
-        self, streams: Mapping[str, Ragged], whole: Mapping[str, Ragged], order: Clock = "publish_time"
+        self, streams: Mapping[str, Ragged], static: Mapping[str, Ragged], order: Clock = "publish_time"
     ) -> None:
-        """Count a block of messages; `whole` are the streams that the estimator began with."""
+        """Count a block of messages; `static` are the streams that the estimator began with."""
         sensed = {
             topic: ragged
             for topic, ragged in streams.items()
@@ -123,7 +123,7 @@ class Usage:
             facts = self.facts.setdefault(topic, Counter())
             facts["are infinite"] += int(_infinite(stream).sum())
             facts["repeat the message before"] += int(_repeated(stream).sum())
-            maps = [each.stream for each in whole.values() if each.stream.schema.full_name == LANDMARK]
+            maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
             if maps and "target_id" in stream.columns:
                 known = np.concatenate([each["landmark_id"] for each in maps])
                 facts["are of targets that the map lacks"] += int(
@@ -158,7 +158,7 @@ class Usage:
         self.shares.merge(other.shares)
 
     def rows(self) -> Iterator[Row]:
-        """What became of its measurements: of each topic, or of all where innovations are of several."""
+        """Count what became of measurements: by topic, or all where innovations are of several."""
         label, topics = self.name.partition("/")[0], sorted(self.measured)
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
@@ -206,7 +206,7 @@ def _infinite(stream: Stream) -> np.ndarray:
 
 
 def _repeated(stream: Stream) -> np.ndarray:
-    """The messages that are in all the same as the one before; NaN is as good as NaN."""
+    """Return the messages that are in all the same as the one before; NaN is as good as NaN."""
     found = np.zeros(len(stream), bool)
     if len(stream) > 1:
         same = np.diff(stream.publish_time_ns) == 0

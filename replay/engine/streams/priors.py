@@ -1,4 +1,4 @@
-"""The prior rule: components by name, and a run without a usable prior fails alone."""
+"""Reads priors by component names; a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -26,7 +26,7 @@ NOT_POSITIVE_DEFINITE = "the prior's covariance is not positive definite"
 
 
 class Priors(NamedTuple):
-    """The first Gaussian of every run, its components in the order in which they were wanted.
+    """Holds the first Gaussian of every run, its components in the order in which they were wanted.
 
     Attributes:
         time_ns: (runs,) stamps.
@@ -42,10 +42,14 @@ class Priors(NamedTuple):
 
 
 def priors_of(prior: Ragged, components: Components) -> Priors:
-    """The priors of all runs; see `Priors`.
+    """Return the priors of all runs; see `Priors`.
 
     Raises BadInput where the channel does not state the components (see `match_components`), or the
     vectors have other widths than it states.
+
+    Args:
+        prior: Gaussian estimates of all runs.
+        components: wanted, by name, with their kinds.
     """
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
@@ -79,7 +83,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
 
 
 class _Layout(NamedTuple):
-    """How many components a channel states, of the tangent space too, and where the wanted stand."""
+    """Describes how many components a channel states, tangent space too, and where the wanted stand."""
 
     stated: int
     tangent: int
@@ -89,7 +93,10 @@ class _Layout(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
-    """The layout of a channel that states these names and kinds; raises BadInput as `read_priors`."""
+    """Make the layout of a channel that states these names and kinds.
+
+    Raises BadInput as `read_priors`.
+    """
     metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
     stated = stated_components(metadata, components, where)
     return _Layout(
@@ -101,7 +108,13 @@ def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where:
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
-    """Priors that cannot be used, all for one reason."""
+    """Return priors that cannot be used, all for one reason.
+
+    Args:
+        runs: how many.
+        components: wanted, by name, with their kinds.
+        reason: why, as a sentence.
+    """
     size = len(tangent_components(list(components), list(components.values())))
     return Priors(
         np.zeros(runs, np.int64),
@@ -112,21 +125,21 @@ def no_priors(runs: int, components: Components, reason: str) -> Priors:
 
 
 def start_of_runs(
-    whole: Mapping[str, Ragged], priors: Mapping[str, Components]
+    static: Mapping[str, Ragged], priors: Mapping[str, Components]
 ) -> tuple[dict[str, Ragged], dict[int, str]]:
-    """What an estimator starts from, and why some runs cannot start.
+    """Return what an estimator starts from, and why some runs cannot start.
 
     Args:
-        whole: whole topics of all runs.
+        static: topics of all runs.
         priors: which of them are priors, and the components that are wanted of each.
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their
     order, NaN where the run cannot start; and the reasons by run, which may be all of them.
     Raises BadInput where a topic is no such prior, see `priors_of`.
     """
-    found, failed = dict(whole), dict[int, str]()
+    found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():
-        read = priors_of(whole[topic], components)
+        read = priors_of(static[topic], components)
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)
@@ -138,7 +151,7 @@ def start_of_runs(
 def gaussians(
     prior: Ragged,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """What an estimator starts from a prior of `start_of_runs`.
+    """Return what an estimator starts from a prior of `start_of_runs`.
 
     Stamps (runs,), means (runs, d), covariances (runs, t, t), to be changed at will.
     """

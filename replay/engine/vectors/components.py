@@ -1,22 +1,22 @@
-"""A vector's components by the names that its channel states; their order never matters."""
+"""Matches a vector's components by the names that its channel states; their order never matters."""
 
 from collections.abc import Mapping, Sequence
 from typing import cast
 
 from recorders.errors import BadInput
 from recorders.models.states import state_metadata
-from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, things
+from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, manifold_blocks
 
 Components = Mapping[str, Kind]
 
 
 def components_of(names: Sequence[str]) -> Components:
-    """Names with their kinds: an angle is a component in rad that wraps, others are linear."""
+    """Return names with their kinds: an angle is a component in rad that wraps, others are linear."""
     return stated_components(state_metadata(names), {}, "components")
 
 
 def match_components(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Where the wanted components stand among those that a channel states.
+    """Find where the wanted components stand among those that a channel states.
 
     Args:
         stated: the channel's metadata: names as `components`, with or without their `kinds`.
@@ -41,7 +41,7 @@ def match_components(stated: Mapping[str, str], wanted: Components, where: str) 
 
 
 def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Which rows and columns of a stated covariance are those of the wanted components, in their order.
+    """Find which rows and columns of a stated covariance are the wanted components', in order.
 
     A covariance is in the tangent space: one row for an axis, three for a quaternion, see
     `replay.engine.vectors.tangent`. Args and errors as `match_components`.
@@ -49,19 +49,26 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
     columns = match_components(stated, wanted, where)
     rows_of: list[range] = []
     end = 0
-    for kind, numbers in things(list(stated_components(stated, wanted, where).values())):
+    for kind, numbers in manifold_blocks(list(stated_components(stated, wanted, where).values())):
         begin, end = end, end + TANGENT_WIDTHS[kind]
         rows_of += [range(begin, end)] * (numbers.stop - numbers.start)
     return [
-        row for _, numbers in things(list(wanted.values())) for row in rows_of[columns[numbers.start]]
+        row
+        for _, numbers in manifold_blocks(list(wanted.values()))
+        for row in rows_of[columns[numbers.start]]
     ]
 
 
 def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
-    """Names and kinds as a channel states them, in its order; empty where it names none.
+    """Return names and kinds as a channel states them, in its order; empty where it names none.
 
     A channel without kinds means the wanted ones, and "linear" for what is not wanted. Raises BadInput
     where a name stands twice, or the kinds are none or not one for each name.
+
+    Args:
+        stated: the channel's metadata.
+        wanted: whose kinds hold where none are stated.
+        where: the topic, for errors.
     """
     names = [name for name in stated.get("components", "").split(",") if name]
     listed = stated.get("kinds", "")

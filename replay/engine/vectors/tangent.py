@@ -1,4 +1,4 @@
-"""Components that are no vector space: angles, axes and orientations, and their errors in tangent space.
+"""Compares and interpolates angles, axes and orientations in their tangent space.
 
 Every component of a state has a kind. The two of an axis, and the four of a quaternion, stand side by
 side and are equal to their negatives; their error is the rotation from truth to estimate in the body's
@@ -25,7 +25,7 @@ TANGENT_WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 1, "quaternio
 
 
 def are_kinds(kinds: Sequence[str]) -> bool:
-    """Whether these are kinds, with all components of every axis and quaternion side by side."""
+    """Tell whether these are kinds, with all components of every axis and quaternion side by side."""
     index = 0
     while index < len(kinds):
         width = WIDTHS.get(kinds[index])
@@ -35,7 +35,7 @@ def are_kinds(kinds: Sequence[str]) -> bool:
     return True
 
 
-def things(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
+def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
     """Kind and columns of every number, angle, axis and quaternion."""
     index = 0
     while index < len(kinds):
@@ -45,13 +45,17 @@ def things(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
 
 
 def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
+    """Return names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
 
     A linear component or angle keeps its name; an axis has one "angle", a quaternion three components
     of kind "rotation".
+
+    Args:
+        components: names.
+        kinds: one for each.
     """
     found: list[tuple[str, str]] = []
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         name = components[columns.start]
         stem = name.rpartition("_")[0] or name
         if kind == "quaternion":
@@ -62,9 +66,15 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
 
 
 def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
-    """Estimate - truth, both (n, components), in the tangent space (n, tangent components)."""
+    """Subtract truth from estimate, both (n, components), in the tangent space (n, tangent components).
+
+    Args:
+        estimate: (n, components).
+        truth: (n, components).
+        kinds: one for each component.
+    """
     parts = []
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         if kind in ("axis", "quaternion"):
             relative = compose(conjugate(truth[:, columns]), estimate[:, columns])
             parts.append(rotation_vector(relative))
@@ -75,9 +85,16 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
 
 
 def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
-    """States (n, components) on the shortest way from left to right, at weights (n,) from 0 to 1."""
+    """Interpolate states (n, components) the shortest way from left to right, at weights (n,).
+
+    Args:
+        left: (n, components).
+        right: (n, components).
+        weight: (n,), from 0 for left to 1 for right.
+        kinds: one for each component.
+    """
     value = np.empty(left.shape)
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         here, there = left[:, columns], right[:, columns]
         value[:, columns] = (
             _slerp(here, there, weight)
@@ -90,7 +107,14 @@ def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -
 def truth_at(
     truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
 ) -> Floats:
-    """The truth's state (n, d) at any stamps; see `states_at`."""
+    """Return the truth's state (n, d) at any stamps; see `states_at`.
+
+    Args:
+        truth: the stream, whose `state` is (m, d).
+        time_ns: (n,).
+        kinds: one for each component.
+        gap_limit_s: the longest gap that is bridged.
+    """
     return states_at(truth.publish_time_ns, truth["state"], time_ns, kinds, gap_limit_s)
 
 
@@ -101,9 +125,16 @@ def states_at(
     kinds: Sequence[str],
     gap_limit_s: float,
 ) -> Floats:
-    """States (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
+    """Return states (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
 
     NaN over gaps above the limit; a stamp that there is a state of exactly needs no neighbour.
+
+    Args:
+        times: (m,), in order.
+        state: (m, d).
+        time_ns: (n,).
+        kinds: one for each component.
+        gap_limit_s: the longest gap that is bridged.
     """
     if len(times) == 0:
         return np.full((len(time_ns), len(kinds)), np.nan)
@@ -118,7 +149,7 @@ def states_at(
 
 
 def rotation_vector(x: Floats) -> Floats:
-    """The shortest rotations of unit complex numbers (n, 2), as angles (n, 1), or of quaternions (n, 4).
+    """Make the shortest rotations of unit complex numbers (n, 2), as angles, or of quaternions (n, 4).
 
     In rad; x and -x are the same, so that the angle of an axis lies in [-pi/2, pi/2].
     """

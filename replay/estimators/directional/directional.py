@@ -13,9 +13,10 @@ from pydantic import Field, PositiveFloat, ValidationError
 
 from recorders.errors import BadInput
 from recorders.log import Schema, schemas
+from recorders.models.directional_noise import DirectionalNoise
+from recorders.models.headings import Correlation, equal_sigmas
+from recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS
 from recorders.parameters import Parameters
-from recorders.simulators.headings import Correlation, equal_sigmas
-from recorders.simulators.orientation import AXIS_KINDS, ORIENTATION_KINDS, Noise
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
@@ -49,9 +50,9 @@ Advance = Callable[[Any, Messages, Results], Any]
 class BinghamParameters(Parameters):
     """Distributions of prior and noises; one that is none is what the log's channel states."""
 
-    prior: Noise | None = None
-    system: Noise | None = None
-    measurement: Noise | None = None
+    prior: DirectionalNoise | None = None
+    system: DirectionalNoise | None = None
+    measurement: DirectionalNoise | None = None
 
 
 class KalmanParameters(BinghamParameters):
@@ -87,9 +88,9 @@ class UnscentedTorusParameters(HeadingsFilterParameters):
 class Distributions(NamedTuple):
     """The prior and both noises."""
 
-    prior: Noise
-    system: Noise
-    measurement: Noise
+    prior: DirectionalNoise
+    system: DirectionalNoise
+    measurement: DirectionalNoise
 
 
 def follow_all(advance: Advance, messages: Messages, state: Any, results: Results) -> None:
@@ -104,7 +105,9 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
     for name in Distributions._fields:
         value = getattr(given.parameters, name)
         try:
-            found[name] = value or Noise.model_validate_json(given.topics[topic].metadata[name])
+            found[name] = value or DirectionalNoise.model_validate_json(
+                given.topics[topic].metadata[name]
+            )
         except (KeyError, ValidationError):
             raise BadInput(
                 f"topic {given.topics[topic].name} does not state its {name}; give it with "
@@ -117,7 +120,7 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
     return Distributions(**found)
 
 
-def as_bingham(noise: Noise) -> Bingham:
+def as_bingham(noise: DirectionalNoise) -> Bingham:
     """The Bingham distribution, or that with the second moment of the projected Gaussian."""
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
@@ -128,7 +131,7 @@ def as_bingham(noise: Noise) -> Bingham:
         raise BadInput(f"Gaussian noise of the variances {noise.diagonal}: {error}") from None
 
 
-def as_covariance(noise: Noise) -> Floats:
+def as_covariance(noise: DirectionalNoise) -> Floats:
     """The Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)
@@ -209,7 +212,7 @@ def _of_unit_vectors(
         summary,
         parameters=parameters,
         streams={topic: schema},
-        whole={},
+        static={},
         components=kinds,  # type: ignore[arg-type]
         truth="truth",
         vectors={topic: Vectors({topic: len(kinds)})},
@@ -226,7 +229,7 @@ def _of_headings(
         summary,
         parameters=parameters,
         streams={"headings": schemas.VECTOR_MEASUREMENT},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=components,
         truth="truth",
         vectors={"headings": Vectors({"value": components})},

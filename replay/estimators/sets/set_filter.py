@@ -10,26 +10,49 @@ A frame and what came before it that contradict each other leave two sets, one o
 if only one of them is wrong; the union is the estimate until later frames have emptied one of the two.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
-import shapely
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
-from shapely.geometry.base import BaseGeometry
 
+from recorders.extras import AtFirstUse
 from recorders.log import Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.channels import given_or_stated
 from replay.engine.streams.failures import reason_stream
-from replay.estimators.sets.feasible_sets import excess_rad, to_blame
-from replay.estimators.sets.moving_sets import (
+from replay.estimators.sets.set_membership import (
+    SetParameters,
+    fault_stream,
+    known_of,
+    polygons,
+    set_metadata,
+    set_streams,
+)
+from replay.regions.feasible_sets import excess_rad, to_blame
+from replay.regions.frames import (
+    CONTRADICTS_ITSELF,
+    CONTRADICTS_PAST,
+    ERRORS,
+    FINDINGS,
+    FRAME_WRONG,
+    PAST_WRONG,
+    STATED,
+    UNDECIDED,
+    Bearings,
+    Bounds,
+    Frame,
+    Known,
+    frames_with_bearings,
+)
+from replay.regions.moving_sets import (
     ALL_HEADINGS,
-    Growth,
     Headings,
     Motion,
     Odometry,
@@ -45,27 +68,12 @@ from replay.estimators.sets.moving_sets import (
     turned,
     within_l8,
 )
-from replay.estimators.sets.set_membership import (
-    Frame,
-    Known,
-    SetParameters,
-    fault_stream,
-    frames,
-    known_of,
-    polygons,
-    set_metadata,
-    set_streams,
-)
 
-CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
-FINDINGS = (
-    "the bearings of this frame contradict each other: it is left out",
-    "this frame contradicts what came before it: the sets of both are kept",
-    "this frame contradicts both sets that were kept: they count as one from here on",
-    "the earlier frame that contradicted what came before it was wrong",
-    "what came before the earlier frame that contradicted it was wrong",
-)
-NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = AtFirstUse("shapely", "papers", "guaranteed sets over time")
+
 LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
@@ -90,30 +98,6 @@ class SetFilterParameters(SetParameters):
     most_edges: PositiveInt = 400
 
 
-class Bounds(NamedTuple):
-    """How far odometry and bearings err at most."""
-
-    position: Growth
-    heading: Growth
-    bearing_rad: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Bounds":
-        """From the five numbers of a channel or of parameters, in the order of STATED."""
-        return cls(Growth(*values[:2]), Growth(*values[2:4]), values[4])
-
-
-ERRORS = ("position_error_m", "position_error_mps", "heading_error_rad", "heading_error_radps")
-STATED = (*ERRORS, "bearing_bound_rad")
-
-
-class Bearings(NamedTuple):
-    """The bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
-
-    place_m: Floats
-    bearing_rad: Floats
-
-
 class Step(NamedTuple):
     """The estimate at one frame.
 
@@ -129,7 +113,7 @@ class Step(NamedTuple):
 
     time_ns: int
     anchor_ns: int
-    parts: list[BaseGeometry]
+    parts: list[shapely.Geometry]
     headings: Headings
     growth: float = 1.0
     finding: int | None = None
@@ -142,7 +126,7 @@ class Anchor:
 
     time_ns: int
     pose: Floats
-    parts: list[BaseGeometry]
+    parts: list[shapely.Geometry]
     headings: Headings
 
 
@@ -156,7 +140,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 
 
 def narrowed(
-    headings: Headings, places: BaseGeometry, seen: Bearings, bound_rad: float
+    headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
     """The headings from which landmarks are seen as they were; None where there are none."""
     left: Headings | None = headings
@@ -197,14 +181,14 @@ def follow(
     return steps
 
 
-def _first(frame: Frame, cut: BaseGeometry, seen: Bearings, bounds: Bounds) -> Step:
+def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> Step:
     """What a frame says by itself."""
     headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
     return Step(frame.time_ns, frame.time_ns, [cut], headings)
 
 
 def _advance(
-    anchor: Anchor, frame: Frame, cut: BaseGeometry, seen: Bearings, pose: Floats, bounds: Bounds
+    anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
 ) -> Step:
     """The set of an anchor moved to a frame and cut by it; the anchor is cut by the frame as well."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
@@ -229,7 +213,7 @@ def _advance(
 
 
 def _cut(
-    anchor: Anchor, step: Step, cut: BaseGeometry, seen: Bearings, motion: Motion, bounds: Bounds
+    anchor: Anchor, step: Step, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
 ) -> Step | None:
     """The step and its anchor cut by a frame; None, and no change, where nothing would be left."""
     common = shapely.union_all(step.parts).intersection(cut)
@@ -254,36 +238,19 @@ def _cut(
     return step._replace(parts=[parts[index] for index in alive], headings=headings, finding=finding)
 
 
-def _contradicting(frame: Frame, places: BaseGeometry) -> int | None:
+def _contradicting(frame: Frame, places: shapely.Geometry) -> int | None:
     """The relative bearing whose bound is exceeded most at the corner of a set that suits it best."""
     excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
     best = excess[np.argmin(excess.max(axis=1))]
     return int(np.argmax(best)) if best.max() > 0.0 else None
 
 
-def _simpler(part: BaseGeometry, most_edges: int) -> BaseGeometry:
+def _simpler(part: shapely.Geometry, most_edges: int) -> shapely.Geometry:
     return within_l8(part) if shapely.get_num_coordinates(corners_of(part)) > most_edges else part
 
 
-def _area(parts: Sequence[BaseGeometry]) -> float:
+def _area(parts: Sequence[shapely.Geometry]) -> float:
     return float(shapely.union_all(parts).area)
-
-
-def frames_with_bearings(
-    stream: Stream, landmarks: Stream, known: Known
-) -> Iterable[tuple[Frame, Bearings]]:
-    """The frames of a stream and the single bearings of each, none of a relative-bearing stream."""
-    places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
-    for frame in frames(stream, landmarks, known):
-        bearings = Bearings(np.empty((0, 2)), np.empty(0))
-        if "bearing_rad" in stream.columns:
-            first, end = np.searchsorted(stream.publish_time_ns, [frame.time_ns, frame.time_ns + 1])
-            rows = [row for row in range(first, end) if int(stream["target_id"][row]) in places]
-            targets = stream["target_id"][rows].tolist()
-            bearings = Bearings(
-                np.array([places[target] for target in targets]), stream["bearing_rad"][rows]
-            )
-        yield frame, bearings
 
 
 def solve(

@@ -1,4 +1,4 @@
-"""Parameters as part of the state: a sensor's bias, a scale factor, a time offset that is estimated too.
+"""Augments a state by parameters of its model: a sensor's bias, a scale factor, a time offset.
 
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
@@ -20,8 +20,13 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import gaussian_stream
 from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import Walk, kept, spread, with_walk_parameters
-from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.gauss_markov import (
+    GaussMarkov,
+    added_variance,
+    remaining_share,
+    with_gauss_markov_parameters,
+)
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import number_fields, settings_type
 from replay.inference.model.point_errors import (
     Errors,
@@ -33,31 +38,37 @@ from replay.inference.model.point_errors import (
 )
 from replay.inference.model.settings import TracedParameters
 from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 Start = Callable[[Mapping[str, Ragged]], Any]
 
 
 class Added(NamedTuple):
-    """What is estimated beside the state: parameters, then errors about points, and how each moves."""
+    """Holds what is added to the state: parameters, then errors about points, and how each moves."""
 
     parameters: Names
     errors: Errors
-    walks: tuple[Walk, ...]
+    processes: tuple[GaussMarkov, ...]
 
     @property
     def names(self) -> Names:
-        """The components, in their order."""
+        """Return the components, in their order."""
         return self.parameters + tuple(each.name for each in self.errors)
 
 
 def estimated(label: str, model: Model, parameters: Any) -> Added:
-    """What is to be estimated beside the state, as the settings say.
+    """Return what is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where what the model lists as `estimable` is none of its parameters, it does not list
-    one that is asked for, one stands twice, or has no sigma.
+    Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
+    list one that is asked for, one stands twice, or has no sigma.
+
+    Args:
+        label: the estimator's, for errors.
+        model: whose parameters are asked for.
+        parameters: with `estimate` and its options.
     """
-    check_estimable(f"estimator {label}", model)
+    check_augmentable(f"estimator {label}", model)
     asked = parameters.estimate or []
     options = {
         "estimate_sigma": parameters.estimate_sigma or {},
@@ -67,13 +78,13 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
     for option, given in options.items():
         for name in given.keys() - set(asked):
             raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
-    named: dict[str, Walk] = {}
-    errors: dict[PointError, Walk] = {}
+    named: dict[str, GaussMarkov] = {}
+    errors: dict[PointError, GaussMarkov] = {}
     for asks in asked:
         where = f"estimator {label}: estimate = {asks}"
         own = point_errors(where, model, asks)
-        if not own and asks not in model.estimable:
-            known = choices(asks, model.estimable)
+        if not own and asks not in model.augmentable:
+            known = choices(asks, model.augmentable)
             raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
         if asks in named or not errors.keys().isdisjoint(own):
             raise BadInput(f"{where}: is named twice; name it once")
@@ -83,38 +94,40 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
                 f"{where}: its uncertainty at the start is missing; give its standard deviation, "
                 f"estimate_sigma.{asks}=..."
             )
-        if time_s is not None and model.estimable.get(asks) == "angle":
+        if time_s is not None and model.augmentable.get(asks) == "angle":
             raise BadInput(
                 f"{where}: is an angle, which cannot return to a mean; give "
                 f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
             )
-        walk = Walk(sigma, drift or 0.0, time_s or np.inf)
+        process = GaussMarkov(sigma, drift or 0.0, time_s or np.inf)
         if own:
-            errors |= dict.fromkeys(own, walk)
+            errors |= dict.fromkeys(own, process)
         else:
-            named[asks] = walk
+            named[asks] = process
     return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
 
 
-def check_estimable(where: str, model: Model) -> None:
-    """Raise BadInput where `estimable` is no mapping from parameters of the model to linear or angle."""
-    if not isinstance(model.estimable, Mapping):
+def check_augmentable(where: str, model: Model) -> None:
+    """Raise BadInput where `augmentable` does not map parameters of the model to linear or angle."""
+    if not isinstance(model.augmentable, Mapping):
         raise BadInput(
-            f"{where}: estimable is a {type(model.estimable).__name__}; it is a mapping from parameter "
-            'to kind, such as {"length_m": "linear"}'
+            f"{where}: augmentable is a {type(model.augmentable).__name__}; it is a mapping from "
+            'parameter to kind, such as {"length_m": "linear"}'
         )
     known = number_fields(model.parameters)
-    for name, kind in model.estimable.items():
+    for name, kind in model.augmentable.items():
         if name not in known:
             raise BadInput(
-                f"{where}: estimable: '{name}' is no parameter of the model; {choices(name, known)}"
+                f"{where}: augmentable: '{name}' is no parameter of the model; {choices(name, known)}"
             )
         if kind not in ("linear", "angle"):
-            raise BadInput(f"{where}: estimable: {name} is of kind '{kind}'; known are linear and angle")
+            raise BadInput(
+                f"{where}: augmentable: {name} is of kind '{kind}'; known are linear and angle"
+            )
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
-    """The model with these parameters and errors in its state; the model itself where there are none.
+    """Add parameters and errors to a model's state; the model itself where there are none.
 
     >>> from replay.estimators.models.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
@@ -125,7 +138,12 @@ def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
 
 
 def augmented_stage(stage: Stage, added: Added) -> Stage:
-    """The same of a model as a method takes it."""
+    """Return the same of a model as a method takes it.
+
+    Args:
+        stage: the model with the sensors at hand.
+        added: what is added to its state.
+    """
     names, errors = added.parameters, added.errors
     if names:
         model, sensors = stage.model, stage.sensors
@@ -140,19 +158,31 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
     return stage
 
 
-def with_walks(settings: Floats, added: Added) -> Floats:
-    """Numbers of motion and sensors with those that an augmented model has beside them."""
-    numbers = np.ravel(added.walks)
+def with_gauss_markov(settings: Floats, added: Added) -> Floats:
+    """Return numbers of motion and sensors with those that an augmented model has beside them.
+
+    Args:
+        settings: (1 + sensors, fields).
+        added: what is added to the state.
+    """
+    numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
 
 def begin(
     label: str, topic: str, stage: Stage, added: Added, settings: Floats
 ) -> Callable[[Start], Start]:
-    """What makes of the start of an augmented model's filter one from the log's own prior on `topic`.
+    """Make the function that extends the log's own prior on `topic` to an augmented model's.
 
     `stage` and `settings` are those of the model itself. Raises BadInput where a parameter that is to be
     estimated has no value.
+
+    Args:
+        label: the estimator's, for errors.
+        topic: of the prior.
+        stage: of the model itself.
+        added: what is added to its state.
+        settings: (1 + sensors, fields), of the model itself.
     """
     fields = number_fields(stage.model.parameters)
     means = np.array(
@@ -164,11 +194,11 @@ def begin(
                 f"estimator {label}: estimate = {name}: its value at the start is missing; give "
                 f"{name}=..."
             )
-    variances = np.array([walk.sigma**2 for walk in added.walks])
+    variances = np.array([process.sigma**2 for process in added.processes])
 
     def extended(prior: Ragged) -> Ragged:
         time_ns, mean, covariance = gaussians(prior)
-        runs, t, k = len(mean), covariance.shape[1], len(added.walks)
+        runs, t, k = len(mean), covariance.shape[1], len(added.processes)
         wider = np.zeros((runs, t + k, t + k))
         wider[:, :t, :t] = covariance
         wider[:, range(t, t + k), range(t, t + k)] = variances
@@ -176,7 +206,11 @@ def begin(
         return Ragged(gaussian_stream(topic, time_ns, longer, wider, {}), prior.offsets)
 
     def begun(start: Start) -> Start:
-        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if added.walks else start
+        return (
+            (lambda static: start({**static, topic: extended(static[topic])}))
+            if added.processes
+            else start
+        )
 
     return begun
 
@@ -188,19 +222,19 @@ def _augmented(model: Model, names: Names) -> Model:
     }
     return replace(
         model,
-        state={**model.state, **{name: model.estimable[name] for name in names}},
-        parameters=with_walk_parameters(model.parameters, names),
+        state={**model.state, **{name: model.augmentable[name] for name in names}},
+        parameters=with_gauss_markov_parameters(model.parameters, names),
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
         modes=modes,
         correct=correcting_more(model, len(names)),
-        estimable={},
+        augmentable={},
     )
 
 
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """The motion, in which the parameters walk about or come back to what they were given as."""
+    """Return the motion, in which parameters are random walks or return to their given values."""
     n, t, noises = model.size, model.tangent, motion.noises
     given = motion.noise or _no_noise(t)
     state, parameters = trial_state(model.kinds), _traced(model)
@@ -210,7 +244,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, parameters)
     reads_none = not parameters.read & set(names)
     move_own = _reading(model, names, motion.move)
-    angular = tuple(model.estimable[name] == "angle" for name in names)
+    angular = tuple(model.augmentable[name] == "angle" for name in names)
 
     def move(state: Any, control: Any, *others: Any) -> Any:
         *entering, duration_s, parameters = others
@@ -218,8 +252,8 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         moved = list(move_own(state, control, *own, duration_s, parameters))
         for index, name in enumerate(names):
             stay = state[n + index]
-            if not angular[index]:  # an angle has no mean to come back to
-                share = kept(name, duration_s, parameters)
+            if not angular[index]:  # an angle has no mean to return to
+                share = remaining_share(name, duration_s, parameters)
                 stay = share * stay + (1.0 - share) * getattr(parameters, name)
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
@@ -231,7 +265,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
             found = list(own(state, duration_s, parameters))
             for index, name in enumerate(names):
                 found += [0.0] * (t + index) if is_triangle else []
-                found.append(spread(name, duration_s, parameters))
+                found.append(added_variance(name, duration_s, parameters))
             return tuple(found)
 
         return noise
@@ -240,7 +274,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         motion,
         move=move,
         noise=with_spreads(given, is_triangle=is_triangle),
-        lost=motion.lost and with_spreads(motion.lost),
+        gap_noise=motion.gap_noise and with_spreads(motion.gap_noise),
         noises=noises + len(names) if noises else 0,
         linear=motion.linear and reads_none,
         jacobians=None,
@@ -251,8 +285,8 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
 @lru_cache(maxsize=256)
 def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    parameters, about = _traced(model), (1.0,) * sensor.about_size
-    sensor.measure(trial_state(model.kinds), *entering, about, parameters)
+    parameters, reference = _traced(model), (1.0,) * sensor.reference_size
+    sensor.measure(trial_state(model.kinds), *entering, reference, parameters)
     return replace(
         sensor,
         measure=_reading(model, names, sensor.measure),
@@ -264,7 +298,7 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
 
 
 def _reading(model: Model, names: Names, function: Function) -> Function:
-    """A model's function of the augmented state, which reads the estimated parameters from there."""
+    """Make a model's function of the augmented state, which reads estimated parameters from there."""
     n, fields = model.size, number_fields(model.parameters)
     settings = settings_type(fields)
     places = tuple((field, n + names.index(field) if field in names else -1) for field in fields)

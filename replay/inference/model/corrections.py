@@ -1,6 +1,6 @@
-"""How an update moves a state by a step of its tangent space, and what becomes of the covariance.
+"""Moves a state and its covariance by a step of the tangent space, after an update or a smoother's step.
 
-Components move by themselves (`manifold.retraction`), unless a model says how they bend together
+Components move by themselves (`manifold.boxplus`), unless a model says how they bend together
 (`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that
 of the new one by the derivative of the moved state by the step, and the other way by that of the step by
 the state to which it leads.
@@ -9,13 +9,13 @@ the state to which it leads.
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import moved_covariance
+from replay.inference.linear_algebra.gaussian import propagate_covariance
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.manifold import (
-    differencing,
+    boxminus,
+    boxplus,
+    by_right_jacobian,
     is_flat,
-    resetting,
-    retraction,
     tangent_size,
 )
 from replay.inference.linear_algebra.tuples import filling, tuple_of
@@ -26,9 +26,13 @@ Kinds = tuple[str, ...]
 
 
 def sloping(kinds: Kinds, correct: Correction | None) -> Function:
-    """`fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
+    """Make `fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
 
     Where nothing bends it is left as it is.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
     """
     if correct is None:
 
@@ -53,10 +57,10 @@ def sloping(kinds: Kinds, correct: Correction | None) -> Function:
 
 
 def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) -> Function:
-    """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
+    """Make `move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
 
     Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
-    `product`. With `back` it is a step of a smoother's way back.
+    `product`. With `back` it is a step of a smoother's backward pass.
     """
     if correct is not None:
         step_together = _stepping(kinds, correct.back if back else correct.move)
@@ -65,10 +69,10 @@ def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) 
         def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
             step_together(mean, work)
             fill(mean, work.state)
-            moved_covariance(covariance, work.transition, work.product)
+            propagate_covariance(covariance, work.transition, work.product)
 
         return move_together
-    add, reset = retraction(kinds), resetting(kinds)
+    add, reset = boxplus(kinds), by_right_jacobian(kinds)
     if is_flat(kinds):
 
         def move(mean: Floats, covariance: Floats, work: Any) -> None:
@@ -85,10 +89,14 @@ def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) 
 
 
 def comparing(kinds: Kinds, correct: Correction | None) -> Function:
-    """`compare(origin, mean, covariance, work)`: the step that `correcting` takes back, found again.
+    """Make `compare(origin, mean, covariance, work)`: it finds the step that `correcting` takes back.
 
     Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
     from the mean's tangent space to the origin's.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
     """
     if correct is not None:
         t, read_state = tangent_size(kinds), tuple_of(len(kinds))
@@ -106,10 +114,10 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
             linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
             for row in range(t):
                 work.change[0, row] = work.step[row]
-            moved_covariance(covariance, work.transition, work.product)
+            propagate_covariance(covariance, work.transition, work.product)
 
         return compare_together
-    subtract, reset_back = differencing(kinds), resetting(kinds, back=True)
+    subtract, reset_back = boxminus(kinds), by_right_jacobian(kinds, back=True)
     if is_flat(kinds):
 
         def compare(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
@@ -126,7 +134,7 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
 
 
 def relinearising(model: Model) -> tuple[Function, Function]:
-    """Where an iterated update linearises, and the chain rule back to the mean.
+    """Find where an iterated update linearises, and the chain rule back to the mean.
 
     `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`; after it
     `chain(rows, work)` makes of a Jacobian (m, t) at that state one by the step.
@@ -145,8 +153,8 @@ def relinearising(model: Model) -> tuple[Function, Function]:
                     rows[i, column] = work.turned[column]
 
         return _stepping(model.kinds, model.correct.move), chain_together
-    fill, add, flat = filling(model.size), retraction(model.kinds), is_flat(model.kinds)
-    turn = resetting(model.kinds)
+    fill, add, flat = filling(model.size), boxplus(model.kinds), is_flat(model.kinds)
+    turn = by_right_jacobian(model.kinds)
 
     def step_to(mean: Floats, work: Any) -> None:
         fill(work.state, mean)
@@ -162,7 +170,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
 
 
 def _stepping(kinds: Kinds, move: Function) -> Function:
-    """`step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
+    """Make `step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
     straight = ("linear",) * tangent_size(kinds)
     inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
     arguments = (len(each.kinds) for each in inputs)
@@ -176,7 +184,7 @@ def _stepping(kinds: Kinds, move: Function) -> Function:
 
 
 def correcting_more(model: Model, more: int) -> Correction | None:
-    """How a model is corrected whose state gets so many more components, which move by themselves."""
+    """Extend a model's correction to more components of the state, which move by themselves."""
     if model.correct is None:
         return None
     n, t, correct = model.size, model.tangent, model.correct

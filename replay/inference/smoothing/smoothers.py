@@ -1,4 +1,4 @@
-"""Smoothers: filters that keep their nodes, and at the end, or a lag behind, go back over them.
+"""Runs smoothers: filters that keep their nodes and pass back over them, at the end or at a lag.
 
 The steps that a filter leaves, and the way back over them, are in
 `replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
@@ -32,14 +32,14 @@ from replay.inference.kalman.steps import Steps
 from replay.inference.linear_algebra.manifold import is_flat
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.run.filtering import Filter, FilterState
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
     Nodes,
     back_memory,
-    going_back,
+    backward_pass_over_runs,
     no_later,
     smoothing_steps,
 )
@@ -59,7 +59,7 @@ class SmootherParameters(UnscentedParameters, RegressionParameters):
 
 
 class Forward(NamedTuple):
-    """A filter's name, its variant, and the lag, FOREVER_NS for the whole run."""
+    """Holds a filter's name, its variant, and the lag, FOREVER_NS for the whole run."""
 
     name: str
     variant: str
@@ -67,7 +67,7 @@ class Forward(NamedTuple):
 
 
 def parse_forward(text: str) -> Forward:
-    """What `SmootherParameters.forward` says; raises BadInput where it says nothing."""
+    """Parse `SmootherParameters.forward`; raises BadInput where it has another form."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
     rest_on = before.removesuffix(":")
     name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
@@ -86,14 +86,14 @@ def parse_forward(text: str) -> Forward:
 
 
 class Piece(NamedTuple):
-    """Nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+    """Holds nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
 
     nodes: Nodes
     offsets: Integers
 
 
 class Stored:
-    """A piece on disk, in a temporary file that is gone when nobody refers to it any more."""
+    """Represents a piece on disk, in a temporary file that is gone when nobody refers to it any more."""
 
     def __init__(self, piece: Piece) -> None:
         self.offsets = piece.offsets
@@ -103,58 +103,60 @@ class Stored:
             np.save(self._file, column)
 
     def read(self) -> Piece:
-        """The piece, in memory."""
+        """Return the piece, in memory."""
         self._file.seek(0)
         return Piece(Nodes(*(np.load(self._file) for _ in Nodes._fields)), self.offsets)
 
 
 def stored(pieces: Sequence[Piece | Stored], new: Piece) -> Piece | Stored:
-    """A piece, on disk where it is too much beside those in memory."""
+    """Return a piece, on disk where it is too much beside those in memory."""
     in_memory = [new, *(piece for piece in pieces if isinstance(piece, Piece))]
     size = sum(column.nbytes for piece in in_memory for column in piece.nodes)
     return new if size <= IN_MEMORY_BYTES else Stored(new)
 
 
 class Waiting(NamedTuple):
-    """The nodes within the lag, and the steps between them."""
+    """Holds the nodes within the lag, and the steps between them."""
 
     piece: Piece
     window: Window
 
 
 class Smoother(Filter):
-    """A filter that keeps its nodes, and at the end, or a lag behind, goes back over them."""
+    """Runs a filter that keeps its nodes, and smooths them at the end, or a lag behind."""
 
     @cached_property
     def lag_ns(self) -> int:
-        """How much later a message may be that an estimate uses."""
+        """Compute how much later a message may be that an estimate uses."""
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
-    def cannot_rewind(self) -> str:
-        """A smoother has its estimates from what came later in any case."""
+    def why_in_sequence(self) -> str:
+        """Explain that a smoother uses later messages in any case."""
         return "a smoother uses later messages in any case; replay it in the order of the stamps"
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
-        """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
+        """Return the state at every run's prior, see `Filter.start`."""
+        state = super().start(static)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         slope, none = np.zeros(covariance.shape[:2]), np.zeros(len(mean), np.int64)
         chain = Chain(mean, covariance, mean.copy(), slope, gain, rest, none)
         return state._replace(carried=state.carried._replace(belief=chain), kept=())
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
-        """Nodes and innovations to be filled in."""
-        estimates, innovations = super().no_results(due, noted, slots)
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
+        """Return nodes and innovations to be filled in."""
+        estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
         predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events, and smooth what the lag lets go."""
-        after, (nodes, offsets), made = self.filtered(state, happenings)
+        after, (nodes, offsets), made = self.filtered(state, events)
         new = Piece(nodes, offsets)
         if self.lag_ns == FOREVER_NS:  # nothing yet
             nothing = self.states(*self.gone_back([new], offsets[:-1]))
@@ -170,8 +172,8 @@ class Smoother(Filter):
         smoothed = self.states(*self.lagging(piece, window, stop))
         return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
-    def finish(self, state: State) -> list[Ragged]:
-        """What waited for later messages, and what those say of all before them."""
+    def finish(self, state: FilterState) -> list[Ragged]:
+        """Filter what waited for later messages, and smooth all nodes that are left."""
         state, made = self.ended(state)
         if self.lag_ns == FOREVER_NS:
             return [*made, self.states(*self.gone_back(state.kept))]
@@ -181,7 +183,7 @@ class Smoother(Filter):
         return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
 
     def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[Estimates, Integers]:
-        """The estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
+        """Return the estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
 
         Changes the nodes, and the window, which then begins at row stop[run].
         """
@@ -204,7 +206,7 @@ class Smoother(Filter):
     def gone_back(
         self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
     ) -> tuple[Estimates, Integers]:
-        """The estimates at the nodes of all pieces, or of one those before row stop[run].
+        """Return the estimates at the nodes of all pieces, or of one those before row stop[run].
 
         Run r owns offsets[r]:offsets[r + 1].
         """
@@ -221,7 +223,7 @@ class Smoother(Filter):
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            going_back(model.kinds, model.correct)(runs, *arguments, scratch=memory)
+            backward_pass_over_runs(model.kinds, model.correct)(runs, *arguments, scratch=memory)
         return smoothed, offsets
 
 
@@ -232,7 +234,7 @@ def _no_estimates(offsets: Integers, n: int, t: int) -> Estimates:
 
 
 def _joined(pieces: Sequence[Piece]) -> Piece:
-    """Pieces as one, each run's nodes together."""
+    """Return pieces as one, each run's nodes together."""
     if len(pieces) == 1:
         return pieces[0]
     runs = np.arange(len(pieces[0].offsets) - 1)
@@ -244,7 +246,7 @@ def _joined(pieces: Sequence[Piece]) -> Piece:
 
 
 def _rows_from(piece: Piece, begin: Integers) -> Piece:
-    """The nodes of every run from row begin[run] on."""
+    """Return the nodes of every run from row begin[run] on."""
     counts = piece.offsets[1:] - begin
     rows = np.arange(piece.offsets[-1]) >= np.repeat(begin, np.diff(piece.offsets))
     columns: Any = (column[rows] for column in piece.nodes[1:])
@@ -257,7 +259,7 @@ def _rows_from(piece: Piece, begin: Integers) -> Piece:
 
 @lru_cache(maxsize=64)
 def _smoother_of(name: str, variant: str) -> Method:
-    """The method that smooths what a filter estimates."""
+    """Make the method that smooths what a filter estimates."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:

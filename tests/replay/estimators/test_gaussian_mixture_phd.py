@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.ensemble import judge, replay_in_memory
+from pipeline.runs.recorded import judge, replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from replay.engine.replaying.estimator import bind
@@ -14,12 +14,12 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import gather
 from replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
-    Scans,
     filter_scans,
     no_components,
     scans_of,
     settings_of,
 )
+from replay.estimators.tracking.phd_recursion import Scans
 from replay.judging.errors.truths import Truths
 from replay.judging.sets.errors import set_errors
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source

@@ -5,8 +5,10 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.output.results import read_table
 from recorders.errors import BadInput
 from recorders.log import Clock
 from recorders.parsing import parse_json
@@ -35,8 +37,13 @@ def untaken(
     """
     taken: dict[str, set[str]] = {label: set() for label in labels}
     for each in bound:
-        opening = getattr(each, "opening", None)
-        own = {*each.streams, *each.whole, *each.priors, *(opening.topics if opening else ())}
+        initialization = getattr(each, "initialization", None)
+        own = {
+            *each.streams,
+            *each.static,
+            *each.priors,
+            *(initialization.topics if initialization else ()),
+        }
         taken.setdefault(each.name.partition("/")[0], set()).update(own)
     messages: Counter[str] = Counter()
     for source in sources:
@@ -127,11 +134,11 @@ def _recounted(
     usages = {each.name: Usage(each.name) for each in bound}
     maps = {
         topic: gather([source.read([topic])[topic]])
-        for topic in {topic for each in bound for topic in each.whole}
+        for topic in {topic for each in bound for topic in each.static}
         if topic in source.topics and source.topics[topic].schema_name == LANDMARK
     }
     own_maps = {
-        each.name: {topic: maps[topic] for topic in each.whole if topic in maps} for each in bound
+        each.name: {topic: maps[topic] for topic in each.static if topic in maps} for each in bound
     }
     for name, usage in usages.items():
         usage.note_start(own_maps[name])
@@ -200,6 +207,20 @@ def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
             row if before is None else row._replace(messages=row.messages + before.messages)
         )
     return list(counts.values())
+
+
+def stored_rows(folder: Path) -> list[Row]:
+    """The table `coverage` of a result; older ones have none."""
+    path = folder / "tables" / "coverage.parquet"
+    if not path.is_file():
+        return []
+    table = read_table(path).astype(object)
+    return [Row(*row) for row in table.where(table.notna(), None)[[*Row._fields]].to_numpy().tolist()]
+
+
+def rows_of_side(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
+    """The lines of one estimator, under a side's name."""
+    return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 
 def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
