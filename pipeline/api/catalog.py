@@ -15,7 +15,7 @@ from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
-from replay.engine.replaying.estimator import Estimator
+from replay.engine.replaying.estimator import Estimator, find_estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
 from replay.inference.model.binding import serving
@@ -72,6 +72,8 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
     """Print a list, or all about one of its entries."""
     if name is not None:
         known = {entry.name: entry for entry in entries}
+        if kind == "estimator" and name.partition(":")[0] in known:
+            known[name] = _estimator(name, *find_estimator(name))
         if name not in known:
             raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
         entries = [known[name]]
@@ -139,8 +141,10 @@ def _recorder(name: str, recorder: Recorder[Any]) -> Entry:
     return Entry(name, recorder.summary, {"record with": command}, recorder.parameters)
 
 
-def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
+def _estimator(name: str, estimator: Estimator[Any], variant: Mapping[str, Any] | None = None) -> Entry:
     facts = {"needs": estimator.needs}
+    if variant:
+        return Entry(name, estimator.summary, facts, estimator.parameters_with(name, variant), variant)
     if estimator.variant:
         facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
     return Entry(name, estimator.summary, facts, estimator.parameters)
@@ -160,9 +164,13 @@ def _model(name: str, model: Model) -> Entry:
         facts["estimable"] = _listed(model.estimable)
     facts["needs"] = needs_of(model)
     facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
+    return Entry(name, model.summary, facts, model.parameters, stated=stated_of(model))
+
+
+def stated_of(model: Model) -> set[str]:
+    """The parameters of a model that a log's channels state where they are not given."""
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
-    stated = own & {*number_fields(model.parameters)}
-    return Entry(name, model.summary, facts, model.parameters, stated=stated)
+    return own & {*number_fields(model.parameters)}
 
 
 def _listed(components: Mapping[str, str]) -> str:
@@ -202,17 +210,20 @@ def _print_details(entry: Entry) -> None:
     for key, fact in entry.facts.items():
         say(f"{key}: {fact}")
     if entry.parameters:
-        described = describe(entry.parameters, entry.values)
-        table = [
-            [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
-            for each in described
-        ]
-        if any(each.meaning for each in described):
-            print_table(["parameter", "default", "accepts", "meaning"], table)
-        elif table:
-            print_table(["parameter", "default", "accepts"], [row[:-1] for row in table])
-        for place, text in explain(entry.parameters).items() if table else ():
-            say(f"\n{place}\n{text}" if place else f"\n{text}")
+        print_table(["parameter", "default", "unit", "accepts", "meaning"], rows_of(entry))
+        for place, text in explain(entry.parameters).items():
+            for line in ("", *([place] if place else []), *text.splitlines()):
+                say(line)
+
+
+def rows_of(entry: Entry) -> list[list[object]]:
+    """Of every parameter its name, its default, its unit, what it accepts and what it means."""
+    if entry.parameters is None:
+        return []
+    return [
+        [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
+        for each in describe(entry.parameters, entry.values)
+    ]
 
 
 def _default(value: object, *, is_stated: bool) -> object:

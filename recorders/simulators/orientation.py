@@ -23,9 +23,10 @@ from recorders.recording import Recording, Simulator, simulation_stamps_ns
 class Noise(Parameters):
     """A distribution of unit vectors, along the components of a complex number or quaternion.
 
-    `diagonal` are the concentrations of a Bingham distribution: 0 for its mode, at most 0 for the
-    others. For a Gaussian they are variances about the identity (1, 0, ...), and its samples are scaled
-    to unit length.
+    Attributes:
+        distribution: of which kind it is; samples of a Gaussian are scaled to unit length.
+        diagonal: of a Bingham distribution the concentrations: 0 for its mode, at most 0 for the others;
+            of a Gaussian the variances about the identity (1, 0, ...).
     """
 
     distribution: Literal["bingham", "gaussian"] = "bingham"
@@ -52,7 +53,16 @@ class Noise(Parameters):
 
 
 class AxisParameters(Parameters):
-    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode."""
+    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode.
+
+    Attributes:
+        steps: number of time steps.
+        step_s: length of a time step.
+        start: true orientation at the start, a unit vector.
+        prior: distribution of the orientation at the start, as filters assume it.
+        system: distribution of what a step turns by.
+        measurement: distribution of what a measurement is turned by.
+    """
 
     steps: PositiveInt = 100
     step_s: PositiveFloat = 0.1
