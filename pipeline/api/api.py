@@ -27,8 +27,8 @@ from pipeline.runs.experiment import (
     require_campaign,
     run_experiment,
 )
+from pipeline.runs.summary import summary_table
 from pipeline.runs.sweeps import nested, over_of, points_of, run_sweep
-from pipeline.studies.toolkit.localization import summary_table
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, open_log, write_log
 from recorders.parameters import merge

@@ -25,7 +25,7 @@ from pipeline.output.results import in_order, result_folder, write_outcome
 from pipeline.runs.coverage import coverage_table, sentences
 from pipeline.runs.ensemble import Pass, Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
 from pipeline.runs.initial_states import order_of, origins_of, span_of
-from pipeline.studies.toolkit.localization import error_charts, summarise, summary_table
+from pipeline.runs.summary import error_charts, summarise, summary_table
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, open_log, schemas

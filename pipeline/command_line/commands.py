@@ -158,7 +158,7 @@ def evaluate_logs(
     are judged in their alignment with the truth.
     """
     from pipeline.api.trajectories import ComparedLogs, compare_logs
-    from pipeline.studies.toolkit.localization import summarise, summary_table
+    from pipeline.runs.summary import summarise, summary_table
     from replay.judging.errors.trajectories import Comparison
 
     if errors and out is None:

@@ -32,7 +32,7 @@ from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
-from pipeline.studies.toolkit.localization import summarise, summary_table
+from pipeline.runs.summary import summarise, summary_table
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Schema, Stream, schemas
 from recorders.parameters import merge

@@ -11,7 +11,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.localization import summarise
+from pipeline.runs.summary import summarise
 from pipeline.tuning.outcome import START, TUNED
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput

@@ -1,9 +1,13 @@
 """Exact samples of the noise on axes and orientations: Bingham, and Gaussian projected to the sphere."""
 
+from typing import Literal, Self
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import model_validator
 
 from recorders.errors import BadInput
+from recorders.parameters import Parameters
 
 _MOST_NEWTON_STEPS = 50
 
@@ -70,3 +74,35 @@ def sample_projected_gaussian(
     """Samples (*shape, d) of a Gaussian in R^d, each scaled to unit length."""
     drawn = generator.multivariate_normal(mean, covariance, shape, method="eigh")
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
+
+
+class DirectionalNoise(Parameters):
+    """A distribution of unit vectors, along the components of a complex number or quaternion.
+
+    Attributes:
+        distribution: of which kind it is; samples of a Gaussian are scaled to unit length.
+        diagonal: of a Bingham distribution the concentrations: 0 for its mode, at most 0 for the others;
+            of a Gaussian the variances about the identity (1, 0, ...).
+    """
+
+    distribution: Literal["bingham", "gaussian"] = "bingham"
+    diagonal: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _has_its_sign(self) -> Self:
+        if len(self.diagonal) not in (2, 4):
+            raise ValueError("give 2 numbers for an axis, 4 for an orientation")
+        if self.distribution == "bingham" and max(self.diagonal) != 0.0:
+            raise ValueError(
+                "Bingham concentrations must be 0 for the mode and at most 0 for the others"
+            )
+        if self.distribution == "gaussian" and min(self.diagonal) < 0.0:
+            raise ValueError("variances must not be negative")
+        return self
+
+    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Unit vectors (count, d)."""
+        d = len(self.diagonal)
+        if self.distribution == "bingham":
+            return sample_bingham(np.eye(d), np.broadcast_to(self.diagonal, (count, d)), rng)
+        return sample_projected_gaussian(np.eye(d)[0], np.diag(self.diagonal), (count,), rng)

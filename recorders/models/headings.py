@@ -1,8 +1,14 @@
 """Systems of two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
 
+from typing import Annotated
+
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
 from recorders.models.planar import Component
+
+Correlation = Annotated[float, Field(gt=-1, lt=1)]
 
 
 def turn_together(
@@ -24,3 +30,8 @@ def turn_on(
     The turn is an angle too: by how much more than half a turn cannot be told from the other way round.
     """
     return direction + turn + drift1, coupling * np.sin(turn) + drift2
+
+
+def equal_sigmas(sigma: float, correlation: float) -> NDArray[np.float64]:
+    """The covariance (2, 2) of two numbers with one standard deviation."""
+    return sigma**2 * np.array([[1.0, correlation], [correlation, 1.0]])

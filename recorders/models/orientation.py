@@ -16,6 +16,9 @@ SIGNS = np.array(
 SIGNS.setflags(write=False)
 XOR = np.bitwise_xor.outer(np.arange(4), np.arange(4))
 
+AXIS_KINDS = {"axis_x": "axis", "axis_y": "axis"}
+ORIENTATION_KINDS = {f"orientation_{part}": "quaternion" for part in "wxyz"}
+
 
 def left_matrix(left: ArrayLike) -> NDArray[np.float64]:
     """The matrix (..., d, d) of y -> left (+) y, for `left` (..., d) with d = 2 or 4."""

@@ -5,25 +5,17 @@ Sampling on the Torus for Bivariate Circular Estimation", 2016, section IV, with
 channel states the model.
 """
 
-from typing import Annotated
-
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 
 from recorders.log import make_stream, schemas
-from recorders.models.headings import turn_together
+from recorders.models.headings import Correlation, equal_sigmas, turn_together
 from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
-Correlation = Annotated[float, Field(gt=-1, lt=1)]
 HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
-
-
-def equal_sigmas(sigma: float, correlation: float) -> NDArray[np.float64]:
-    """The covariance (2, 2) of two numbers with one standard deviation."""
-    return sigma**2 * np.array([[1.0, correlation], [correlation, 1.0]])
 
 
 class HeadingsParameters(Parameters):

@@ -7,49 +7,16 @@ measurements' channel states the noise and the prior as JSON.
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt, model_validator
 
 from recorders.log import Schema, make_stream, schemas
-from recorders.models.directional_noise import sample_bingham, sample_projected_gaussian
-from recorders.models.orientation import compose
+from recorders.models.directional_noise import DirectionalNoise
+from recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS, compose
 from recorders.parameters import Parameters
 from recorders.recording import Recording, Simulator, simulation_stamps_ns
-
-
-class Noise(Parameters):
-    """A distribution of unit vectors, along the components of a complex number or quaternion.
-
-    Attributes:
-        distribution: of which kind it is; samples of a Gaussian are scaled to unit length.
-        diagonal: of a Bingham distribution the concentrations: 0 for its mode, at most 0 for the others;
-            of a Gaussian the variances about the identity (1, 0, ...).
-    """
-
-    distribution: Literal["bingham", "gaussian"] = "bingham"
-    diagonal: tuple[float, ...]
-
-    @model_validator(mode="after")
-    def _has_its_sign(self) -> Self:
-        if len(self.diagonal) not in (2, 4):
-            raise ValueError("give 2 numbers for an axis, 4 for an orientation")
-        if self.distribution == "bingham" and max(self.diagonal) != 0.0:
-            raise ValueError(
-                "Bingham concentrations must be 0 for the mode and at most 0 for the others"
-            )
-        if self.distribution == "gaussian" and min(self.diagonal) < 0.0:
-            raise ValueError("variances must not be negative")
-        return self
-
-    def sample(self, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Unit vectors (count, d)."""
-        d = len(self.diagonal)
-        if self.distribution == "bingham":
-            return sample_bingham(np.eye(d), np.broadcast_to(self.diagonal, (count, d)), rng)
-        return sample_projected_gaussian(np.eye(d)[0], np.diag(self.diagonal), (count,), rng)
 
 
 class AxisParameters(Parameters):
@@ -67,9 +34,9 @@ class AxisParameters(Parameters):
     steps: PositiveInt = 100
     step_s: PositiveFloat = 0.1
     start: tuple[float, ...] = (1.0, 0.0)
-    prior: Noise = Noise(diagonal=(-1.0, 0.0))
-    system: Noise = Noise(diagonal=(0.0, -200.0))
-    measurement: Noise = Noise(diagonal=(0.0, -2.0))
+    prior: DirectionalNoise = DirectionalNoise(diagonal=(-1.0, 0.0))
+    system: DirectionalNoise = DirectionalNoise(diagonal=(0.0, -200.0))
+    measurement: DirectionalNoise = DirectionalNoise(diagonal=(0.0, -2.0))
 
     @model_validator(mode="after")
     def _has_one_dimension(self) -> Self:
@@ -92,9 +59,9 @@ class OrientationParameters(AxisParameters):
     """The paper's four-dimensional evaluation: (61)-(65)."""
 
     start: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
-    prior: Noise = Noise(diagonal=(-1.0, -1.0, -1.0, 0.0))
-    system: Noise = Noise(diagonal=(0.0, -2.0, -200.0, -200.0))
-    measurement: Noise = Noise(diagonal=(0.0, -500.0, -500.0, -500.0))
+    prior: DirectionalNoise = DirectionalNoise(diagonal=(-1.0, -1.0, -1.0, 0.0))
+    system: DirectionalNoise = DirectionalNoise(diagonal=(0.0, -2.0, -200.0, -200.0))
+    measurement: DirectionalNoise = DirectionalNoise(diagonal=(0.0, -500.0, -500.0, -500.0))
 
     @classmethod
     def dimension(cls) -> int:
@@ -129,8 +96,6 @@ def simulate(
     )
 
 
-AXIS_KINDS = {"axis_x": "axis", "axis_y": "axis"}
-ORIENTATION_KINDS = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 AXIS = Simulator(
     "an axis in the plane, equal to its negative, turns at random; noisy measurements of it",
     AxisParameters,

@@ -14,9 +14,9 @@ import numpy as np
 
 from pipeline.runs.ensemble import record_ensemble
 from recorders.log import RunMetadata, make_stream, schemas
+from recorders.models.headings import equal_sigmas
 from recorders.models.planar import wrap_angle
 from recorders.recording import Recording, simulation_stamps_ns
-from recorders.simulators.headings import equal_sigmas
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal

@@ -15,7 +15,7 @@ from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.estimators.orientation.complementary import HALF
-from replay.estimators.orientation.inertial import triad
+from replay.estimators.orientation.triad import triad
 from tests.bench.timing import median_seconds, seconds
 
 COUNT, STEP_NS, THEIRS = 100_000, 10_000_000, 500

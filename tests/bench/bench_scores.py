@@ -3,7 +3,7 @@
 import numpy as np
 from sklearn.metrics import roc_curve
 
-from replay.estimators.biometrics.biometrics import RULES, normalise
+from replay.estimators.biometrics.pairs import RULES, normalise
 from replay.judging.consistency.verification import Floats, genuine_accept_at, roc
 from tests.bench.timing import median_seconds
 

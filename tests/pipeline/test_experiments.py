@@ -27,7 +27,7 @@ from pipeline.runs.experiment import (
     load_experiment,
     run_experiment,
 )
-from pipeline.studies.toolkit.localization import summarise
+from pipeline.runs.summary import summarise
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas
 from recorders.parameters import build

@@ -17,6 +17,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import Replayed, hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
+from pipeline.runs.summary import summary_table
 from pipeline.studies.biometrics.claims import (
     CASES,
     METHODS,
@@ -25,7 +26,6 @@ from pipeline.studies.biometrics.claims import (
     claims_of_bssr1,
     claims_of_simulation,
 )
-from pipeline.studies.toolkit.localization import summary_table
 from recorders.models.scores import TOPIC, comparisons_of, matchers_of
 from recorders.parameters import Parameters
 from replay.engine.replaying.estimator import configure

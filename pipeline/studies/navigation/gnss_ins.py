@@ -19,6 +19,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
+from pipeline.runs.summary import summary_table
 from pipeline.studies.navigation.outages import (
     COASTED,
     FIX,
@@ -34,7 +35,6 @@ from pipeline.studies.navigation.outages import (
     windows_of,
     withheld,
 )
-from pipeline.studies.toolkit.localization import summary_table
 from recorders.errors import BadInput
 from recorders.importers.tables.mapping import adapted, read_mapping, recordings_in
 from recorders.parameters import Parameters

@@ -21,7 +21,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import hash_streams, replay_in_memory
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.localization import summary_table
+from pipeline.runs.summary import summary_table
 from pipeline.studies.toolkit.repetitions import rms_length
 from recorders.errors import BadInput
 from recorders.importers.tables.mapping import read_mapping, recordings_in

@@ -19,7 +19,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import Replayed, hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.localization import summarise
+from pipeline.runs.summary import summarise
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.streams.blocks import gather

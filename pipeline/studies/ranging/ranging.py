@@ -12,7 +12,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import hash_streams
 from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.localization import summary_table
+from pipeline.runs.summary import summary_table
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.parameters import Parameters

@@ -17,9 +17,9 @@ from recorders.models.planar import wrap_angle
 from recorders.parameters import Parameters
 from replay.engine.streams.sources import MemorySource
 from replay.engine.vectors.tangent import truth_at
-from replay.estimators.sets.moving_sets import Growth, odometry_of
-from replay.estimators.sets.set_filter import ERRORS
 from replay.judging.sets.filter_evaluation import POSE, odometry_error
+from replay.regions.frames import ERRORS
+from replay.regions.moving_sets import Growth, odometry_of
 
 Floats = NDArray[np.float64]
 

@@ -18,16 +18,16 @@ from pipeline.runs.runner import Runner
 from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval
 from replay.distributions import chi2
-from replay.estimators.sets.set_filter import (
+from replay.judging.errors.evaluation import Errors
+from replay.judging.sets.evaluation import JudgedSets, judge_sets
+from replay.judging.sets.filter_evaluation import JudgedFilter, judge_filter
+from replay.regions.frames import (
     CONTRADICTS_ITSELF,
     CONTRADICTS_PAST,
     FRAME_WRONG,
     PAST_WRONG,
     UNDECIDED,
 )
-from replay.judging.errors.evaluation import Errors
-from replay.judging.sets.evaluation import JudgedSets, judge_sets
-from replay.judging.sets.filter_evaluation import JudgedFilter, judge_filter
 
 ELLIPSE = 0.99
 FRAMES, FILTER, L8, EKF, BEARINGS = "frames", "filter", "filter-l8", "ekf", "ekf-bearings"

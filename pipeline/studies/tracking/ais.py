@@ -14,7 +14,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import Replayed, hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.localization import summary_table
+from pipeline.runs.summary import summary_table
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.judging.metrics.measuring import Output

@@ -17,7 +17,7 @@ from pipeline.output.results import Outcome
 from pipeline.runs.ensemble import hash_streams, replay_in_memory
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.localization import summary_table
+from pipeline.runs.summary import summary_table
 from pipeline.studies.tracking.tracking import (
     difference,
     lower,

@@ -13,9 +13,10 @@ from pydantic import Field, PositiveFloat, ValidationError
 
 from recorders.errors import BadInput
 from recorders.log import Schema, schemas
+from recorders.models.directional_noise import DirectionalNoise
+from recorders.models.headings import Correlation, equal_sigmas
+from recorders.models.orientation import AXIS_KINDS, ORIENTATION_KINDS
 from recorders.parameters import Parameters
-from recorders.simulators.headings import Correlation, equal_sigmas
-from recorders.simulators.orientation import AXIS_KINDS, ORIENTATION_KINDS, Noise
 from replay.distributions import bingham
 from replay.distributions.bingham import Bingham, make_bingham
 from replay.distributions.wrapped_normal import WrappedNormal
@@ -55,9 +56,9 @@ class BinghamParameters(Parameters):
         measurement: distribution of what a measurement is turned by.
     """
 
-    prior: Noise | None = None
-    system: Noise | None = None
-    measurement: Noise | None = None
+    prior: DirectionalNoise | None = None
+    system: DirectionalNoise | None = None
+    measurement: DirectionalNoise | None = None
 
 
 class KalmanParameters(BinghamParameters):
@@ -116,9 +117,9 @@ class UnscentedTorusParameters(HeadingsFilterParameters):
 class Distributions(NamedTuple):
     """The prior and both noises."""
 
-    prior: Noise
-    system: Noise
-    measurement: Noise
+    prior: DirectionalNoise
+    system: DirectionalNoise
+    measurement: DirectionalNoise
 
 
 def follow_all(advance: Advance, messages: Messages, state: Any, results: Results) -> None:
@@ -133,7 +134,9 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
     for name in Distributions._fields:
         value = getattr(given.parameters, name)
         try:
-            found[name] = value or Noise.model_validate_json(given.topics[topic].metadata[name])
+            found[name] = value or DirectionalNoise.model_validate_json(
+                given.topics[topic].metadata[name]
+            )
         except (KeyError, ValidationError):
             raise BadInput(
                 f"topic {given.topics[topic].name} does not state its {name}; give it with "
@@ -146,7 +149,7 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
     return Distributions(**found)
 
 
-def as_bingham(noise: Noise) -> Bingham:
+def as_bingham(noise: DirectionalNoise) -> Bingham:
     """The Bingham distribution, or that with the second moment of the projected Gaussian."""
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
@@ -157,7 +160,7 @@ def as_bingham(noise: Noise) -> Bingham:
         raise BadInput(f"Gaussian noise of the variances {noise.diagonal}: {error}") from None
 
 
-def as_covariance(noise: Noise) -> Floats:
+def as_covariance(noise: DirectionalNoise) -> Floats:
     """The Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)

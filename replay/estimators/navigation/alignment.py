@@ -7,7 +7,7 @@ each is known the same samples say, unless it is given.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +15,30 @@ from pydantic import NonNegativeFloat, PositiveFloat
 
 from recorders.errors import BadInput
 from recorders.log import Stream
-from recorders.models.inertial import (
-    EARTH_RATE_RADPS,
-    from_mounting,
-    into_body,
-    into_plane,
-    product,
-    rotation,
-)
+from recorders.models.inertial import EARTH_RATE_RADPS, into_body, into_plane, product, rotation
 from recorders.models.planar import Components, wrap_angle
-from recorders.models.states import NAVIGATION
-from replay.engine.arrays import Floats, Integers
+from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import SPACE, read_fixes
-from replay.engine.vectors.components import components_of
+from replay.estimators.navigation.samples import (
+    NS,
+    STANDARD_GRAVITY_MPS2,
+    USUAL_SIGMA_M,
+    Moving,
+    Samples,
+    mounted,
+    read_motion,
+    read_samples,
+    stated_or,
+)
 from replay.inference.model.model import ModelParameters, Started
 from replay.inference.run.initialization import WIDER
 
-STANDARD_GRAVITY_MPS2 = 9.80665
 LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
 SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
 USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
-USUAL_SIGMA_M, USUAL_SIGMA_MPS = 10.0, 0.5  # of a receiver that does not say how well it measures
 SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
 PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
-VELOCITY = components_of(NAVIGATION[3:6])
-_NS = 1e-9
 
 
 class AlignmentParameters(ModelParameters):
@@ -108,34 +106,6 @@ class AlignmentParameters(ModelParameters):
     force_bias_sigma_mps2: PositiveFloat = 0.3
 
 
-class _Samples(NamedTuple):
-    """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
-
-    time_ns: Integers
-    force: Floats
-    rate: Floats
-
-
-class _Moving(NamedTuple):
-    """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
-
-    topic: str
-    time_ns: Integers
-    mps: Floats
-    covariance: Floats
-
-    def first_above(self, row: int, limit_mps: float) -> int | None:
-        """The first row from this one on with a greater horizontal speed."""
-        faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
-        return row + int(faster[0]) if len(faster) else None
-
-
-def mounted(sample: Any, parameters: Any) -> Any:
-    """What the unit measures, in the body's axes; three components, or columns of them."""
-    roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
-    return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
-
-
 def specific_force(samples: Any, bias: Any, parameters: Any) -> Any:
     """The specific force of the body by samples of the unit, force and rate, of this bias."""
     x, y, z = mounted(samples[:3], parameters)
@@ -160,11 +130,11 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
     Raises BadInput where there is no such fix, no gravity to level by, or numbers of another unit.
     """
-    samples, topic = _samples(streams["inertial"], parameters), streams["inertial"].topic
+    samples, topic = read_samples(streams["inertial"], parameters), streams["inertial"].topic
     if "fix" not in streams:
         raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
     start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
-    moving, how = _moving(streams, parameters), "levelled, its heading unknown"
+    moving, how = read_motion(streams, parameters), "levelled, its heading unknown"
     mean, covariance = np.zeros(16), np.zeros((15, 15))
     mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
     covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
@@ -179,13 +149,13 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
         turning = _turned(samples, start_ns, tilted, mean[10:13])
         found = _heading(turning, start_ns, moving, row, parameters)
         if found is not None:
-            heading, heading_sigma = found[0], _given(parameters.heading_sigma_rad, found[1])
+            heading, heading_sigma = found[0], stated_or(parameters.heading_sigma_rad, found[1])
             how = "levelled, its heading the course"
             how += _mounting(samples, turning, start_ns, moving, tilted, heading, parameters)
         how += _leap(samples, moving, row, parameters)
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
     up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
-    covariance[9:12, 9:12] = _given(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
+    covariance[9:12, 9:12] = stated_or(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
     unsteadiness_mps2 = _unsteadiness(samples, moving, parameters)
     tilts = np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])
     covariance[tilts] = _tilt_covariance(up, unsteadiness_mps2, parameters)
@@ -206,11 +176,11 @@ def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
     if not len(streams["inertial"]):
         return []
     try:
-        samples = _samples(streams["inertial"], parameters)
+        samples = read_samples(streams["inertial"], parameters)
         _tilt(samples, topic, parameters)
     except BadInput as error:
         return [str(error)]
-    moving = _moving(streams, parameters)
+    moving = read_motion(streams, parameters)
     if moving is not None:
         try:
             _bias(samples, topic, moving, 0, parameters)
@@ -220,29 +190,9 @@ def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
     return [each for each in found if each]
 
 
-def _samples(inertial: Stream, parameters: Any) -> _Samples:
-    """The finite samples at the times at which they were measured."""
-    columns = [
-        np.stack(mounted(inertial[name].T, parameters), axis=1)
-        for name in ("specific_force_mps2", "turn_rate_radps")
-        if len(inertial)
-    ]
-    finite = np.isfinite(np.hstack(columns)).all(axis=1) if columns else np.zeros(0, bool)
-    if not finite.any():
-        raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
-    time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / _NS)
-    force, rate = (column[finite] for column in columns)
-    return _Samples(time_ns, force, rate)
-
-
-def _given(sigma: float | None, otherwise: Any) -> Any:
-    """A parameter that may not be given, which is None, or NaN among the numbers that a filter has."""
-    return otherwise if sigma is None or np.isnan(sigma) else sigma
-
-
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
     """The covariance (3, 3) of a start at a message of this one, which is used once more."""
-    given = _given(sigma, None)
+    given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
 
@@ -254,7 +204,7 @@ def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> F
     """
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = force = parameters.force_bias_sigma_mps2**2 * np.eye(3)
-    tilt_sigma = _given(parameters.tilt_sigma_rad, None)
+    tilt_sigma = stated_or(parameters.tilt_sigma_rad, None)
     if tilt_sigma is not None:
         covariance[:3, :3] = tilt_sigma**2 * (np.eye(3) - np.outer(up, up))
         return covariance
@@ -266,19 +216,19 @@ def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> F
 
 
 def _first_place(
-    fix: Stream, samples: _Samples, topic: str, parameters: Any
+    fix: Stream, samples: Samples, topic: str, parameters: Any
 ) -> tuple[int, Floats, Floats]:
     """When the first fix within the samples was measured, its place (3,) and covariance (3, 3).
 
     One in the plane has the height of the origin. Raises BadInput where there is none.
     """
-    sigma = _given(parameters.sigma_fix_m, USUAL_SIGMA_M)
+    sigma = stated_or(parameters.sigma_fix_m, USUAL_SIGMA_M)
     places = read_fixes(fix, "position_m", "covariance_m2", SPACE, sigma)
-    time_ns = fix.publish_time_ns - round(parameters.fix_delay_s / _NS)
+    time_ns = fix.publish_time_ns - round(parameters.fix_delay_s / NS)
     within = (time_ns >= samples.time_ns[0]) & (time_ns <= samples.time_ns[-1])
     usable = np.flatnonzero(within & np.isfinite(places.value[:, :2]).all(axis=1))
     if not len(usable):
-        later_s = (time_ns[0] - samples.time_ns[0]) * _NS if len(fix) else np.nan
+        later_s = (time_ns[0] - samples.time_ns[0]) * NS if len(fix) else np.nan
         raise BadInput(
             f"no message of {fix.topic} within the span of {topic}, and it begins "
             f"{later_s:.3g} s later; do their clocks agree? fix_delay_s and inertial_delay_s move them"
@@ -287,26 +237,12 @@ def _first_place(
     return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
 
 
-def _moving(streams: Mapping[str, Stream], parameters: Any) -> _Moving | None:
-    """The velocities that are finite; None where there are none."""
-    stream = streams.get("velocity")
-    if stream is None:
-        return None
-    sigma = _given(parameters.sigma_velocity_mps, USUAL_SIGMA_MPS)
-    found = read_fixes(stream, "velocity_mps", "covariance_m2ps2", VELOCITY, sigma)
-    finite = np.isfinite(found.value).all(axis=1)
-    if not finite.any():
-        return None
-    time_ns = stream.publish_time_ns - round(parameters.velocity_delay_s / _NS)
-    return _Moving(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
-
-
-def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]:
+def _tilt(samples: Samples, topic: str, parameters: Any) -> tuple[float, float]:
     """Roll and pitch, rad, under which the mean of the first specific forces points up.
 
     Raises BadInput where that is not gravity in m/s2, or points down.
     """
-    until_ns = samples.time_ns[0] + round(parameters.level_s / _NS)
+    until_ns = samples.time_ns[0] + round(parameters.level_s / NS)
     x, y, z = samples.force[samples.time_ns < until_ns].mean(axis=0)
     length = float(np.sqrt(x * x + y * y + z * z))
     if not 0.8 * STANDARD_GRAVITY_MPS2 < length < 1.25 * STANDARD_GRAVITY_MPS2:
@@ -323,13 +259,13 @@ def _tilt(samples: _Samples, topic: str, parameters: Any) -> tuple[float, float]
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
 
 
-def _unsteadiness(samples: _Samples, moving: _Moving | None, parameters: Any) -> float:
+def _unsteadiness(samples: Samples, moving: Moving | None, parameters: Any) -> float:
     """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
 
     It is as much as they differ among themselves, and as the velocity changes meanwhile.
     """
     begin_ns = samples.time_ns[0]
-    until_ns = begin_ns + round(parameters.level_s / _NS)
+    until_ns = begin_ns + round(parameters.level_s / NS)
     spread = samples.force[samples.time_ns < until_ns].std(axis=0)
     changed = np.zeros(3)
     if moving is not None:
@@ -341,7 +277,7 @@ def _unsteadiness(samples: _Samples, moving: _Moving | None, parameters: Any) ->
 
 
 def _bias(
-    samples: _Samples, topic: str, moving: _Moving, row: int, parameters: Any
+    samples: Samples, topic: str, moving: Moving, row: int, parameters: Any
 ) -> tuple[Floats, float]:
     """The mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
 
@@ -351,7 +287,7 @@ def _bias(
     """
     moved = moving.first_above(row, parameters.still_mps)
     end_ns = samples.time_ns[-1] if moved is None else moving.time_ns[moved]
-    at_rest = samples.time_ns < end_ns - round(parameters.rest_margin_s / _NS)
+    at_rest = samples.time_ns < end_ns - round(parameters.rest_margin_s / NS)
     if not at_rest.any():
         return np.zeros(3), USUAL_BIAS_RADPS
     bias = samples.rate[at_rest].mean(axis=0)
@@ -362,7 +298,7 @@ def _bias(
             "it looks "
             "like deg/s: import it with that unit"
         )
-    since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * _NS
+    since_s = (samples.time_ns[at_rest] - samples.time_ns[0]) * NS
     _, stretch, count = np.unique(since_s // parameters.level_s, return_inverse=True, return_counts=True)
     if len(count) < 3:
         return bias, USUAL_BIAS_RADPS
@@ -371,10 +307,10 @@ def _bias(
     return bias, float(np.sqrt(sigma + EARTH_RATE_RADPS**2))
 
 
-def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
+def _leap(samples: Samples, moving: Moving, row: int, parameters: Any) -> str:
     """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
     moved = moving.first_above(row, parameters.still_mps)
-    level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / _NS)
+    level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / NS)
     if moved is None:
         return ""
     change = samples.force - samples.force[level].mean(axis=0)
@@ -382,7 +318,7 @@ def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
     sets_off = np.flatnonzero((np.abs(change) > noise).any(axis=1))
     if not len(sets_off):
         return ""
-    later_s = float(moving.time_ns[moved] - samples.time_ns[sets_off[0]]) * _NS
+    later_s = float(moving.time_ns[moved] - samples.time_ns[sets_off[0]]) * NS
     if abs(abs(later_s) - LEAP_SECONDS) > LEAP_MARGIN_S:
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
@@ -393,10 +329,10 @@ def _leap(samples: _Samples, moving: _Moving, row: int, parameters: Any) -> str:
     )
 
 
-def _turned(samples: _Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
+def _turned(samples: Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
     """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
     since = samples.time_ns >= start_ns
-    since_s = np.asarray((samples.time_ns[since] - start_ns) * _NS, float)
+    since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
     rate = (samples.rate[since] - bias) @ up
     return since_s, _integral(rate, since_s)
@@ -410,7 +346,7 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 
 
 def _heading(
-    turning: tuple[Floats, Floats], start_ns: int, moving: _Moving, row: int, parameters: Any
+    turning: tuple[Floats, Floats], start_ns: int, moving: Moving, row: int, parameters: Any
 ) -> tuple[float, float] | None:
     """The heading at the start, rad, and its standard deviation; None where nothing moves.
 
@@ -420,21 +356,21 @@ def _heading(
     fast = moving.first_above(row, parameters.course_mps)
     if fast is None:
         return None
-    until_ns = moving.time_ns[fast] + round(parameters.course_s / _NS)
+    until_ns = moving.time_ns[fast] + round(parameters.course_s / NS)
     rows = np.arange(fast, np.searchsorted(moving.time_ns, until_ns))
     rows = rows[np.hypot(*moving.mps[rows, :2].T) > parameters.course_mps]
     east, north, _ = moving.mps[rows].T
-    heading = np.arctan2(north, east) - np.interp((moving.time_ns[rows] - start_ns) * _NS, *turning)
+    heading = np.arctan2(north, east) - np.interp((moving.time_ns[rows] - start_ns) * NS, *turning)
     apart = wrap_angle(heading - heading[0])
     noise = moving.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
     return float(heading[0]), float(min(np.sqrt(np.mean(apart**2) + noise), np.pi))
 
 
 def _mounting(
-    samples: _Samples,
+    samples: Samples,
     turning: tuple[Floats, Floats],
     start_ns: int,
-    moving: _Moving,
+    moving: Moving,
     tilted: Components,
     heading: float,
     parameters: Any,
@@ -445,10 +381,8 @@ def _mounting(
     """
     since_s, turned = turning
     fast = moving.first_above(0, parameters.course_mps)
-    end_s = (
-        since_s[-1] if fast is None else (moving.time_ns[fast] - start_ns) * _NS + parameters.course_s
-    )
-    stamps_s = (moving.time_ns - start_ns) * _NS
+    end_s = since_s[-1] if fast is None else (moving.time_ns[fast] - start_ns) * NS + parameters.course_s
+    stamps_s = (moving.time_ns - start_ns) * NS
     rows = np.flatnonzero((stamps_s >= 0.0) & (stamps_s <= min(end_s, since_s[-1])))
     if len(rows) < 3:
         return ""

@@ -19,10 +19,10 @@ from recorders.models.inertial import into_body, into_plane, product, rotation
 from recorders.models.planar import Components
 from replay.engine.arrays import Booleans, Floats
 from replay.engine.vectors.tangent import Kind
-from replay.estimators.navigation.alignment import STANDARD_GRAVITY_MPS2
 from replay.estimators.navigation.navigation import UNIT as CARRIED
-from replay.estimators.orientation.inertial import triad
+from replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
 from replay.estimators.orientation.orientation import ORIENTATION
+from replay.estimators.orientation.triad import triad
 from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Start, Started
 
 PERIOD_NS = 1_000_000_000

@@ -18,10 +18,9 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat
 
 from recorders.errors import BadInput
 from recorders.log import Topic, schemas
-from recorders.models.planar import drive
 from recorders.parameters import Parameters
 from replay.distributions import chi2
-from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.engine.arrays import Booleans, Floats, Function
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
@@ -29,14 +28,20 @@ from replay.engine.streams.channels import given_or_stated, numbered
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.priors import Priors, no_priors, priors_of
 from replay.engine.streams.results import ALL_WELL, failures_by_run, failures_of, states_in
-from replay.estimators.models.landmarks import LANDMARKS, POSE, sight
-from replay.estimators.networks.covariance_intersection import Criterion, Stake, blend, sighting_weight
-from replay.inference.kalman.steps import FAILURES, NOT_FINITE, NOT_POSITIVE_DEFINITE
-from replay.inference.linear_algebra.gaussian import add_through, copy_gaussian, wrap
-from replay.inference.linear_algebra.linearization import Input, derivative
-from replay.inference.linear_algebra.small_matrices import UpdateMemory, update, update_memory
+from replay.estimators.models.landmarks import LANDMARKS, POSE
+from replay.estimators.networks.covariance_intersection import Criterion
+from replay.estimators.networks.encounters import (
+    Carried,
+    Events,
+    Fusion,
+    Results,
+    Settings,
+    Work,
+    cooperate,
+)
+from replay.inference.kalman.steps import FAILURES
+from replay.inference.linear_algebra.small_matrices import update_memory
 from replay.inference.run.events import Points, points_of
-from replay.tracing.functions import traced
 
 Mode = Literal["alone", "naive", "ci", "joint"]
 
@@ -72,20 +77,6 @@ class CooperativeParameters(Parameters):
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
 
 
-class Carried(NamedTuple):
-    """What goes from block to block; first axis = run. `failure` is one of gaussian's.
-
-    The mean (3 n,) and covariance (3 n, 3 n) are of all n robots; only the joint filter has entries
-    between robots.
-    """
-
-    mean: Floats
-    covariance: Floats
-    velocity: Floats
-    time_ns: Integers
-    failure: Integers
-
-
 class State(NamedTuple):
     """What goes from block to block, and why robots take no part: (runs, robots), "" where they do.
 
@@ -96,254 +87,6 @@ class State(NamedTuple):
     landmarks: Points
     reasons: NDArray[np.str_]
     told: Booleans
-
-
-class Settings(NamedTuple):
-    """Noise of the robots' odometry and sensors, both (n, 2), who is an anchor, and the gate."""
-
-    density: Floats
-    variance: Floats
-    anchor: Booleans
-    gate: Floats
-
-
-class Fusion(NamedTuple):
-    """How a sighting of another robot is used: in one state of all, by an intersection, or naively.
-
-    The weight of an intersection is that of the least trace or else of the least determinant.
-    """
-
-    joint: bool
-    intersect: bool
-    by_trace: bool
-
-
-class Events(NamedTuple):
-    """The events of all runs in order: whose they are, and what they say.
-
-    `robots` (m, 2) are the one that speaks and the one that it sees, -1 where it sees none. Odometry has
-    the value (forward, turn) and `is_sighting` false; a sighting has (range, bearing), of a robot or of
-    a landmark's `place` (m, 2). `is_due` says that the speaker's estimate is wanted.
-    """
-
-    offsets: Integers
-    time_ns: Integers
-    robots: Integers
-    is_sighting: Booleans
-    place: Floats
-    value: Floats
-    is_due: Booleans
-
-
-class Results(NamedTuple):
-    """The speaker's pose (m, 3) and covariance (m, 3, 3) after every event; NaN where none is said."""
-
-    mean: Floats
-    covariance: Floats
-
-
-class Work(NamedTuple):
-    """Memory of one run.
-
-    Attributes:
-        state, transition, gain, variances: of a drive (3,), (3, 3), (3, 2), (2,).
-        predicted, rows: of a sighting (2,), and by the pose that sees (2, 3).
-        both: the same by the pose that sees and the one that is seen, (2, 2, 3).
-        spread, square: H P H' and H P P H' of both, (2, 2, 2).
-        whole: rows by the state of all robots, (2, 3 n).
-        product: (3, 3 n).
-        update: see `replay.inference.linear_algebra.small_matrices`.
-    """
-
-    state: Floats
-    transition: Floats
-    gain: Floats
-    variances: Floats
-    predicted: Floats
-    rows: Floats
-    both: Floats
-    spread: Floats
-    square: Floats
-    whole: Floats
-    product: Floats
-    update: UpdateMemory
-
-
-KINDS = tuple(POSE.values())
-linear_drive = derivative(
-    traced(drive, 3, 2, None),
-    [Input("pose", KINDS, "transition"), Input("velocity", ("linear", "linear"), "gain")],
-    KINDS,
-    "state",
-)
-linear_sight = derivative(
-    traced(sight, 3, 2), [Input("pose", KINDS, "rows")], ("linear", "angle"), "predicted"
-)
-
-
-def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Floats, work: Work) -> None:
-    """Move one robot to a time by its odometry, with its correlations."""
-    duration_s = (time_ns - carried.time_ns[run, robot]) * 1e-9
-    if duration_s <= 0.0:
-        return
-    carried.time_ns[run, robot] = time_ns
-    mean, covariance, first = carried.mean[run], carried.covariance[run], 3 * robot
-    velocity = carried.velocity[run, robot]
-    pose = (mean[first], mean[first + 1], mean[first + 2])
-    linear_drive(pose, (velocity[0], velocity[1]), duration_s, work)
-    for k in range(3):
-        mean[first + k] = work.state[k]
-    for k in range(2):
-        work.variances[k] = density[k] * density[k] / duration_s
-    for row in range(3):
-        for column in range(len(mean)):
-            work.product[row, column] = 0.0
-            for k in range(3):
-                work.product[row, column] += work.transition[row, k] * covariance[first + k, column]
-    own = work.product[:, first : first + 3]
-    fill_spread(covariance, first, work.transition, own)
-    add_through(own, work.gain, work.variances)
-    for row in range(3):
-        for column in range(len(mean)):
-            covariance[first + row, column] = covariance[column, first + row] = work.product[row, column]
-
-
-def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) -> None:
-    """Fill rows P rows' with the block P (3, 3) of one robot; symmetric by construction."""
-    for row in range(len(rows)):
-        for column in range(row + 1):
-            entry = 0.0
-            for k in range(3):
-                for m in range(3):
-                    entry += rows[row, k] * covariance[first + k, first + m] * rows[column, m]
-            spread[row, column] = spread[column, row] = entry
-
-
-def look(
-    mean: Floats, robot: int, place: tuple[float, float], value: Floats, difference: Floats, work: Work
-) -> None:
-    """Fill the innovation of a robot's sighting of a place, and its rows by both robots."""
-    first = 3 * robot
-    linear_sight((mean[first], mean[first + 1], mean[first + 2]), place, work)
-    for row in range(2):
-        difference[row] = wrap(value[row] - work.predicted[row], row == 1)
-        for k in range(3):
-            work.both[0, row, k] = work.rows[row, k]
-            work.both[1, row, k] = -work.rows[row, k] if k < 2 else 0.0
-
-
-def see_through(covariance: Floats, first: int, side: int, work: Work) -> float:
-    """Fill what a sighting says of one robot's block of the covariance; returns the block's trace."""
-    rows, trace = work.both[side], 0.0
-    fill_spread(covariance, first, rows, work.spread[side])
-    for k in range(3):
-        trace += covariance[first + k, first + k]
-        for row in range(2):
-            work.rows[row, k] = 0.0
-            for m in range(3):
-                work.rows[row, k] += covariance[first + k, first + m] * rows[row, m]
-    for row in range(2):
-        for column in range(2):
-            work.square[side, row, column] = 0.0
-            for k in range(3):
-                work.square[side, row, column] += work.rows[row, k] * work.rows[column, k]
-    return trace
-
-
-def scale(covariance: Floats, first: int, factor: float) -> None:
-    """Scale the block of one robot."""
-    for row in range(3):
-        for column in range(3):
-            covariance[first + row, first + column] *= factor
-
-
-def meet(
-    mean: Floats,
-    covariance: Floats,
-    robots: Integers,
-    difference: Floats,
-    variance: Floats,
-    gate: float,
-    fusion: Fusion,
-    work: Work,
-) -> bool:
-    """Use a sighting; False where a covariance is not positive definite."""
-    own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
-    first, both = (3 * robots[0], 3 * robots[1]), robots[1] >= 0
-    for row in range(2):
-        own[row, row] = variance[row]
-    for side in range(1 + both):
-        traces[side] = see_through(covariance, first[side], side, work)
-    for side in range(1 + (both and not fusion.joint)):
-        weight, share = 1.0, 0.0
-        if both and not fusion.joint:
-            share = 1.0
-            if fusion.intersect:
-                stake = Stake(3, traces[side], work.spread[side], work.square[side])
-                weight = sighting_weight(fusion.by_trace, stake, work.spread[1 - side], own)
-                share = 1.0 / (1.0 - weight)
-        blend(1.0, own, share, work.spread[1 - side], noise)
-        scale(covariance, first[side], 1.0 / weight)
-        work.whole[:] = 0.0
-        for other in range(side, side + 1 + (both and fusion.joint)):
-            for row in range(2):
-                for k in range(3):
-                    work.whole[row, first[other] + k] = work.both[other, row, k]
-        squared = update(mean, covariance, difference, work.whole, noise, work.update, gate)
-        if np.isnan(squared):
-            return False
-        if not squared <= gate:
-            scale(covariance, first[side], weight)
-    return True
-
-
-def cooperate(
-    run: int,
-    events: Events,
-    settings: Settings,
-    fusion: Fusion,
-    carried: Carried,
-    results: Results,
-    work: Work,
-) -> None:
-    """Move the robots of one run through its events, until these end or an update fails."""
-    mean, covariance = carried.mean[run], carried.covariance[run]
-    difference = np.empty(2)
-    for event in range(events.offsets[run], events.offsets[run + 1]):
-        robots, now = events.robots[event], events.time_ns[event]
-        robot, seen = robots[0], robots[1]
-        if carried.failure[run] != ALL_WELL or now < carried.time_ns[run, robot]:
-            continue
-        for side in range(2):
-            if robots[side] >= 0:
-                density = settings.density[robots[side]]
-                advance(carried, run, robots[side], now, density, work)
-        if events.is_sighting[event]:
-            place = (events.place[event, 0], events.place[event, 1])
-            if seen >= 0:
-                place = (mean[3 * seen], mean[3 * seen + 1])
-            look(mean, robot, place, events.value[event], difference, work)
-            measured, variance = 0, settings.variance[robot]
-            for k in range(2):
-                measured += not np.isnan(difference[k])
-            gate = settings.gate[measured]
-            if measured > 0 and not meet(
-                mean, covariance, robots, difference, variance, gate, fusion, work
-            ):
-                carried.failure[run] = NOT_POSITIVE_DEFINITE
-                continue
-        else:
-            for k in range(2):
-                carried.velocity[run, robot, k] = events.value[event, k]
-        total = 0.0
-        for row in range(len(mean)):
-            total += mean[row]
-        if not np.isfinite(total):
-            carried.failure[run] = NOT_FINITE
-        elif events.is_due[event]:
-            first, end = 3 * robot, 3 * robot + 3
-            found = results.mean[event], results.covariance[event]
-            copy_gaussian(mean[first:end], covariance[first:end, first:end], found[0], found[1])
 
 
 def memory(states: int) -> Work:

@@ -16,17 +16,14 @@ from numpy.typing import ArrayLike
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
+from replay.estimators.networks.estimates import Estimate, blend, determinant, inverted, transform
+from replay.estimators.networks.pairwise import fuse_in_turn
 
 Criterion = Literal["trace", "determinant"]
-# what is left of a diagonal entry in the Cholesky factor of a matrix that counts as singular
-SINGULAR = 1e-13
 ITERATIONS = 10_000
 # by their numbers, which are known only when a kernel runs: one kernel has them all
 RULES = ("ci-trace", "ci-determinant", "niehsen", "franken", "naive", "inverse-ci", "split-ci")
 CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(len(RULES))
-GOLDEN = 0.6180339887498949
-SIGHTING_STEPS = 40
 
 
 class Fused(NamedTuple):
@@ -43,17 +40,6 @@ class Fused(NamedTuple):
     gap: Floats
 
 
-class Estimate(NamedTuple):
-    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others.
-
-    Only split CI looks at the parts.
-    """
-
-    mean: Floats
-    covariance: Floats
-    independent: Floats
-
-
 class Memory(NamedTuple):
     """What K estimates are fused in: their informations (K, n, n), and weights (K,) to come."""
 
@@ -64,58 +50,6 @@ class Memory(NamedTuple):
 def memory_for(count: int, states: int) -> Memory:
     """Memory for the fusion of so many estimates at most."""
     return Memory(np.empty((count, states, states)), np.empty(count))
-
-
-def inverted(matrix: Floats, inverse: Floats) -> bool:
-    """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular."""
-    size = len(matrix)
-    factor = np.zeros((size, size))
-    if not cholesky(factor, matrix, size):
-        return False
-    for row in range(size):
-        if not factor[row, row] ** 2 > SINGULAR * matrix[row, row]:
-            return False
-    half = np.zeros((size, size))  # of the factor
-    for column in range(size):
-        half[column, column] = 1.0 / factor[column, column]
-        for row in range(column + 1, size):
-            entry = 0.0
-            for k in range(column, row):
-                entry -= factor[row, k] * half[k, column]
-            half[row, column] = entry / factor[row, row]
-    for row in range(size):
-        for column in range(row + 1):
-            entry = 0.0
-            for k in range(row, size):
-                entry += half[k, row] * half[k, column]
-            inverse[row, column] = entry
-            inverse[column, row] = entry
-    return True
-
-
-def multiply(left: Floats, right: Floats, product: Floats) -> None:
-    """Fill left @ right."""
-    for row in range(left.shape[0]):
-        for column in range(right.shape[1]):
-            entry = 0.0
-            for k in range(left.shape[1]):
-                entry += left[row, k] * right[k, column]
-            product[row, column] = entry
-
-
-def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
-    """Fill matrix @ vector."""
-    for row in range(len(vector)):
-        image[row] = 0.0
-        for k in range(len(vector)):
-            image[row] += matrix[row, k] * vector[k]
-
-
-def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats) -> None:
-    """Fill share * left + rest * right."""
-    for row in range(len(total)):
-        for column in range(len(total)):
-            total[row, column] = share * left[row, column] + rest * right[row, column]
 
 
 def summed(count: int, weights: Floats, information: Floats, covariance: Floats) -> bool:
@@ -224,18 +158,6 @@ def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
         weights[i] /= total
 
 
-def determinant(matrix: Floats) -> float:
-    """The determinant of a matrix that is positive definite, else 0."""
-    size = len(matrix)
-    factor = np.zeros((size, size))
-    if not cholesky(factor, matrix, size):
-        return 0.0
-    product = 1.0
-    for row in range(size):
-        product *= factor[row, row] ** 2
-    return product
-
-
 def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
     """Franken and Huepper: weights by what is lost from |sum of I| without I_i, plus |I_i|."""
     size = information.shape[1]
@@ -299,145 +221,6 @@ def fuse_together(
     if not gap < np.inf or not combined(count, weights, information, parts.mean, mean, covariance):
         return np.inf
     return gap
-
-
-def put(given: Estimate, place: Estimate) -> None:
-    """Copy an estimate; loops, since slices are very slow to compile."""
-    copy_gaussian(given.mean, given.covariance, place.mean, place.covariance)
-    for row in range(len(given.mean)):
-        for column in range(len(given.mean)):
-            place.independent[row, column] = given.independent[row, column]
-
-
-def one_of(estimates: Estimate, i: int) -> Estimate:
-    """One of several estimates; changing it changes them."""
-    return Estimate(estimates.mean[i], estimates.covariance[i], estimates.independent[i])
-
-
-def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
-    """Inverse CI of two estimates at a weight: I_a + I_b less that of w P_a + (1 - w) P_b."""
-    size, shares = len(fused.mean), (weight, 1.0 - weight)
-    covariance, information = np.zeros((3, size, size)), np.empty((3, size, size))
-    for i in range(2):
-        for row in range(size):
-            for k in range(size):
-                covariance[i, row, k] = pair.covariance[i, row, k]
-                covariance[2, row, k] += shares[i] * pair.covariance[i, row, k]
-                fused.independent[row, k] = 0.0
-    for i in range(3):
-        if not inverted(covariance[i], information[i]):
-            return False
-    total, vector, common = np.empty((size, size)), np.zeros(size), information[2]
-    blend(1.0, information[0], 1.0, information[1], total)
-    blend(1.0, total, -1.0, common, total)
-    if not inverted(total, fused.covariance):
-        return False
-    for i in range(2):
-        for row in range(size):
-            for k in range(size):
-                entry = information[i, row, k] - shares[i] * common[row, k]
-                vector[row] += entry * pair.mean[i, k]
-    transform(fused.covariance, vector, fused.mean)
-    return True
-
-
-def mix_split(weight: float, pair: Estimate, fused: Estimate) -> bool:
-    """Split CI of two estimates at a weight: only the correlated parts are divided by it."""
-    size, shares = len(fused.mean), (weight, 1.0 - weight)
-    part, information = np.empty((size, size)), np.empty((2, size, size))
-    for i in range(2):
-        inverse = 1.0 / shares[i]
-        blend(inverse, pair.covariance[i], 1.0 - inverse, pair.independent[i], part)
-        if not inverted(part, information[i]):
-            return False
-    blend(1.0, information[0], 1.0, information[1], part)
-    if not inverted(part, fused.covariance):
-        return False
-    gain, spread, moved = np.empty((size, size)), np.empty((size, size)), np.empty(size)
-    for i in range(2):
-        multiply(fused.covariance, information[i], gain)
-        multiply(gain, pair.independent[i], part)
-        multiply(part, gain.T, spread)
-        transform(gain, pair.mean[i], moved)
-        for row in range(size):
-            fused.mean[row] = moved[row] + (fused.mean[row] if i > 0 else 0.0)
-            for k in range(size):
-                before = fused.independent[row, k] if i > 0 else 0.0
-                fused.independent[row, k] = before + spread[row, k]
-    return True
-
-
-def steps_for(tolerance: float) -> int:
-    """How many steps of a golden section leave a tenth of the root of the tolerance."""
-    return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
-
-
-def golden(step: int, steps: int, value: float, section: Floats) -> float:
-    """Where in (0, 1) a search for the least value looks next, after `value` at the last place.
-
-    Golden section; the last of all steps is the middle of what is left. `section` (7,) is what the
-    search remembers: both ends, both inner places and their values, and which one was asked for. Written
-    like this, the function that is searched is called in one place, and compiled once.
-    """
-    if step == 0:
-        section[0], section[1] = 1e-9, 1.0 - 1e-9
-        section[2], section[3] = 1.0 - GOLDEN, GOLDEN
-        section[6] = 2
-        return section[2]
-    section[2 + int(section[6])] = value  # 4: at the left place, 5: at the right one
-    if step == 1:
-        section[6] = 3
-        return section[3]
-    if step == steps - 1:
-        return 0.5 * (section[0] + section[1])
-    if section[4] < section[5]:
-        section[1], section[3], section[5] = section[3], section[2], section[4]
-        section[2] = section[1] - GOLDEN * (section[1] - section[0])
-        section[6] = 2
-    else:
-        section[0], section[2], section[4] = section[2], section[3], section[5]
-        section[3] = section[0] + GOLDEN * (section[1] - section[0])
-        section[6] = 3
-    return section[int(section[6])]
-
-
-def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> float:
-    """Fuse two estimates at a weight; returns the trace, infinite where they cannot be fused."""
-    is_fused = mix_split(weight, pair, fused) if is_split else mix_inverse(weight, pair, fused)
-    if not is_fused:
-        return np.inf
-    trace = 0.0
-    for row in range(len(fused.mean)):
-        trace += fused.covariance[row, row]
-    return trace
-
-
-def fuse_in_turn(
-    is_split: bool,
-    count: int,
-    parts: Estimate,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-    tolerance: float,
-) -> float:
-    """Fuse one estimate after another, each at the weight of the least trace."""
-    size, steps = len(mean), steps_for(tolerance)
-    pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
-    fused = Estimate(mean, covariance, np.empty((size, size)))
-    weights[0] = 1.0
-    put(one_of(parts, 0), fused)
-    for i in range(1, count):
-        put(fused, one_of(pair, 0))
-        put(one_of(parts, i), one_of(pair, 1))
-        section = np.empty(7)
-        trace = np.inf
-        for step in range(steps):
-            weights[i] = golden(step, steps, trace, section)
-            trace = trace_at(is_split, weights[i], pair, fused)
-        if trace == np.inf:
-            return np.inf
-    return 0.0
 
 
 def rule_number(name: str) -> int:
@@ -557,50 +340,3 @@ def fuse(
             f"the weights did not converge: the certificate is {fused.gap.max():.1e}, not {tolerance}"
         )
     return Fused(*(part.reshape(batch + part.shape[1:]) for part in fused))
-
-
-class Stake(NamedTuple):
-    """What a state (n,) has at stake in a sighting with rows H (m, n): what its best weight depends on.
-
-    Attributes:
-        states: n.
-        trace: of the covariance P.
-        spread: H P H' (m, m).
-        square: H P P H' (m, m).
-    """
-
-    states: int
-    trace: float
-    spread: Floats
-    square: Floats
-
-
-def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
-    """The weight w of the update by a measurement of part of a state that rests on another estimate.
-
-    Its noise has a part `shared` that is correlated with the state in an unknown way, and one that is
-    not, `own`, the sensor's: P / w stands against shared / (1 - w) + own, at the w of the least trace,
-    which depends on the state's units, or the least determinant, which does not. It is above 0: at 0
-    whatever the measurement does not see would be lost. NaN where a covariance is singular.
-
-    With R = shared / (1 - w) + own and S = H P H' / w + R the fused covariance has the trace
-    tr P / w - tr(S^-1 H P P H') / w^2 and a determinant in proportion to |R| / (w^n |S|). Trace and
-    logarithm are convex in w.
-    """
-    noise, total, precision = np.empty_like(own), np.empty_like(own), np.empty_like(own)
-    section = np.empty(7)
-    value, weight = np.inf, 0.5
-    for step in range(SIGHTING_STEPS):
-        weight = golden(step, SIGHTING_STEPS, value, section)
-        blend(1.0 / (1.0 - weight), shared, 1.0, own, noise)
-        blend(1.0 / weight, stake.spread, 1.0, noise, total)
-        if not inverted(total, precision):
-            return np.nan
-        if by_trace:
-            value = stake.trace / weight
-            for row in range(len(own)):
-                for column in range(len(own)):
-                    value -= precision[row, column] * stake.square[row, column] / weight**2
-        else:
-            value = np.log(determinant(noise) / determinant(total)) - stake.states * np.log(weight)
-    return weight if np.isfinite(value) else np.nan

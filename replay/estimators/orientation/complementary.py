@@ -20,8 +20,8 @@ from replay.engine.api.functions import batch, each_run
 from replay.engine.api.inputs import Given, Messages, OneRun
 from replay.engine.api.outputs import Estimates, Results
 from replay.engine.arrays import Floats, Integers
-from replay.estimators.orientation.inertial import triad, unit
 from replay.estimators.orientation.orientation import FIELDS, ORIENTATION, of_inertial_samples
+from replay.estimators.orientation.triad import triad, unit
 
 HALF = np.sqrt(0.5)
 

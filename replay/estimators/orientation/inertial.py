@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
-from recorders.models.inertial import cross
-from recorders.models.planar import Components
 from replay.distributions.bingham_kernels import (
-    Vector,
     compose,
     integrate,
     local_moments,
@@ -30,6 +27,7 @@ from replay.distributions.bingham_kernels import (
 )
 from replay.engine.arrays import Floats, Integers
 from replay.engine.compiling.compile import compile_over_runs
+from replay.estimators.orientation.triad import all_finite, carry, diagonal, increment, isotropic, triad
 
 _NS = 1e-9
 
@@ -247,7 +245,7 @@ def _reckon(
     """Take in one sample; one that is not finite is passed over."""
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
-    if not _all_finite(rate, force, field):
+    if not all_finite(rate, force, field):
         return
     orientation, times, sums = state.orientation[run], state.time_ns[run], state.sums[run]
     if times[0] < 0:
@@ -271,19 +269,12 @@ def _reckon(
     turn, count = np.empty(3), max(state.rest_samples[run], 1)
     for i in range(3):
         turn[i] = (rate[i] - (sums[0, i] / count if unbiased else 0.0)) * duration_s
-    compose(orientation.copy(), _increment(turn[0], turn[1], turn[2]), orientation)
+    compose(orientation.copy(), increment(turn[0], turn[1], turn[2]), orientation)
     estimates.orientation[row] = orientation
     variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
     for i in range(3):
         for j in range(3):
             estimates.covariance[row, i, j] = variance if i == j else 0.0
-
-
-def _all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
-    total = 0.0
-    for i in range(3):
-        total += rate[i] + force[i] + field[i]
-    return math.isfinite(total)
 
 
 def _inertial_run(
@@ -311,7 +302,7 @@ def _accumulate(
     """
     time_ns, rate = samples.time_ns[row], samples.rate[row]
     force, field = samples.force[row], samples.field[row]
-    if not _all_finite(rate, force, field):
+    if not all_finite(rate, force, field):
         return math.nan
     times = state.time_ns[run]
     duration_s = (time_ns - times[1]) * _NS
@@ -329,14 +320,14 @@ def _accumulate(
     else:
         bias, count = state.rate_sum[run], max(state.rest_samples[run], 1)
         increment = state.increment[run]
-        step = _increment(
+        step = increment(
             (rate[0] - bias[0] / count) * duration_s,
             (rate[1] - bias[1] / count) * duration_s,
             (rate[2] - bias[2] / count) * duration_s,
         )
         compose((increment[0], increment[1], increment[2], increment[3]), step, increment)
-        _carry(step, state.force[run])
-        _carry(step, state.field[run])
+        carry(step, state.force[run])
+        carry(step, state.field[run])
     for i in range(3):
         state.force[run, i] += force[i]
         state.field[run, i] += field[i]
@@ -357,14 +348,14 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
     moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
     if z[0] < 0.0:
         turn_columns(axes, state.increment[run])
-        _isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
+        isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
         integrate(noise, moments, work)
-        _diagonal(moments, work)
+        diagonal(moments, work)
         predict(axes, z, work)
     attitude = triad(state.force[run], state.field[run])
     if math.isfinite(attitude[0]):
-        _isotropic(model.attitude_sigma_rad, noise)
-        _diagonal(noise, work)
+        isotropic(model.attitude_sigma_rad, noise)
+        diagonal(noise, work)
         update(axes, z, work, attitude)
     local_moments(axes, z, moments, work)
     for i in range(3):
@@ -389,63 +380,7 @@ def _dead_reckon(
         for j in range(3):
             covariance[i, j] = state.covariance[run, i, j]
     for i in range(3):
-        _carry(increment, covariance[i])
+        carry(increment, covariance[i])
     for i in range(3):
-        _carry(increment, covariance[:, i])
+        carry(increment, covariance[:, i])
         covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s
-
-
-def _isotropic(sigma_rad: float, z: NDArray) -> None:
-    """Fill concentrations about the identity, in the order of a quaternion's components."""
-    z[:] = -2.0 / sigma_rad**2
-    z[0] = 0.0
-
-
-def _increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
-    """The quaternion of a rotation vector."""
-    x, y, z = 0.5 * x_rad, 0.5 * y_rad, 0.5 * z_rad
-    angle = math.sqrt(x * x + y * y + z * z)
-    scale = math.sin(angle) / angle if angle > 0.0 else 1.0
-    return math.cos(angle), scale * x, scale * y, scale * z
-
-
-def _carry(turned: Vector, vector: NDArray) -> None:
-    """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
-    w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
-    a, b, c = vector[0], vector[1], vector[2]
-    d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    vector[0] = a + w * d + y * f - z * e
-    vector[1] = b + w * e + z * d - x * f
-    vector[2] = c + w * f + x * e - y * d
-
-
-def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
-    """The orientation under which force points up and field north; NaN where they are parallel."""
-    up = unit(force)
-    east = unit(cross(field, up))
-    north = cross(up, east)
-    # 4 q q^T of the rotation matrix with these rows; its largest column has no cancellation
-    a, b, c = up[1] - north[2], east[2] - up[0], north[0] - east[1]
-    d, e, f = east[1] + north[0], east[2] + up[0], north[2] + up[1]
-    w, x = 1.0 + east[0] + north[1] + up[2], 1.0 + east[0] - north[1] - up[2]
-    y, z = 1.0 - east[0] + north[1] - up[2], 1.0 - east[0] - north[1] + up[2]
-    column, most = (w, a, b, c), w
-    for other, size in (((a, x, d, e), x), ((b, d, y, f), y), ((c, e, f, z), z)):
-        if size > most:
-            column, most = other, size
-    w, x, y, z = column
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    return w / length, x / length, y / length, z / length
-
-
-def unit(vector: Components) -> Components:
-    """The direction of a vector of three components; NaN where it has none."""
-    x, y, z = vector[0], vector[1], vector[2]
-    length = np.sqrt(x * x + y * y + z * z)
-    return x / length, y / length, z / length
-
-
-def _diagonal(values: NDArray, out: NDArray) -> None:
-    out[:] = 0.0
-    for i in range(len(values)):
-        out[i, i] = values[i]

@@ -26,10 +26,32 @@ from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.channels import given_or_stated
 from replay.engine.streams.failures import reason_stream
-from replay.estimators.sets.feasible_sets import excess_rad, to_blame
-from replay.estimators.sets.moving_sets import (
+from replay.estimators.sets.set_membership import (
+    SetParameters,
+    fault_stream,
+    known_of,
+    polygons,
+    set_metadata,
+    set_streams,
+)
+from replay.regions.feasible_sets import excess_rad, to_blame
+from replay.regions.frames import (
+    CONTRADICTS_ITSELF,
+    CONTRADICTS_PAST,
+    ERRORS,
+    FINDINGS,
+    FRAME_WRONG,
+    PAST_WRONG,
+    STATED,
+    UNDECIDED,
+    Bearings,
+    Bounds,
+    Frame,
+    Known,
+    frames_with_bearings,
+)
+from replay.regions.moving_sets import (
     ALL_HEADINGS,
-    Growth,
     Headings,
     Motion,
     Odometry,
@@ -45,27 +67,7 @@ from replay.estimators.sets.moving_sets import (
     turned,
     within_l8,
 )
-from replay.estimators.sets.set_membership import (
-    Frame,
-    Known,
-    SetParameters,
-    fault_stream,
-    frames,
-    known_of,
-    polygons,
-    set_metadata,
-    set_streams,
-)
 
-CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED, FRAME_WRONG, PAST_WRONG = range(5)
-FINDINGS = (
-    "the bearings of this frame contradict each other: it is left out",
-    "this frame contradicts what came before it: the sets of both are kept",
-    "this frame contradicts both sets that were kept: they count as one from here on",
-    "the earlier frame that contradicted what came before it was wrong",
-    "what came before the earlier frame that contradicted it was wrong",
-)
-NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
 LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
@@ -95,30 +97,6 @@ class SetFilterParameters(SetParameters):
     heading_error_radps: NonNegativeFloat | None = None
     anchor_s: PositiveFloat = 5.0
     most_edges: PositiveInt = 400
-
-
-class Bounds(NamedTuple):
-    """How far odometry and bearings err at most."""
-
-    position: Growth
-    heading: Growth
-    bearing_rad: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> "Bounds":
-        """From the five numbers of a channel or of parameters, in the order of STATED."""
-        return cls(Growth(*values[:2]), Growth(*values[2:4]), values[4])
-
-
-ERRORS = ("position_error_m", "position_error_mps", "heading_error_rad", "heading_error_radps")
-STATED = (*ERRORS, "bearing_bound_rad")
-
-
-class Bearings(NamedTuple):
-    """The bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
-
-    place_m: Floats
-    bearing_rad: Floats
 
 
 class Step(NamedTuple):
@@ -274,23 +252,6 @@ def _simpler(part: BaseGeometry, most_edges: int) -> BaseGeometry:
 
 def _area(parts: Sequence[BaseGeometry]) -> float:
     return float(shapely.union_all(parts).area)
-
-
-def frames_with_bearings(
-    stream: Stream, landmarks: Stream, known: Known
-) -> Iterable[tuple[Frame, Bearings]]:
-    """The frames of a stream and the single bearings of each, none of a relative-bearing stream."""
-    places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
-    for frame in frames(stream, landmarks, known):
-        bearings = Bearings(np.empty((0, 2)), np.empty(0))
-        if "bearing_rad" in stream.columns:
-            first, end = np.searchsorted(stream.publish_time_ns, [frame.time_ns, frame.time_ns + 1])
-            rows = [row for row in range(first, end) if int(stream["target_id"][row]) in places]
-            targets = stream["target_id"][rows].tolist()
-            bearings = Bearings(
-                np.array([places[target] for target in targets]), stream["bearing_rad"][rows]
-            )
-        yield frame, bearings
 
 
 def solve(

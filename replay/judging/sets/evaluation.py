@@ -11,10 +11,10 @@ from recorders.log import Stream, schemas
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import Components
-from replay.estimators.sets.feasible_sets import excess_rad, signed_area
-from replay.estimators.sets.set_membership import Known, frames
 from replay.judging.errors.evaluation import reference, split_topic
 from replay.judging.errors.truths import Truths
+from replay.regions.feasible_sets import excess_rad, signed_area
+from replay.regions.frames import Known, frames
 
 Floats = NDArray[np.float64]
 

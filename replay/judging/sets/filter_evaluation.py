@@ -11,12 +11,11 @@ from recorders.models.planar import wrap_angle
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import Components
-from replay.estimators.sets.moving_sets import Odometry, odometry_of, relative_pose
-from replay.estimators.sets.set_filter import NOT_CUT, STATED, Bearings, Bounds, frames_with_bearings
-from replay.estimators.sets.set_membership import Known
 from replay.judging.errors.evaluation import reference
 from replay.judging.errors.truths import Truths
 from replay.judging.sets.evaluation import JudgedSets, judge_sets, premises_hold
+from replay.regions.frames import NOT_CUT, STATED, Bearings, Bounds, Known, frames_with_bearings
+from replay.regions.moving_sets import Odometry, odometry_of, relative_pose
 
 Booleans = NDArray[np.bool_]
 Floats = NDArray[np.float64]

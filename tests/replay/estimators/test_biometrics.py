@@ -13,17 +13,16 @@ from pipeline.studies.biometrics.claims import PAPER_FUSED, REAL_COUNTS, SINGLE
 from recorders.errors import BadInput
 from recorders.recording import import_run, record_run
 from replay.engine.streams.sources import memory_source
-from replay.estimators.biometrics.biometrics import (
+from replay.estimators.biometrics.biometrics import ClassifierParameters, learn_classifier
+from replay.estimators.biometrics.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
+from replay.estimators.biometrics.pairs import (
     RULES,
-    ClassifierParameters,
     all_pairs,
     cross_validate,
-    learn_classifier,
     normalise,
     trimmed_pairs,
     user_folds,
 )
-from replay.estimators.biometrics.mixture_hmm import Fit, MixtureHmm, fit, log_likelihood
 from replay.judging.consistency.verification import (
     Fused,
     bootstrap_users,

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recorders.errors import BadInput
-from replay.estimators.networks.covariance_intersection import RULES, Stake, fuse, sighting_weight
+from replay.estimators.networks.covariance_intersection import RULES, fuse
+from replay.estimators.networks.pairwise import Stake, sighting_weight
 
 PAIR = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
 THREE = np.array([np.diag([1.0, 4.0]), np.diag([4.0, 1.0]), [[2.0, 1.5], [1.5, 2.0]]])

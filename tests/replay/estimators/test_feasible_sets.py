@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from recorders.errors import BadInput
 from recorders.models.relative_bearing import relative_bearing
-from replay.estimators.sets.feasible_sets import (
+from replay.regions.feasible_sets import (
     Arena,
     area,
     box,
@@ -22,7 +22,7 @@ from replay.estimators.sets.feasible_sets import (
     signed_area,
     to_blame,
 )
-from replay.estimators.sets.pseudo_ellipsoids import (
+from replay.regions.pseudo_ellipsoids import (
     PseudoEllipsoid,
     fit,
     fuse,

@@ -14,12 +14,12 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import gather
 from replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
-    Scans,
     filter_scans,
     no_components,
     scans_of,
     settings_of,
 )
+from replay.estimators.tracking.phd_recursion import Scans
 from replay.judging.errors.truths import Truths
 from replay.judging.sets.errors import set_errors
 from tests.replay.estimators.scan_scenes import VARIANCE_M2, simulate, source

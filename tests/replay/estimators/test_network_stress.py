@@ -6,8 +6,8 @@ from scipy.stats import chi2
 
 from pipeline.runs.ensemble import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
-from replay.estimators.networks.covariance_intersection import Estimate
-from replay.estimators.networks.networks import agrees, divergence
+from replay.estimators.networks.estimates import Estimate
+from replay.estimators.networks.nodes import agrees, divergence
 
 RULE = {"kind": "network:ci-trace"}
 

@@ -9,7 +9,9 @@ import shapely
 from pipeline.runs.ensemble import record_ensemble, replay_ensemble
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import MemorySource
-from replay.estimators.sets.moving_sets import (
+from replay.judging.sets.filter_evaluation import judge_filter
+from replay.regions.frames import CONTRADICTS_ITSELF, CONTRADICTS_PAST, FRAME_WRONG, PAST_WRONG
+from replay.regions.moving_sets import (
     Headings,
     Motion,
     all_headings_of,
@@ -20,13 +22,6 @@ from replay.estimators.sets.moving_sets import (
     to_rings,
     within_l8,
 )
-from replay.estimators.sets.set_filter import (
-    CONTRADICTS_ITSELF,
-    CONTRADICTS_PAST,
-    FRAME_WRONG,
-    PAST_WRONG,
-)
-from replay.judging.sets.filter_evaluation import judge_filter
 
 DRIVE = {
     "landmarks": 5,

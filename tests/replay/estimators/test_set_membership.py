@@ -13,10 +13,10 @@ from recorders.recording import Recording, import_run
 from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import LogSource, memory_source
 from replay.engine.vectors.tangent import truth_at
-from replay.estimators.sets.feasible_sets import arena_around, box, exact_set, excess_rad, rings
-from replay.estimators.sets.pseudo_ellipsoids import fit, room
-from replay.estimators.sets.set_membership import Known, frames
 from replay.judging.sets.evaluation import judge_sets
+from replay.regions.feasible_sets import arena_around, box, exact_set, excess_rad, rings
+from replay.regions.frames import Known, frames
+from replay.regions.pseudo_ellipsoids import fit, room
 
 pytestmark = pytest.mark.paper
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.runs.ensemble import Part, record_ensemble, replay_ensemble, replay_parts
-from pipeline.studies.toolkit.localization import error_charts
+from pipeline.runs.summary import error_charts
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata

@@ -15,8 +15,8 @@ from shapely.geometry.base import BaseGeometry
 
 from recorders.models.planar import drive, wrap_angle
 from replay.engine.arrays import Floats, Integers
-from replay.estimators.sets.feasible_sets import Arena
-from replay.estimators.sets.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
+from replay.regions.feasible_sets import Arena
+from replay.regions.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
 
 ROUNDING_M = 1e-7
 ON_A_LINE_M = 1e-10  # a vertex so near to the line between its neighbours is none

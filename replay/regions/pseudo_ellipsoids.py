@@ -16,7 +16,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats
-from replay.estimators.sets.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
+from replay.regions.feasible_sets import Arena, Pairs, discs, evaluate, signed_area
 
 Order = Literal[4, 8]
 Weighting = Literal["area", "batch", "determinant", "equal"]

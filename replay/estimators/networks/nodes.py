@@ -1,0 +1,343 @@
+"""What the nodes of a network do between events: predict, measure, send, receive and fuse."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.models.constant_velocity import noise_moments
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.estimators.networks.covariance_intersection import Memory, fuse_by, memory_for
+from replay.estimators.networks.estimates import Estimate, blend, determinant, inverted, one_of
+from replay.inference.linear_algebra.gaussian import coast, copy_gaussian
+
+
+class Activities(NamedTuple):
+    """Every moment of every node at which it measures, sends or receives, by run, time and node.
+
+    Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
+    measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
+    in which a message was sent, `may_send` says in which activities a node has a chance to send.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    node: Integers
+    measured: Integers
+    received: Integers
+    message: Integers
+    may_send: Booleans
+
+
+class Sensing(NamedTuple):
+    """Measurements in the order of their activities: (k, n), NaN where a component is not measured.
+
+    `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
+    """
+
+    value: Floats
+    sensor: Integers
+    variance: Floats
+    density: Floats
+
+
+class Fusion(NamedTuple):
+    """The rule's number in `covariance_intersection.RULES`, and how exactly its weights are optimised.
+
+    With `own_first` a node fuses its own x*, not its prediction. A message differs by `divergence` nats
+    at least from what the last one says, which is `interval_ns` old at least; `gate` is the largest
+    squared distance between a prediction and what is heard, infinity where everything is fused. The
+    index `liar` is -1 where there is none.
+    """
+
+    rule: int
+    tolerance: float
+    own_first: bool
+    interval_ns: int
+    divergence: float
+    gate: float
+    liar: int
+    lie_m: float
+    lie_after_ns: int
+
+
+class Nodes(NamedTuple):
+    """What the nodes of one run know, first axis = node.
+
+    Attributes:
+        time_ns: (nodes,), of their estimates.
+        mean, covariance: (nodes, n), (nodes, n, n).
+        said_ns, said_mean, said_covariance: of each node's last message; -1 where there is none.
+    """
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    said_ns: Integers
+    said_mean: Floats
+    said_covariance: Floats
+
+
+class Work(NamedTuple):
+    """What one core works in: the nodes of a run, and what one of them fuses, with weights (most,)."""
+
+    nodes: Nodes
+    parts: Estimate
+    weights: Floats
+    memory: Memory
+
+
+def work_for(nodes: int, most: int, states: int) -> Work:
+    """Memory for so many nodes, of which each fuses so many estimates at most."""
+    square, many = (nodes, states, states), (most, states, states)
+    return Work(
+        Nodes(
+            np.empty(nodes, np.int64),
+            np.empty((nodes, states)),
+            np.empty(square),
+            np.empty(nodes, np.int64),
+            np.empty((nodes, states)),
+            np.empty(square),
+        ),
+        Estimate(np.empty((most, states)), np.empty(many), np.empty(many)),
+        np.empty(most),
+        memory_for(most, states),
+    )
+
+
+class Results(NamedTuple):
+    """What the kernel fills, a row per activity: estimates, x* as it is sent, and whether it is.
+
+    `refused` (m,) says of every message that arrived whether the gate kept it out.
+    """
+
+    mean: Floats
+    covariance: Floats
+    sent_mean: Floats
+    sent_covariance: Floats
+    sent_independent: Floats
+    sent: Booleans
+    refused: Booleans
+
+
+def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
+    """Predict with constant velocity, in place."""
+    coast(mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s))
+
+
+def observe(
+    mean: Floats, covariance: Floats, independent: Floats, value: Floats, variance: Floats
+) -> None:
+    """Update with what is measured, component by component, in place.
+
+    `independent` is the part of the covariance that stems from measurements since it was zero.
+    """
+    size = len(mean)
+    gain, crossed = np.empty(size), np.empty(size)
+    for seen in range(size):
+        if np.isnan(value[seen]):
+            continue
+        spread = covariance[seen, seen] + variance[seen]
+        error = value[seen] - mean[seen]
+        for row in range(size):
+            gain[row] = covariance[row, seen] / spread
+        at = independent[seen, seen]
+        for row in range(size):
+            crossed[row] = independent[seen, row]
+        for row in range(size):
+            mean[row] += gain[row] * error
+            for column in range(size):
+                independent[row, column] += (
+                    gain[row] * gain[column] * (at + variance[seen])
+                    - gain[row] * crossed[column]
+                    - crossed[row] * gain[column]
+                )
+        for row in range(size):
+            for column in range(row + 1):
+                covariance[row, column] -= gain[row] * gain[column] * spread
+                covariance[column, row] = covariance[row, column]
+
+
+def observe_all(
+    activity: int,
+    mean: Floats,
+    covariance: Floats,
+    independent: Floats,
+    activities: Activities,
+    sensing: Sensing,
+) -> None:
+    """Update with all that a node measures in an activity, see `observe`."""
+    for k in range(activities.measured[activity], activities.measured[activity + 1]):
+        variance = sensing.variance[sensing.sensor[k]]
+        observe(mean, covariance, independent, sensing.value[k], variance)
+
+
+def squared_distance(difference: Floats, covariance: Floats) -> float:
+    """The squared Mahalanobis distance; infinity where the covariance is singular."""
+    information = np.empty_like(covariance)
+    if not inverted(covariance, information):
+        return np.inf
+    squared = 0.0
+    for row in range(len(difference)):
+        for column in range(len(difference)):
+            squared += difference[row] * information[row, column] * difference[column]
+    return squared
+
+
+def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
+    """The Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
+    size = len(mean)
+    information, difference = np.empty_like(covariance), np.empty(size)
+    if not inverted(of_covariance, information):
+        return np.inf
+    total = np.log(determinant(of_covariance) / determinant(covariance)) - size
+    for row in range(size):
+        difference[row] = mean[row] - of_mean[row]
+        for column in range(size):
+            total += information[row, column] * covariance[row, column]
+    return 0.5 * (total + squared_distance(difference, of_covariance))
+
+
+def agrees(mean: Floats, covariance: Floats, heard: Estimate, gate: float) -> bool:
+    """Whether an estimate may be of the same state, however both are correlated.
+
+    The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
+    """
+    if gate == np.inf:
+        return True
+    difference, most = np.empty(len(mean)), np.empty_like(covariance)
+    for row in range(len(mean)):
+        difference[row] = heard.mean[row] - mean[row]
+    blend(2.0, covariance, 2.0, heard.covariance, most)
+    return squared_distance(difference, most) <= gate
+
+
+def follow(
+    run: int,
+    activities: Activities,
+    sensing: Sensing,
+    prior_mean: Floats,
+    prior_covariance: Floats,
+    prior_ns: Integers,
+    fusion: Fusion,
+    results: Results,
+    failed_ns: Integers,
+    work: Work,
+) -> None:
+    """Move the nodes of one run through their activities, until these end or a fusion fails.
+
+    At every time all nodes send first, and then take in what they hear.
+    """
+    nodes, parts, weights, memory = work
+    nodes.time_ns[:], nodes.said_ns[:] = prior_ns[run], -1
+    for node in range(len(nodes.mean)):
+        copy_gaussian(prior_mean[run], prior_covariance[run], nodes.mean[node], nodes.covariance[node])
+    begin, last = activities.offsets[run], activities.offsets[run + 1]
+    while begin < last:
+        now = activities.time_ns[begin]
+        end = begin
+        while end < last and activities.time_ns[end] == now:
+            predict_and_send(end, prior_ns[run], activities, sensing, fusion, nodes, results)
+            end += 1
+        for activity in range(begin, end):
+            node = activities.node[activity]
+            mean, covariance = nodes.mean[node], nodes.covariance[node]
+            heard = hear(activity, activities, sensing, fusion, nodes, parts, results)
+            if heard > 1:
+                rule, tolerance = fusion.rule, fusion.tolerance
+                gap = fuse_by(rule, heard, parts, weights, mean, covariance, tolerance, memory)
+                if not gap < np.inf:
+                    failed_ns[run] = now
+                    return
+            # the independent part is of no use any more
+            observe_all(activity, mean, covariance, parts.independent[0], activities, sensing)
+            copy_gaussian(mean, covariance, results.mean[activity], results.covariance[activity])
+        begin = end
+
+
+def predict_and_send(
+    activity: int,
+    start_ns: int,
+    activities: Activities,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+    results: Results,
+) -> None:
+    """Predict a node to now, update x* with its own measurements, and send that where it is due."""
+    node, now = activities.node[activity], activities.time_ns[activity]
+    if now > nodes.time_ns[node]:
+        span_s = (now - nodes.time_ns[node]) * 1e-9
+        move(nodes.mean[node], nodes.covariance[node], sensing.density[node], span_s)
+        nodes.time_ns[node] = now
+    mean, covariance = results.sent_mean[activity], results.sent_covariance[activity]
+    copy_gaussian(nodes.mean[node], nodes.covariance[node], mean, covariance)
+    independent = results.sent_independent[activity]
+    observe_all(activity, mean, covariance, independent, activities, sensing)
+    if not activities.may_send[activity]:
+        return
+    if is_due(node, now, mean, covariance, sensing, fusion, nodes):
+        results.sent[activity], nodes.said_ns[node] = True, now
+        copy_gaussian(mean, covariance, nodes.said_mean[node], nodes.said_covariance[node])
+    if node == fusion.liar and now - start_ns >= fusion.lie_after_ns:
+        mean[0] += fusion.lie_m
+
+
+def is_due(
+    node: int,
+    now: int,
+    mean: Floats,
+    covariance: Floats,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+) -> bool:
+    """Whether x* may be sent again, and differs enough from what the last message says of now."""
+    if nodes.said_ns[node] < 0:
+        return True
+    if now - nodes.said_ns[node] < fusion.interval_ns:
+        return False
+    if fusion.divergence == 0.0:
+        return True
+    said_mean, said_covariance = nodes.said_mean[node].copy(), nodes.said_covariance[node].copy()
+    silent_s = (now - nodes.said_ns[node]) * 1e-9
+    move(said_mean, said_covariance, sensing.density[node], silent_s)
+    return fusion.divergence <= divergence(mean, covariance, said_mean, said_covariance)
+
+
+def hear(
+    activity: int,
+    activities: Activities,
+    sensing: Sensing,
+    fusion: Fusion,
+    nodes: Nodes,
+    parts: Estimate,
+    results: Results,
+) -> int:
+    """Fill in what a node fuses, its own estimate first and all as of now; returns how many."""
+    node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
+    first, end = activities.received[activity], activities.received[activity + 1]
+    count = 0
+    for i in range(-1, end - first):
+        is_own = i < 0
+        source = activity if is_own else activities.message[first + i]
+        if not is_own and not results.sent[source]:
+            continue
+        mean, covariance = nodes.mean[node], nodes.covariance[node]
+        if not is_own or fusion.own_first:
+            mean, covariance = results.sent_mean[source], results.sent_covariance[source]
+        copy_gaussian(mean, covariance, parts.mean[count], parts.covariance[count])
+        late_s = (now - activities.time_ns[source]) * 1e-9
+        # what was new in a late one others may have passed on
+        new = 1.0 if not is_own and late_s <= 0.0 else 0.0
+        for row in range(size):
+            for column in range(size):
+                own = results.sent_independent[source, row, column]
+                parts.independent[count, row, column] = new * own
+        if late_s > 0.0:
+            move(parts.mean[count], parts.covariance[count], sensing.density[node], late_s)
+        heard = one_of(parts, count)
+        if is_own or agrees(nodes.mean[node], nodes.covariance[node], heard, fusion.gate):
+            count += 1
+        else:
+            results.refused[first + i] = True
+    return count

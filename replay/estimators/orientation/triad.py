@@ -1,0 +1,75 @@
+"""Orientation from two directions (TRIAD), and steps of an orientation by a turn."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.models.inertial import cross
+from recorders.models.planar import Components
+from replay.distributions.bingham_kernels import Vector
+
+
+def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
+    """Whether no component of the three vectors is NaN or infinite."""
+    total = 0.0
+    for i in range(3):
+        total += rate[i] + force[i] + field[i]
+    return math.isfinite(total)
+
+
+def isotropic(sigma_rad: float, z: NDArray) -> None:
+    """Fill concentrations about the identity, in the order of a quaternion's components."""
+    z[:] = -2.0 / sigma_rad**2
+    z[0] = 0.0
+
+
+def increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
+    """The quaternion of a rotation vector."""
+    x, y, z = 0.5 * x_rad, 0.5 * y_rad, 0.5 * z_rad
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = math.sin(angle) / angle if angle > 0.0 else 1.0
+    return math.cos(angle), scale * x, scale * y, scale * z
+
+
+def carry(turned: Vector, vector: NDArray) -> None:
+    """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
+    w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
+    a, b, c = vector[0], vector[1], vector[2]
+    d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    vector[0] = a + w * d + y * f - z * e
+    vector[1] = b + w * e + z * d - x * f
+    vector[2] = c + w * f + x * e - y * d
+
+
+def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
+    """The orientation under which force points up and field north; NaN where they are parallel."""
+    up = unit(force)
+    east = unit(cross(field, up))
+    north = cross(up, east)
+    # 4 q q^T of the rotation matrix with these rows; its largest column has no cancellation
+    a, b, c = up[1] - north[2], east[2] - up[0], north[0] - east[1]
+    d, e, f = east[1] + north[0], east[2] + up[0], north[2] + up[1]
+    w, x = 1.0 + east[0] + north[1] + up[2], 1.0 + east[0] - north[1] - up[2]
+    y, z = 1.0 - east[0] + north[1] - up[2], 1.0 - east[0] - north[1] + up[2]
+    column, most = (w, a, b, c), w
+    for other, size in (((a, x, d, e), x), ((b, d, y, f), y), ((c, e, f, z), z)):
+        if size > most:
+            column, most = other, size
+    w, x, y, z = column
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    return w / length, x / length, y / length, z / length
+
+
+def unit(vector: Components) -> Components:
+    """The direction of a vector of three components; NaN where it has none."""
+    x, y, z = vector[0], vector[1], vector[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def diagonal(values: NDArray, out: NDArray) -> None:
+    """Fill a diagonal matrix."""
+    out[:] = 0.0
+    for i in range(len(values)):
+        out[i, i] = values[i]
