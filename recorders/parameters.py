@@ -34,9 +34,9 @@ class Parameters(BaseModel):
         schema = handler(core_schema)
         table = handler.resolve_ref_schema(schema)
         table["description"] = _prose(cls)
-        meaning_of = meanings(cls)
+        meaning_of, entries = meanings(cls), table.setdefault("properties", {})
         for name, field in cls.model_fields.items():
-            entry = table["properties"][field.alias or name]
+            entry = entries[field.alias or name]
             entry.setdefault("description", meaning_of.get(name, ""))
             entry["unit"] = unit_of(name)
         return schema
@@ -140,8 +140,13 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
 
 
 def _prose(kind: type[BaseModel]) -> str:
-    """What a type says of its parameters as a whole."""
-    return _ATTRIBUTES.sub("", cleandoc(kind.__doc__ or "")).strip()
+    """What a type and its bases say of their parameters as a whole."""
+    told = [
+        _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
+        for each in reversed(kind.__mro__)
+        if issubclass(each, Parameters) and each is not Parameters
+    ]
+    return "\n\n".join(filter(None, dict.fromkeys(told)))
 
 
 class Described(NamedTuple):
@@ -169,33 +174,31 @@ def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> 
 def explain(kind: type[BaseModel]) -> dict[str, str]:
     """What a type and those of its nested tables say as a whole, by where these are.
 
-    A place is the full name of a table and a dot, such as `range_bearing.`, empty for the type itself;
-    several tables of one type stand together. What a type inherits comes first.
+    A place is how the names in a table begin, such as `range_bearing.`, empty for the type itself;
+    several tables that say the same stand together. What a type inherits comes first.
     """
+    schema = kind.model_json_schema()
     places: dict[str, list[str]] = {}
-    for place, table in _tables(kind, ""):
-        told = [
-            _prose(each)
-            for each in reversed(table.__mro__)
-            if issubclass(each, BaseModel) and each not in (BaseModel, Parameters) and each.__doc__
-        ]
-        if told:
-            places.setdefault("\n\n".join(dict.fromkeys(told)), []).append(place)
+    for place, table in _tables("", schema, schema.get("$defs", {})):
+        if told := table.get("description"):
+            places.setdefault(told, []).append(place)
     return {", ".join(names): text for text, names in places.items()}
 
 
-def _tables(kind: type[BaseModel], prefix: str) -> Iterator[tuple[str, type[BaseModel]]]:
-    yield prefix, kind
-    for name, entry in kind.model_fields.items():
-        if table := _table_in(entry.annotation):
-            yield from _tables(table, f"{prefix}{entry.alias or name}.")
+def _tables(
+    prefix: str, table: Mapping[str, Any], definitions: Mapping[str, Any]
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    yield prefix, table
+    for name, entry in table["properties"].items():
+        for below in _below(entry, definitions, f"{prefix}{name}"):
+            yield from _tables(*below, definitions)
 
 
 def _described(
     table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
 ) -> Iterator[Described]:
     """Walk a JSON schema; `given` are defaults that the table above states for this one."""
-    for name, entry in table.get("properties", {}).items():
+    for name, entry in table["properties"].items():
         value = given.get(name, entry.get("default"))
         below = next(_below(entry, definitions, f"{prefix}{name}"), None)
         is_table = below is not None and below[0] == f"{prefix}{name}."

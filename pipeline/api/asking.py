@@ -4,8 +4,9 @@ Every command names what takes its settings, by a key of `TAKERS`.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from pipeline.api.catalog import Entry, rows_of, stated_of
 from pipeline.logs.constraints import ConstraintParameters
@@ -20,6 +21,7 @@ from pipeline.runs.experiment import (
 from pipeline.runs.settings import read_settings
 from recorders.errors import BadInput, choices
 from recorders.log import open_log
+from recorders.parameters import merge, parse_settings
 from recorders.recording import Recorder
 from recorders.registry import load
 from replay.engine.replaying.estimator import Estimator, find_estimator
@@ -27,13 +29,7 @@ from replay.inference.estimators import registered_models
 from replay.inference.observability import OBSERVABILITY
 
 ASKED, OF_MODEL = "=?", " of "
-
-
-class Taker(NamedTuple):
-    """What takes settings, and how keys begin, such as with `ekf.`; of several the first has a key."""
-
-    begins: str
-    entries: Sequence[Entry]
+Entries = Sequence[Entry]  # what takes settings at once
 
 
 def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) -> None:
@@ -50,23 +46,20 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
     print_table(["parameter", "of", "default", "unit", "accepts", "meaning"], table)
 
 
-def _answer(name: str, takers: Sequence[Taker]) -> list[list[object]]:
-    """Rows of one name, of a table with all that is in it; what is alike of several stands once."""
-    for taker in takers:
+def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
+    """Rows of one name, of a table with all that is in it; what is alike of several stands once.
+
+    Of several takers the first has a name.
+    """
+    for entries in takers:
         alike: dict[str, tuple[list[object], list[str]]] = {}
-        for entry in taker.entries:
-            for key, *row in rows_of(entry):
-                full = f"{taker.begins}{key}"
-                if f"{full}.".startswith((f"{name}.", f"{name}[")):
-                    alike.setdefault(repr((key, row)), ([full, *row], []))[1].append(entry.name)
+        for entry in entries:
+            for row in rows_of(entry):
+                if f"{row[0]}.".startswith((f"{name}.", f"{name}[")):
+                    alike.setdefault(repr(row), (row, []))[1].append(entry.name)
         if alike:
             return [[row[0], ", ".join(_whose(of, alike)), *row[1:]] for row, of in alike.values()]
-    known = {
-        f"{taker.begins}{key}"
-        for taker in takers
-        for entry in taker.entries
-        for key, *_ in rows_of(entry)
-    }
+    known = {str(row[0]) for entries in takers for entry in entries for row in rows_of(entry)}
     raise BadInput(f"--set {name}{ASKED}: no such parameter; {choices(name, sorted(known))}")
 
 
@@ -75,7 +68,7 @@ def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
     return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
 
 
-def _recorder(options: Mapping[str, Any]) -> Iterator[Taker]:
+def _recorder(options: Mapping[str, Any]) -> Iterator[Entries]:
     """That of a scenario, of a log to record again, or of data to import."""
     name, values = options.get("source"), dict[str, Any]()
     if name is None and options["again"] is not None:
@@ -85,7 +78,7 @@ def _recorder(options: Mapping[str, Any]) -> Iterator[Taker]:
         name, values, _ = load_scenario(options["scenario"])
     if name is None:
         raise BadInput(f"--set NAME{ASKED}: name a scenario, one that fuselog scenarios lists")
-    yield Taker("", [_of_recorder(name, values)])
+    yield [_of_recorder(name, values)]
 
 
 def _of_recorder(name: str, values: Mapping[str, Any]) -> Entry:
@@ -93,21 +86,27 @@ def _of_recorder(name: str, values: Mapping[str, Any]) -> Entry:
     return Entry(name, recorder.summary, parameters=recorder.parameters, values=values)
 
 
-def _estimators(options: Mapping[str, Any]) -> Iterator[Taker]:
+def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
     """Those that a command names."""
     labels = options.get("names") or options.get("labels") or [options.get("label")]
     if not all(labels):
         raise BadInput(f"--set NAME{ASKED}: name an estimator, such as -e ekf")
     tables = read_settings(options["settings_file"], labels)
-    yield from _by_label({label: tables.get(label, {}) for label in labels}, options.get("model"))
+    given = parse_settings(text for text in options["settings"] if not text.endswith(ASKED))
+    named = {label: given[label] for label in labels if isinstance(given.get(label), dict)}
+    kinds = {label: {"kind": each["kind"]} for label, each in named.items() if "kind" in each}
+    chosen = {label: merge(tables.get(label, {}), kinds.get(label, {})) for label in labels}
+    yield from _by_label(chosen, options.get("model"))
 
 
-def _by_label(estimators: Mapping[str, Mapping[str, Any]], model: str | None = None) -> Iterator[Taker]:
+def _by_label(
+    estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
+) -> Iterator[Entries]:
     """Estimators by label: first what a label begins, then what is set for all."""
     found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
     for label, entries in found.items():
-        yield Taker(f"{label}.", entries)
-    yield Taker("", [entry for entries in found.values() for entry in entries])
+        yield [replace(entry, prefix=f"{label}.") for entry in entries]
+    yield [entry for entries in found.values() for entry in entries]
 
 
 def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = None) -> list[Entry]:
@@ -129,35 +128,34 @@ def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = Non
     ]
 
 
-def _experiment(options: Mapping[str, Any]) -> Iterator[Taker]:
+def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
     """An experiment's own, its study's, its scenario's or importer's, and those of its estimators."""
     named, labels = options["experiment"], options["labels"]
     logs = [Path(each) for each in named if each.endswith(".mcap")]
     stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])
     experiment = stated.with_settings({}, {})
     study = load("studies", experiment.study, Study)
-    yield Taker("", [Entry(stated.name, "", parameters=Experiment, values=stated.values)])
-    yield Taker(
-        "options.", [Entry(experiment.study, "", parameters=study.options, values=experiment.options)]
-    )
+    yield [Entry(stated.name, "", parameters=Experiment, values=stated.values)]
+    own, values = study.options, experiment.options
+    yield [Entry(experiment.study, "", parameters=own, values=values, prefix="options.")]
     if experiment.import_:
         source = experiment.import_
-        yield Taker("", [_of_recorder(source.source, source.parameters)])
+        yield [_of_recorder(source.source, source.parameters)]
     elif experiment.record:
         name, values, _ = load_scenario(experiment.record.scenario)
-        yield Taker("", [_of_recorder(name, values | experiment.record.parameters)])
+        yield [_of_recorder(name, values | experiment.record.parameters)]
     yield from _by_label(experiment.estimators)
 
 
-def _constraints(_: Mapping[str, Any]) -> Iterator[Taker]:
-    yield Taker("", [Entry("constrain", "", parameters=ConstraintParameters)])
+def _constraints(_: Mapping[str, Any]) -> Iterator[Entries]:
+    yield [Entry("constrain", "", parameters=ConstraintParameters)]
 
 
-def _observability(options: Mapping[str, Any]) -> Iterator[Taker]:
-    yield Taker("", _of_estimator("observability", {"kind": OBSERVABILITY}, options["model"]))
+def _observability(options: Mapping[str, Any]) -> Iterator[Entries]:
+    yield _of_estimator("observability", {"kind": OBSERVABILITY}, options["model"])
 
 
-TAKERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Taker]]] = {
+TAKERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Entries]]] = {
     "recorder": _recorder,
     "estimators": _estimators,
     "experiment": _experiment,

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.output.terminal import print_json, print_table, say
-from pipeline.runs.experiment import Experiment, load_scenario, shipped
+from pipeline.runs.experiment import Experiment, Study, load_scenario, shipped
 from recorders.errors import BadInput, choices
 from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml
@@ -30,7 +30,8 @@ from replay.judging.metrics.measuring import Metric
 class Entry:
     """One thing to choose: what it is in a line, more facts, its parameters, and values it sets.
 
-    `stated` are the parameters that a log's channels state where they are not given.
+    `stated` are the parameters that a log's channels state where they are not given; the names of all
+    begin with `prefix` where they are set.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Entry:
     parameters: type[BaseModel] | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
     stated: Collection[str] = ()
+    prefix: str = ""
 
 
 def scenarios() -> list[Entry]:
@@ -191,7 +193,8 @@ def _experiment(name: str, path: Path) -> Entry:
         facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"
     if experiment.import_:
         facts["imports"] = f"{experiment.import_.source}; give its place with --data"
-    return Entry(name, experiment.title, facts)
+    options = load("studies", experiment.study, Study).options
+    return Entry(name, experiment.title, facts, options, experiment.options, prefix="options.")
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:
@@ -209,8 +212,9 @@ def _print_details(entry: Entry) -> None:
     say(f"{entry.name}: {entry.what}")
     for key, fact in entry.facts.items():
         say(f"{key}: {fact}")
-    if entry.parameters:
-        print_table(["parameter", "default", "unit", "accepts", "meaning"], rows_of(entry))
+    rows = rows_of(entry)
+    if rows and entry.parameters:
+        print_table(["parameter", "default", "unit", "accepts", "meaning"], rows)
         for place, text in explain(entry.parameters).items():
             for line in ("", *([place] if place else []), *text.splitlines()):
                 say(line)
@@ -221,7 +225,11 @@ def rows_of(entry: Entry) -> list[list[object]]:
     if entry.parameters is None:
         return []
     return [
-        [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
+        [
+            f"{entry.prefix}{each.name}",
+            _default(each.default, is_stated=each.name in entry.stated),
+            *each[2:],
+        ]
         for each in describe(entry.parameters, entry.values)
     ]
 

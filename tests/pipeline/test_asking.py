@@ -49,6 +49,7 @@ def test_every_parameter_says_what_it_means() -> None:
         ("import ros bag --set clock=?", ["header, bag"]),
         ("replay a.mcap -e ekf --set ekf.gate_probability=?", ["ekf of robot", "0.999"]),
         ("replay a.mcap -e vqf --set heading_s=? --set gap=3", ["vqf", "time constant"]),
+        ("replay a.mcap -e b --set b.kind=particles --set cloud=?", ["all its particles"]),
         ("tune a.mcap -e ukf --free a --model robot --set sigma_range_m=?", ["from the log"]),
         ("check a.mcap --against a.golden.xz -e ekf --set topics=?", ["empty name"]),
         ("compare a b -e smoother:iterated -e ekf --set loss=?", ["square, huber, cauchy"]),

@@ -238,5 +238,5 @@ def test_what_types_say_of_their_parameters() -> None:
 
     assert explain(Robot) == {
         "left., right.": "Of all sensors.\n\nOf this one.",
-        "more.": "Of all sensors.",
+        "more[].": "Of all sensors.",
     }
