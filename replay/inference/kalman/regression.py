@@ -1,4 +1,4 @@
-"""Statistical linear regression: a Gaussian through a function at weighted samples of it.
+"""Passes a Gaussian through a function by statistical linear regression at weighted samples.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
 (24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent
@@ -17,10 +17,10 @@ from replay.inference.kalman.steps import Workspace
 from replay.inference.kalman.update import reading, sensor_noise
 from replay.inference.linear_algebra.gaussian import cholesky, wrap
 from replay.inference.linear_algebra.manifold import (
-    differencing,
+    boxminus,
+    boxplus,
     is_flat,
     recentring,
-    retraction,
     tangent_size,
 )
 from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
@@ -34,7 +34,7 @@ MEANS = 30  # at most so many steps to an intrinsic mean
 
 @varying(0, points=1, weights=1)
 class SampleMemory(NamedTuple):
-    """Samples of N(0, I), and what a regression at them works in; N = t + noises.
+    """Holds samples of N(0, I), and the arrays of a regression at them; N = t + noises.
 
     Attributes:
         points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
@@ -61,7 +61,7 @@ class SampleMemory(NamedTuple):
 def sample_memory(
     sets: SampleSets, kinds: Sequence[str], noises: int, outputs: Sequence[str]
 ) -> SampleMemory:
-    """Memory for the regression of a function of a state and its noise."""
+    """Make memory for the regression of a function of a state and its noise."""
     _, count, dimension = sets.points.shape
     values = tangent_size(outputs)
     return SampleMemory(
@@ -79,18 +79,18 @@ def sample_memory(
 def regression(
     function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
 ) -> Function:
-    """The regression of `function(state, noise, arguments)` at samples.
+    """Make the regression of `function(state, noise, arguments)` at weighted samples.
 
-    Returns `regress(mean, covariance, arguments, variances, spread, cross, use, memory)`. It takes the
-    samples of use number `use`, fills `memory.centre` with the intrinsic mean of the values, `spread`
-    (v, v) with their covariance and `cross` (t, v) with that with the state; False where the state's
-    covariance is not positive definite. `variances` is a tuple of those of the noise; `spread` may be
-    the state's covariance itself.
+    Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
+    takes the set of samples number `sample_index`, fills `memory.centre` with the intrinsic mean of the
+    values, `spread` (v, v) with their covariance and `cross` (t, v) with that with the state; False
+    where the state's covariance is not positive definite. `variances` is a tuple of those of the noise;
+    `spread` may be the state's covariance itself.
     """
     t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
     size = t + noises
     read_state, read_noise = tuple_of(components), tuple_of(noises, t)
-    add, subtract = retraction(kinds), differencing(outputs)
+    add, subtract = boxplus(kinds), boxminus(outputs)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
@@ -120,10 +120,10 @@ def regression(
         variances: tuple[float, ...],
         spread: Floats,
         cross: Floats,
-        use: int,
+        sample_index: int,
         memory: SampleMemory,
     ) -> bool:
-        chosen = (use - memory.first) * memory.stride
+        chosen = (sample_index - memory.first) * memory.stride
         weights, factor = memory.weights[chosen], memory.factor
         if not cholesky(factor, covariance, t):
             return False
@@ -140,13 +140,13 @@ def regression(
 
 @lru_cache(maxsize=64)
 def settling(kinds: tuple[str, ...]) -> Function:
-    """`settle(weights, values, centre, shift)`: moves a centre to the intrinsic mean of values.
+    """Make `settle(weights, values, centre, shift)`: it moves a centre to the intrinsic mean of values.
 
     The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
     afterwards.
     """
     v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
-    add, recentre, weighted_mean = retraction(kinds), recentring(kinds), weighted_mean_of(v)
+    add, recentre, weighted_mean = boxplus(kinds), recentring(kinds), weighted_mean_of(v)
 
     def settle(weights: Floats, values: Floats, centre: Floats, shift: Floats) -> None:
         for _ in range(MEANS):
@@ -168,7 +168,7 @@ def _no_variances(*_: Any) -> tuple[float, ...]:
 
 
 def sampled_motion(stage: Stage, number: int) -> Function:
-    """Prediction by regression at the samples `work.samples[number]`.
+    """Make the prediction by regression at the samples `work.samples[number]`.
 
     Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
     """
@@ -187,14 +187,14 @@ def sampled_motion(stage: Stage, number: int) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         memory, state, driven = work.samples[number], read_state(mean), read_control(control)
         arguments = (driven, duration_s, parameters)
         variances = variances_of(state, duration_s, parameters)
         cross = work.product.T
-        if not regress(mean, covariance, arguments, variances, covariance, cross, use, memory):
+        if not regress(mean, covariance, arguments, variances, covariance, cross, sample_index, memory):
             return False
         linearise(state, driven, duration_s, parameters, work)
         add_noise(state, covariance, duration_s, parameters, work)
@@ -220,23 +220,28 @@ def _moved(motion: Motion) -> Function:
 
 
 def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
-    """`innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
+    """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(_measured(sensor), model.kinds, sensor.noises, kinds)
-    read_about, m = reading(sensor).about, len(kinds)
+    read_reference, m = reading(sensor).reference, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
     entering = sensor.noise if sensor.noises else None
     variances_of = entering or _no_variances
     add_noise = nothing if sensor.noises else sensor_noise(sensor)
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
         memory = work.samples[samples]
         difference, spread, cross = work.innovations[number]
-        arguments, variances = (read_about(data), parameters), variances_of(parameters)
-        if not regress(mean, covariance, arguments, variances, spread, cross, use, memory):
+        arguments, variances = (read_reference(data), parameters), variances_of(parameters)
+        if not regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory):
             return False
         for i in range(m):
             difference[i] = wrap(data[i] - memory.centre[i], angular[i])

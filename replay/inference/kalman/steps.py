@@ -1,4 +1,4 @@
-"""The steps of a recursive Gaussian filter, made for one model: what a method puts together.
+"""Defines the steps of a recursive filter, which methods make for one model, and their memory.
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
 `linear_sensor`), by samples (`replay.inference.kalman.regression`), or by moments that the model knows.
@@ -33,25 +33,26 @@ NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Gaussian(NamedTuple):
-    """What is believed of the states, first axis = run: means (runs, n), covariances (runs, t, t)."""
+    """Holds a Gaussian of every run, first axis = run: means (runs, n), covariances (runs, t, t)."""
 
     mean: Floats
     covariance: Floats
 
 
 class Steps(NamedTuple):
-    """A recursive filter of one model, as the recursion takes it.
+    """Holds the steps of a recursive filter of one model, as the recursion calls them.
 
     Attributes:
         memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
-        predict: (run, belief, control, duration_s, parameters, use, memory) -> whether all is well;
-            moves the belief in place. `use` numbers the sets of randomised samples.
-        updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
-            ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
+        predict: (run, belief, control, duration_s, parameters, sample_index, memory) -> whether all is
+            well; moves the belief in place. `sample_index` numbers the sets of randomised samples.
+        updates: for every sensor, (run, belief, data, parameters, gate, sample_index, memory, record) ->
+            a failure, ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
-        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
+        resumes_after_gap: whether it goes on after a gap of the control: `predict` then takes NaN for a
+            control.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -59,11 +60,11 @@ class Steps(NamedTuple):
     updates: tuple[Function, ...]
     estimate: Function
     sampled: tuple[int, ...] = ()
-    resumes: bool = False
+    resumes_after_gap: bool = False
 
 
-class Note(NamedTuple):
-    """What an update tells of itself: one row of the results.
+class InnovationRecord(NamedTuple):
+    """Holds the innovation of one update: one row of the results.
 
     Attributes:
         difference, covariance: (slots,), (slots, slots) the innovation; a sensor fills its own slots.
@@ -76,7 +77,7 @@ class Note(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What the steps of one core work in.
+    """Holds the arrays that the steps of one core work in.
 
     Attributes:
         state: (n,), the moved state.
@@ -108,7 +109,12 @@ class Workspace(NamedTuple):
 
 
 def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
-    """A workspace for a model with the sensors at hand."""
+    """Make the workspace of a model with the sensors at hand.
+
+    Args:
+        stage: the model, with n components of the state, t of the tangent space, m of a sensor at most.
+        samples: the memories of `regression`, motion first, one for each of `Steps.sampled`.
+    """
     model, t = stage.model, stage.model.tangent
     m = max((len(sensor.measured) for sensor in stage.sensors), default=0)
     noises = max([stage.motion.noises, *(sensor.noises for sensor in stage.sensors)])
@@ -138,20 +144,34 @@ def gaussian_filter(
     memory: Callable[[tuple[Any, ...]], Any] | None = None,
     sampled: tuple[int, ...] = (),
 ) -> Steps:
-    """The steps of a filter whose belief is one Gaussian.
+    """Make the steps of a filter whose belief is one Gaussian.
 
-    `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
-    one run's mean and covariance.
+    Args:
+        stage: the model as a method takes it.
+        predict: `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` moves
+            one run's mean (n,) and covariance (t, t) in place; returns whether all is well.
+        updates: for every sensor, `update(mean, covariance, data, parameters, gate, sample_index, work,
+            record)`; see `kalman_update`.
+        memory: (sets) -> the workspace; `workspace(stage)` unless given.
+        sampled: see `Steps.sampled`.
+
+    Returns the steps, which pass over gaps of the control where the motion has a `gap_noise`.
     """
-    lost = stage.motion.lost
-    if lost is not None:
-        predict = _predicting_lost(stage.model, lost, predict)
+    gap_noise = stage.motion.gap_noise
+    if gap_noise is not None:
+        predict = _predicting_gap(stage.model, gap_noise, predict)
 
     def predict_run(
-        run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
+        run: int,
+        belief: Gaussian,
+        control: Any,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        work: Any,
     ) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return predict(mean, covariance, control, duration_s, parameters, use, work)
+        return predict(mean, covariance, control, duration_s, parameters, sample_index, work)
 
     def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
@@ -163,12 +183,12 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
-        resumes=lost is not None,
+        resumes_after_gap=gap_noise is not None,
     )
 
 
-def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
-    """The prediction that, where the control is NaN, keeps the mean and adds to the covariance."""
+def _predicting_gap(model: Model, gap_noise: Function, predict_driven: Function) -> Function:
+    """Make the prediction that, where the control is NaN, keeps the mean and adds the gap noise."""
     read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
 
     def predict(
@@ -177,15 +197,15 @@ def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> 
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         if not np.isnan(control[0]):
-            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+            return predict_driven(mean, covariance, control, duration_s, parameters, sample_index, work)
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
-        add(covariance, lost(read_state(mean), duration_s, parameters))
+        add(covariance, gap_noise(read_state(mean), duration_s, parameters))
         return True
 
     return predict
@@ -198,11 +218,11 @@ def _of_run(update: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Any,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return update(mean, covariance, data, parameters, gate, use, work, note)
+        return update(mean, covariance, data, parameters, gate, sample_index, work, record)
 
     return update_run
