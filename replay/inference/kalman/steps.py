@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     copy_gaussian,
     no_innovation,
 )
 from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
 
 FAILURES = (
@@ -33,7 +33,10 @@ NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Gaussian(NamedTuple):
-    """What is believed of the states, first axis = run: means (runs, n), covariances (runs, t, t)."""
+    """What is believed of the states, first axis = run: means (runs, n), covariances (runs, t, t).
+
+    What stands for the covariances is up to the filter, see `Steps.form`.
+    """
 
     mean: Floats
     covariance: Floats
@@ -52,6 +55,7 @@ class Steps(NamedTuple):
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
         resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
+        form: what stands for the covariances in beliefs; the estimates have the covariances themselves.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -60,6 +64,7 @@ class Steps(NamedTuple):
     estimate: Function
     sampled: tuple[int, ...] = ()
     resumes: bool = False
+    form: Form = COVARIANCES
 
 
 class Note(NamedTuple):
@@ -81,7 +86,8 @@ class Workspace(NamedTuple):
     Attributes:
         state: (n,), the moved state.
         transition: (t, t).
-        product: (t, t), after a prediction the covariance of the moved state with the one before.
+        product, rest: (t, t), after a prediction the covariance of the moved state with the one before,
+            and nothing; of a filter of factors, what `factors` needs to retrace it.
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
@@ -94,6 +100,7 @@ class Workspace(NamedTuple):
     state: Floats
     transition: Floats
     product: Floats
+    rest: Floats
     gain: Floats
     control_variance: Floats
     noise_gain: Floats
@@ -116,6 +123,7 @@ def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
         state=np.empty(model.size),
         transition=np.empty((t, t)),
         product=np.empty((t, t)),
+        rest=np.empty((t, t)),
         gain=np.empty((t, model.controls)),
         control_variance=np.empty(model.controls),
         noise_gain=np.empty((max(t, m), noises)),
@@ -137,15 +145,18 @@ def gaussian_filter(
     updates: tuple[Function, ...],
     memory: Callable[[tuple[Any, ...]], Any] | None = None,
     sampled: tuple[int, ...] = (),
+    form: Form = COVARIANCES,
+    lost_motion: Callable[[Stage], Function] | None = None,
 ) -> Steps:
     """The steps of a filter whose belief is one Gaussian.
 
     `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
-    one run's mean and covariance.
+    one run's mean and covariance, in this form; so does what `lost_motion` makes, where the control has
+    a gap.
     """
-    lost = stage.motion.lost
+    lost, to_covariance = stage.motion.lost, form.to_covariance
     if lost is not None:
-        predict = _predicting_lost(stage.model, lost, predict)
+        predict = _predicting_lost((lost_motion or keeping)(stage), predict)
 
     def predict_run(
         run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
@@ -156,6 +167,7 @@ def gaussian_filter(
     def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
         copy_gaussian(belief.mean[run], belief.covariance[run], mean, covariance)
+        to_covariance(covariance)
 
     return Steps(
         memory or (lambda _: workspace(stage)),
@@ -164,12 +176,12 @@ def gaussian_filter(
         estimate,
         sampled,
         resumes=lost is not None,
+        form=form,
     )
 
 
-def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> Function:
-    """The prediction that, where the control is NaN, keeps the mean and adds to the covariance."""
-    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+def _predicting_lost(predict_lost: Function, predict_driven: Function) -> Function:
+    """The prediction of one kind where the control is NaN, else of the other."""
 
     def predict(
         mean: Floats,
@@ -180,15 +192,35 @@ def _predicting_lost(model: Model, lost: Function, predict_driven: Function) -> 
         use: int,
         work: Workspace,
     ) -> bool:
-        if not np.isnan(control[0]):
-            return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+        if np.isnan(control[0]):
+            return predict_lost(mean, covariance, control, duration_s, parameters, use, work)
+        return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+
+    return predict
+
+
+def keeping(stage: Stage) -> Function:
+    """The prediction in a gap of the control: it keeps the mean and adds to the covariance."""
+    model, lost = stage.model, stage.motion.lost
+    assert lost is not None
+    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+
+    def keep(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        use: int,
+        work: Workspace,
+    ) -> bool:
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
         add(covariance, lost(read_state(mean), duration_s, parameters))
         return True
 
-    return predict
+    return keep
 
 
 def _of_run(update: Function) -> Function:

@@ -99,7 +99,8 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     n, t = stage.model.size, stage.model.tangent
     slots = len(slots_of(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    gather, mix = mixing(stage.model.kinds)
+    gather, mix = mixing(stage.model.kinds, inner.form)
+    to_covariance = inner.form.to_covariance
     predict_member = inner.predict
 
     def predict(
@@ -145,8 +146,10 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
         probability = belief.probability[run, :count]
         gather(mean, covariance, probability, memory)
-        likeliest = likeliest_of(probability)
-        if not cholesky(memory.factor, memory.carried[likeliest], t):
+        likeliest, factor = likeliest_of(probability), memory.factor
+        copy_gaussian(memory.centre, memory.carried[likeliest], memory.centre, factor)
+        to_covariance(factor)
+        if not cholesky(factor, factor, t):
             return
         apart = 0.0
         for each in range(count):
@@ -193,6 +196,7 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
             mixtures.probability[row, belief.member[run, each]] = probability[each]
         gather(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+        to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> Memory:
         notes = np.empty((members, slots)), np.empty((members, slots, slots)), np.empty((members, 3))
@@ -210,7 +214,7 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     updates = (
         of_run(weighed_update(stage, number, update)) for number, update in enumerate(inner.updates)
     )
-    return Steps(memory, predict, tuple(updates), estimate, inner.sampled, inner.resumes)
+    return inner._replace(memory=memory, predict=predict, updates=tuple(updates), estimate=estimate)
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
@@ -278,11 +282,12 @@ class Banked(Mixing):
             np.ones(runs, np.int64),
         )
         for run in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))).tolist():
-            parts = cut(self.stage.model.kinds, mean[run], covariance[run], members)
-            weights, means, narrow = parts
+            whole_prior = covariance[run].copy()
+            self.form.to_covariance(whole_prior)
+            weights, means, narrow = cut(self.stage.model.kinds, mean[run], whole_prior, members)
             member = np.flatnonzero(weights)
             count = len(member)
-            belief.mean[run, :count], belief.covariance[run] = means[member], narrow
+            belief.mean[run, :count], belief.covariance[run] = means[member], self.form.start(narrow)
             belief.probability[run, :count] = weights[member]
             belief.log_probability[run, :count] = np.log(weights[member])
             belief.member[run, :count], belief.left[run] = member, count

@@ -38,6 +38,7 @@ from replay.inference.kalman.methods import (
 )
 from replay.inference.kalman.steps import Gaussian, Note, Steps
 from replay.inference.kalman.update import noting, slots_of
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from replay.inference.linear_algebra.gaussian import keep_measured, whiten, wrap
 from replay.inference.linear_algebra.manifold import (
     differencing,
@@ -139,9 +140,11 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     modes, n, t = len(filters), model.size, model.tangent
     slots = len(slots_of(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    gather, mix = mixing(model.kinds)
+    form = filters[0].form
+    gather, mix = mixing(model.kinds, form)
     change, weigh, predict_modes = changing(modes), weighing(modes), predicting(filters)
     rates_of, fill_rates = switching.rates, filling(modes * (modes - 1))
+    to_covariance = form.to_covariance
 
     def predict(
         run: int,
@@ -170,6 +173,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             probability[mode] = belief.probability[run, mode]
         gather(belief.mean[run], belief.covariance[run], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+        to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> Memory:
         waiting = iter(sets)
@@ -211,7 +215,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
     resumes = all(each.resumes for each in filters)
-    return Steps(memory, predict, updates, estimate, sampled, resumes)
+    return Steps(memory, predict, updates, estimate, sampled, resumes, form)
 
 
 def predicting(filters: Sequence[Steps]) -> Function:
@@ -420,7 +424,7 @@ def weighing(modes: int) -> Function:
     return weigh
 
 
-def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
+def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, Function]:
     """`gather(mean, covariance, probability, memory)` and `mix(weights, memory, mean, covariance)`.
 
     The first carries the Gaussians of all modes to the tangent space of the likeliest; the second fills
@@ -428,7 +432,7 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
     """
     add, subtract, flat = retraction(kinds), differencing(kinds), is_flat(kinds)
     reset, reset_back = resetting(kinds), resetting(kinds, back=True)
-    n, t = len(kinds), tangent_size(kinds)
+    n, t, turn, mix_covariance = len(kinds), tangent_size(kinds), form.turn, form.mix
 
     def gather(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
         likeliest = likeliest_of(probability)
@@ -442,8 +446,7 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
                 for column in range(t):
                     carried[row, column] = covariance[mode, row, column]
             if not flat:
-                reset_back(away[mode], carried)
-                reset_back(away[mode], carried.T)
+                turn(reset_back, away[mode], carried)
 
     def mix(weights: Floats, memory: Any, mean: Floats, covariance: Floats) -> None:
         away, carried, shift = memory.away, memory.carried, memory.shift
@@ -452,19 +455,12 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
             for mode in range(len(weights)):
                 entry += weights[mode] * away[mode, row]
             shift[row] = entry
-        for row in range(t):
-            for column in range(row + 1):
-                entry = 0.0
-                for mode in range(len(weights)):
-                    spread = (away[mode, row] - shift[row]) * (away[mode, column] - shift[column])
-                    entry += weights[mode] * (carried[mode, row, column] + spread)
-                covariance[row, column] = covariance[column, row] = entry
+        mix_covariance(weights, away, shift, carried, covariance)
         for row in range(n):
             mean[row] = memory.centre[row]
         add(mean, shift)
         if not flat:
-            reset(shift, covariance)
-            reset(shift, covariance.T)
+            turn(reset, shift, covariance)
 
     return gather, mix
 

@@ -43,13 +43,13 @@ from replay.inference.linear_algebra.gaussian import (
     moved_covariance,
     multiply_into,
     reduce_covariance,
+    solve_semidefinite,
     whiten,
 )
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.stage import Stage
 from replay.inference.run.filtering import Filter, State
 from replay.inference.run.recursion import Carried, Estimates, Happenings, Innovations
-from replay.inference.smoothing.backward_pass import solve_semidefinite
 
 
 class BoundParameters(MethodParameters):
