@@ -5,11 +5,14 @@ Names are imported when they are first asked for, from the places that the stub 
 """
 
 import ast
+import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 _HERE = Path(__file__).parent
+_RENAMED = {"Told": "Diagnostics"}  # names of the release before
 
 
 def _names() -> dict[str, tuple[str, str]]:
@@ -42,6 +45,11 @@ __all__ = list(_NAMES)
 
 
 def __getattr__(name: str) -> Any:
+    if name in _RENAMED:
+        new = _RENAMED[name]
+        said = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
+        warnings.warn(said, FutureWarning, stacklevel=2)
+        return getattr(sys.modules[__name__], new)
     if name not in _NAMES:
         raise AttributeError(f"module 'fuselog' has no attribute '{name}'")
     module, there = _NAMES[name]

@@ -19,6 +19,7 @@ from pipeline.api import catalog
 from pipeline.api.catalog import Entry
 from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
+from pipeline.output.summary import summary_table
 from pipeline.runs.executors import crew_of, of_executor
 from pipeline.runs.experiment import (
     load_experiment,
@@ -27,7 +28,6 @@ from pipeline.runs.experiment import (
     require_campaign,
     run_experiment,
 )
-from pipeline.runs.summary import summary_table
 from pipeline.runs.sweeps import nested, over_of, points_of, run_sweep
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, open_log, write_log

@@ -18,11 +18,11 @@ from recorders.registry import available, load
 from replay.engine.replaying.estimator import Estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
+from replay.inference.formulas import formulas, formulas_by_function
 from replay.inference.model.binding import serving
-from replay.inference.model.formulas import formulas, formulas_by_function
-from replay.inference.model.model import Model, ModelParameters
-from replay.inference.model.parameters import number_fields
-from replay.inference.model.requirements import needs_of
+from replay.inference.model.model import Model
+from replay.inference.model.parameters import ModelParameters, number_fields
+from replay.inference.requirements import requirements_of
 from replay.judging.metrics.measuring import Metric
 
 
@@ -140,7 +140,7 @@ def _recorder(name: str, recorder: Recorder[Any]) -> Entry:
 
 
 def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
-    facts = {"needs": estimator.needs}
+    facts = {"needs": estimator.requirements}
     if estimator.variant:
         facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
     return Entry(name, estimator.summary, facts, estimator.parameters)
@@ -152,13 +152,13 @@ def _model(name: str, model: Model) -> Entry:
         of = f" of {', '.join(each.topic for each in sensor.maps)}" if sensor.maps else ""
         taken = " or ".join(serving(sensor.schema))
         facts[f"sensor {sensor.topic}"] = f"{_listed(sensor.measured)}{of} ({taken})"
-    for control in [model.control, *model.control.instead] if model.control else []:
+    for control in [model.control, *model.control.fallbacks] if model.control else []:
         facts[f"control {control.topic}"] = ", ".join(control.components)
     if model.modes:
         facts["modes"] = ", ".join(model.modes)
-    if model.estimable:
-        facts["estimable"] = _listed(model.estimable)
-    facts["needs"] = needs_of(model)
+    if model.augmentable:
+        facts["estimable"] = _listed(model.augmentable)
+    facts["needs"] = requirements_of(model)
     facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
     stated = own & {*number_fields(model.parameters)}

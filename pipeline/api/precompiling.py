@@ -20,7 +20,7 @@ from replay.inference.all_methods import METHODS, modelled
 from replay.inference.estimators import registered_models
 from replay.inference.model.binding import topics_of
 from replay.inference.model.model import Model
-from replay.inference.model.requirements import names_state
+from replay.inference.requirements import names_state
 
 USUAL = ("ekf", "ukf", "smoother:ekf")
 SHORT_S = (2.0, 12.0)  # the first that a scenario accepts

@@ -17,15 +17,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from pipeline.api import api as door
+from pipeline.api import api
 from pipeline.api.api import ResultFolder
 from pipeline.output.charts import draw
+from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import in_order, result_folder, write_outcome
-from pipeline.runs.coverage import coverage_table, sentences
-from pipeline.runs.ensemble import Pass, Settings, add_to_hash, cut_in_parts, judge_logs, replay_parts
+from pipeline.output.summary import error_charts, summarise, summary_table
+from pipeline.runs.ensemble import Pass, Settings, cut_in_parts, judge_logs, replay_parts
+from pipeline.runs.estimates import add_to_hash
 from pipeline.runs.initial_states import order_of, origins_of, span_of
-from pipeline.runs.summary import error_charts, summarise, summary_table
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, open_log, schemas
@@ -306,7 +307,7 @@ def _source(log: Log) -> LogSource | MemorySource:
     if isinstance(log, Recording):
         return memory_source(log, RunMetadata("recording", epoch_ns=log.epoch_ns, notes=dict(log.notes)))
     if isinstance(log, str | Path):
-        return door.open(log)
+        return api.open(log)
     raise BadInput(f"a log to replay is {type(log).__name__}; give a path, a log or a recording")
 
 

@@ -15,7 +15,7 @@ from pipeline.api.api import ResultFolder
 from pipeline.output.charts import Axis, Chart, Panel, curve, path, thinned
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.runs.summary import summary_table
+from pipeline.output.summary import summary_table
 from recorders.log import schemas
 from recorders.trajectories import Trajectory, read_trajectory
 from replay.engine.streams.sources import LogSource, Source
@@ -28,8 +28,8 @@ from replay.judging.errors.trajectories import (
     DeltaUnit,
     compare,
     trajectory_metrics,
-    trajectory_of,
 )
+from replay.judging.errors.trajectory_streams import trajectory_of
 from replay.judging.metrics.measuring import metric_key
 
 if TYPE_CHECKING:

@@ -5,14 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.checking.golden import (
-    Discrepancy,
-    Replayed,
-    Tolerances,
-    discrepancies,
-    first_of,
-    make,
-)
+from pipeline.checking.discrepancies import Discrepancy, discrepancies, first_of
+from pipeline.checking.golden import Replayed, Tolerances, make
 from pipeline.checking.stored import SUFFIX, Golden, read, write
 from pipeline.logs.folders import logs_in
 from pipeline.output.outputs import Kind, check_files

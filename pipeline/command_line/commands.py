@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.output.coverage import sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.output.results import (
     ErrorTables,
@@ -28,9 +29,8 @@ from pipeline.output.terminal import (
     say,
     warn,
 )
-from pipeline.runs.coverage import sentences
-from pipeline.runs.ensemble import cut_in_parts, hash_files, judge_logs, replay_parts
-from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.runs.ensemble import cut_in_parts, judge_logs, replay_parts
+from pipeline.runs.estimates import hash_files, log_of_estimates, stated_estimators
 from pipeline.runs.initial_states import check_same_run, order_of, origins_of, span_of
 from pipeline.runs.settings import settings_of_estimators, sigmas_of
 from recorders.atomic import scratch_folder
@@ -158,7 +158,7 @@ def evaluate_logs(
     are judged in their alignment with the truth.
     """
     from pipeline.api.trajectories import ComparedLogs, compare_logs
-    from pipeline.runs.summary import summarise, summary_table
+    from pipeline.output.summary import summarise, summary_table
     from replay.judging.errors.trajectories import Comparison
 
     if errors and out is None:

@@ -23,7 +23,7 @@ from pipeline.command_line.recording import say_written
 from recorders.errors import BadInput, printable
 
 if TYPE_CHECKING:
-    from pipeline.logs.edit import Changed
+    from pipeline.logs.rewriting import Changed
 
 
 @command(

@@ -1,7 +1,7 @@
 """Comparing estimators: paired differences of every metric over the same runs, with a verdict each."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -11,24 +11,17 @@ import numpy as np
 import pandas as pd
 
 from pipeline.api.api import ResultFolder
-from pipeline.api.replays import Kind, replay
-from pipeline.comparing.sides import (
-    Given,
-    Side,
-    name_of,
-    of_estimates,
-    of_replay,
-    of_result,
-    of_trajectory,
-)
+from pipeline.api.replays import Kind
+from pipeline.comparing.groups import comparable_groups, runs_of, sides_of, unlike_runs
+from pipeline.comparing.sides import Side
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
-from pipeline.output.results import RESULT_FILE, Outcome, result_folder, write_outcome
-from pipeline.runs.ensemble import Progress, hash_files, judge_logs, no_progress
-from recorders.errors import BadInput, choices, some_of
-from recorders.log import NotMcap, RunMetadata, open_log, schemas
-from recorders.trajectories import read_trajectory
-from replay.engine.streams.sources import LogSource, MemorySource, Source
+from pipeline.output.results import Outcome, result_folder, write_outcome
+from pipeline.runs.ensemble import Progress, judge_logs, no_progress
+from pipeline.runs.estimates import hash_files
+from recorders.errors import BadInput
+from recorders.log import RunMetadata
+from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.differences import (
     FEWEST_RUNS,
     NATS,
@@ -37,13 +30,10 @@ from replay.judging.errors.differences import (
     aim_of,
     paired_difference,
 )
-from replay.judging.errors.trajectories import truth_of
 
 MARGIN = 0.02
 # The differences over time have at most so many spans.
 SPANS = 32
-# So many settings that differ are named.
-NAMED = 8
 ALL = "all"
 
 
@@ -78,10 +68,10 @@ class Paired(NamedTuple):
         if found.runs < FEWEST_RUNS and np.isnan(found.low):
             return (
                 f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
-                f"and this is of {_runs(found.runs)}"
+                f"and this is of {runs_of(found.runs)}"
             )
         interval = f"difference {found.difference:.3g}, 95 % from {found.low:.3g} to {found.high:.3g}"
-        margin = f"{_runs(found.runs)}, margin {found.margin:.3g}"
+        margin = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
         verdict = f"{self.second} is {found.verdict} than {self.first}"
         if found.verdict == "unclear":
             verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
@@ -89,10 +79,6 @@ class Paired(NamedTuple):
             verdict = f"no difference beyond the margin between {self.second} and {self.first}"
         when = f"; most from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
         return f"{self.quantity}{of}: {verdict}: {values}; {interval} ({margin}){when}"
-
-
-def _runs(count: int) -> str:
-    return "1 run" if count == 1 else f"{count} runs"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -266,14 +252,14 @@ def compare(
     paths = [Path(side) for side in sides]
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
-    givens = _given(paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover)
-    groups = list(_groups(givens, [label for each in estimators for label in _labels(each)]))
+    givens = sides_of(paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover)
+    groups = list(comparable_groups(givens, [label for each in estimators for label in _labels(each)]))
     notes = [note for group in groups for side in group for note in side.notes]
     paired: list[Paired] = []
     times: list[pd.DataFrame] = []
     for group in groups:
         for second in group[1:]:
-            notes += _unlike(group[0], second)
+            notes += unlike_runs(group[0], second)
             found, over_time = _compared(group[0], second, margin, notes)
             paired += found
             times.append(over_time)
@@ -284,152 +270,6 @@ def compare(
 
 def _labels(each: str | Mapping[str, Kind]) -> list[str]:
     return [each] if isinstance(each, str) else list(each)
-
-
-def _given(
-    paths: Sequence[Path],
-    estimators: Sequence[str | Mapping[str, Kind]],
-    truth: str | Path | None,
-    case: str | None,
-    progress: Progress,
-    *,
-    gap_limit_s: float,
-    recover: bool,
-) -> list[Given]:
-    """What every path stands for; logs without estimates are replayed together."""
-    kinds = [_kind_of(path, recover=recover) for path in paths]
-    logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
-    if logs and len(logs) < len(paths):
-        raise BadInput(f"{logs[0]}: is a log without estimates; make them with fuselog replay")
-    if logs:
-        if not estimators:
-            raise BadInput(f"{logs[0]}: is a log without estimates; name two estimators: -e ekf -e ukf")
-        done = replay(
-            [LogSource(open_log(path, recover=recover)) for path in logs],
-            estimators,
-            gap_limit_s=gap_limit_s,
-        )
-        return [of_replay(name_of(logs[0]), done, gap_limit_s)]
-    found: dict[int, Given] = {}
-    for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
-        if kind == "result":
-            found[number] = of_result(path, progress)
-        elif kind == "estimates":
-            found[number] = of_estimates(path, gap_limit_s, recover=recover)
-    if len(found) < len(paths):
-        source = _true_source(truth, list(found.values()))
-        topic = _truth_topic(source, case)
-        for number, path in enumerate(paths):
-            if number not in found:
-                found[number] = of_trajectory(path, source, topic, gap_limit_s)
-    return [found[number] for number in range(len(paths))]
-
-
-def _kind_of(path: Path, *, recover: bool) -> str:
-    if path.is_dir():
-        return "result" if (path / RESULT_FILE).is_file() else "estimates"
-    try:
-        log = open_log(path, recover=recover)
-    except NotMcap:
-        return "trajectory"
-    return "estimates" if any(topic.startswith("/estimates/") for topic in log.topics) else "log"
-
-
-def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
-    """The run that trajectories are of: that of the other sides, or the true trajectory alone."""
-    if truth is not None:
-        trajectory = read_trajectory(truth)
-        stream = truth_of(trajectory, "/truth")
-        epoch_ns = int(stream.publish_time_ns[0])
-        return MemorySource({"/truth": stream}, RunMetadata("trajectory", epoch_ns=epoch_ns), str(truth))
-    sources = {run: source for each in others for run, source in each.sources.items()}
-    if len(sources) != 1:
-        raise BadInput(
-            "a trajectory file has one run: compare it with the estimates log of that run, or give "
-            "the true trajectory with --truth"
-        )
-    return next(iter(sources.values()))
-
-
-def _truth_topic(source: Source, case: str | None) -> str:
-    truths = {
-        topic.rpartition("/")[0].removeprefix("/"): topic
-        for topic, each in source.topics.items()
-        if each.schema_name == schemas.TRUTH_STATE.full_name
-    }
-    if case is None and len(truths) == 1:
-        return next(iter(truths.values()))
-    if case not in truths:
-        known = some_of(truths) or "none"
-        raise BadInput(
-            f"{source.name}: name with --case the truth that trajectories are judged by: {known}"
-        )
-    return truths[case]
-
-
-def _groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Side]]:
-    """The sides to compare: the estimators of one thing, or each estimator of several things."""
-    for each in givens:
-        for label in labels:
-            if label not in each.labels and (len(each.labels) > 1 or len(givens) == 1):
-                raise BadInput(f"{each.name}: no estimates of {label}; {choices(label, each.labels)}")
-    if len(givens) == 1:
-        chosen = list(labels) or list(givens[0].labels)
-        if len(chosen) < 2:
-            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give another side to compare with")
-        yield [givens[0].side(label, label) for label in chosen]
-        return
-    names = _distinct([each.name for each in givens])
-    common = list(labels) or [x for x in givens[0].labels if all(x in each.labels for each in givens)]
-    if not common and all(len(each.labels) == 1 for each in givens):
-        yield [each.side(each.labels[0], name) for each, name in zip(givens, names, strict=True)]
-        return
-    if not common:
-        told = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
-        raise BadInput(f"the sides have no estimator in common: {told}; name those to compare with -e")
-    for label in common:
-        suffix = f":{label}" if len(common) > 1 else ""
-        yield [
-            each.side(label if label in each.labels else each.labels[0], name + suffix)
-            for each, name in zip(givens, names, strict=True)
-        ]
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """The names, numbered where two are the same."""
-    return [
-        f"{name}-{number}" if names.count(name) > 1 else name for number, name in enumerate(names, 1)
-    ]
-
-
-def _unlike(first: Side, second: Side) -> Iterator[str]:
-    """A sentence for what two sides do not share; raises BadInput where that is everything."""
-    runs = [list(dict.fromkeys(side.rows["run"])) for side in (first, second)]
-    common = [run for run in runs[0] if run in set(runs[1])]
-    if not common:
-        told = " and ".join(f"{each[0]}" if each else "nothing" for each in runs)
-        raise BadInput(
-            f"{first.name} and {second.name} have no run in common: they begin with {told}; compare "
-            "estimates of the same runs"
-        )
-    for side, own in zip((first, second), runs, strict=True):
-        alone = [run for run in own if run not in set(common)]
-        if alone:
-            yield f"only {side.name} has {_runs(len(alone))}, left out: {', '.join(alone[:3])}" + (
-                ", ..." if len(alone) > 3 else ""
-            )
-    judged = [run for run in common if run in first.truths and run in second.truths]
-    apart = [run for run in judged if first.truths[run] != second.truths[run]]
-    if apart:
-        yield f"{first.name} and {second.name} have different truths in {_runs(len(apart))}: {apart[0]}"
-    missing = "not stated"
-    names = dict.fromkeys([*first.settings, *second.settings])
-    values = {name: [side.settings.get(name, missing) for side in (first, second)] for name in names}
-    differing = [f"{name} {a} and {b}" for name, (a, b) in values.items() if a != b]
-    if differing:
-        more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
-        what = ", ".join(differing[:NAMED])
-        yield f"settings differ between {first.name} and {second.name}: {what}{more}"
 
 
 def _compared(
@@ -454,7 +294,7 @@ def _compared(
         rows = known[known["quantity"] == quantity]
         missing = len(set(both["run"])) - len(set(rows["run"]))
         if missing:
-            notes.append(f"{quantity}: {_runs(missing)} without it are left out")
+            notes.append(f"{quantity}: {runs_of(missing)} without it are left out")
         scale = NATS if quantity == "log_likelihood" else None
         cases = list(dict.fromkeys(rows["case"]))
         sizes = {first.sizes.get((quantity, case), aim_of(quantity)) for case in cases}

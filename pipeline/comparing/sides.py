@@ -28,7 +28,7 @@ from recorders.trajectories import read_trajectory
 from replay.engine.replaying.estimator import configure
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.errors.evaluation import POSITION, split_topic
-from replay.judging.errors.trajectories import estimates_of
+from replay.judging.errors.trajectory_streams import estimates_of
 from replay.judging.metrics.measuring import find_metrics
 from replay.judging.metrics.metrics import rmse_of
 from replay.judging.tables import joined

@@ -30,9 +30,9 @@ from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
-from pipeline.runs.summary import summarise, summary_table
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Schema, Stream, schemas
 from recorders.parameters import merge
@@ -333,7 +333,7 @@ def _first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> tuple[MemorySource, list[str]]:
     """What the estimator reads of a log, of a long one its first MOST_MESSAGES, in memory."""
-    topics = dict.fromkeys([*streamed, *(topic for each in bound for topic in each.whole)])
+    topics = dict.fromkeys([*streamed, *(topic for each in bound for topic in each.static)])
     streams = source.read([topic for topic in topics if topic in source.topics])
     stamps_ns = np.concatenate([streams[topic].publish_time_ns for topic in streamed])
     notes = []

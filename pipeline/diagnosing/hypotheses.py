@@ -126,7 +126,7 @@ def _noises(command: str, bound: Sequence[Bound], source: MemorySource) -> Itera
     parameters = bound[0].parameters
     if parameters is None:
         return
-    read = [source.topics[topic] for each in bound for topic in (*each.streams, *each.whole)]
+    read = [source.topics[topic] for each in bound for topic in (*each.streams, *each.static)]
     for name in type(parameters).model_fields:
         value = _noise_of(parameters, name, read)
         if value is None:
@@ -370,7 +370,7 @@ def _exchanges(
     maps = {
         topic: field.name
         for each in bound
-        for topic in each.whole
+        for topic in each.static
         if topic in source.streams
         for field in source.streams[topic].schema
         if field.kind == "identifier" and topic not in each.priors

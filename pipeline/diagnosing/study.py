@@ -18,7 +18,7 @@ from pipeline.diagnosing.hypotheses import Kind
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from recorders.parameters import merge
 from recorders.recording import record_run

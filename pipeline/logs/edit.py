@@ -1,42 +1,37 @@
-"""Log surgery: a log cut, constrained, several merged into one, topics and components renamed.
+"""Edits logs: a log cut, constrained, several merged into one, topics and components renamed.
 
 Logs go through block by block, so that memory does not grow with them, into a new log that says in its
 metadata what was done. No log is changed.
 """
 
-import math
-import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
 
 from pipeline.logs.constraints import ConstraintParameters, constraints_of
-from pipeline.output.outputs import CHANGED_BY, CHANGES, changed, check_files
+from pipeline.logs.cutting import Thinner, is_prior, said_once, thinner
+from pipeline.logs.rewriting import (
+    Blocks,
+    Changed,
+    joined_runs,
+    losses_of,
+    matching_topics,
+    ranked,
+    readable_log,
+    run_of,
+    stream_blocks,
+    with_operation,
+    write_changed,
+)
+from pipeline.output.outputs import changed, check_files
 from pipeline.runs.initial_states import span_of
 from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import Log, LogWriter, RunMetadata, Stream, open_log, read_blocks, read_empty, schemas
-from recorders.log.container.sealed import OWN_NAMES
-from recorders.log.schemas import SCHEMAS, message_class
+from recorders.log import Log, Stream, open_log, read_empty, schemas
+from recorders.log.schemas import SCHEMAS
 from recorders.parameters import build
 from replay.engine.streams.sources import LogSource
-
-Blocks = Iterator[list[Stream]]
-# The scenario of a log that does not name one, as estimates of such a log have it.
-UNKNOWN = "unknown"
-
-
-class Changed(NamedTuple):
-    """The log that was written, how many messages each topic has there, and what else is to be said."""
-
-    path: Path
-    messages: dict[str, int]
-    notes: list[str]
 
 
 def cut(
@@ -75,18 +70,18 @@ def cut(
     """
     log, target = open_log(path, recover=recover), Path(out)
     check_files([(target, changed("cut"))], {"log": [log.path]})
-    notes = _losses(log)
+    notes = losses_of(log)
     source = span_of(LogSource(log), start_s, end_s, "publish_time")
-    chosen = _readable(log, _matched(log, topics), notes, asked=topics)
+    chosen = readable_log(log, matching_topics(log, topics), notes, asked=topics)
     zero_ns = source.zero_ns("publish_time")
-    thinners: dict[str, _Thinner] = {}
+    thinners: dict[str, Thinner] = {}
     for pattern, rate in (decimate or {}).items():
-        for topic in _matched(log, [pattern]):
-            thinners[topic] = _thinner(pattern, rate, zero_ns)
-    once = [] if source.start_ns is source.end_ns is None else _said_once(log, chosen)
+        for topic in matching_topics(log, [pattern]):
+            thinners[topic] = thinner(pattern, rate, zero_ns)
+    once = [] if source.start_ns is source.end_ns is None else said_once(log, chosen)
     if once:
         notes.append(f"kept whole, whatever the span: {', '.join(once)}")
-    if start_s is not None and any(_is_prior(log, topic) for topic in once):
+    if start_s is not None and any(is_prior(log, topic) for topic in once):
         notes.append(
             f"the prior is older than this part: replay it with --start {start_s:g} --start-from truth, "
             "or from the estimates of an earlier replay"
@@ -95,10 +90,10 @@ def cut(
     def blocks() -> Blocks:
         start_ns, end_ns = source.start_ns, source.end_ns
         if start_ns is not None:
-            yield from _blocks(log, once, None, start_ns)
-        yield from _blocks(log, chosen, start_ns, end_ns)
+            yield from stream_blocks(log, once, None, start_ns)
+        yield from stream_blocks(log, chosen, start_ns, end_ns)
         if end_ns is not None:
-            yield from _blocks(log, once, end_ns, None)
+            yield from stream_blocks(log, once, end_ns, None)
 
     thinned = (
         [thinners[each.topic].thin(each) if each.topic in thinners else each for each in block]
@@ -111,8 +106,8 @@ def cut(
         "decimated": " ".join(f"{name}={rate}" for name, rate in (decimate or {}).items()) or None,
     }
     done = " ".join(["cut", log.path.name, *(f"{key} {value}" for key, value in asked.items() if value)])
-    run = _told(_moved(log, target), "cut", done)
-    return _write(target, run, [read_empty(log, topic) for topic in chosen], thinned, notes)
+    run = with_operation(run_of(log, target), "cut", done)
+    return write_changed(target, run, [read_empty(log, topic) for topic in chosen], thinned, notes)
 
 
 def merge(
@@ -151,8 +146,8 @@ def merge(
     logs = [open_log(path, recover=recover) for path in paths]
     check_files([(target, changed("merge"))], {"log": [log.path for log in logs]})
     offsets_ns = _offsets_ns(logs, offsets_s or {})
-    notes = [note for log in logs for note in _losses(log)]
-    chosen = [_readable(log, _ranked(log), notes) for log in logs]
+    notes = [note for log in logs for note in losses_of(log)]
+    chosen = [readable_log(log, ranked(log), notes) for log in logs]
     holder: dict[str, Path] = {}
     for log, names in zip(logs, chosen, strict=True):
         common = [name for name in names if name in holder]
@@ -165,15 +160,15 @@ def merge(
     blocks = (
         [_shifted(stream, offset_ns) for stream in block]
         for log, names, offset_ns in zip(logs, chosen, offsets_ns, strict=True)
-        for block in _blocks(log, names)
+        for block in stream_blocks(log, names)
     )
     empty = [read_empty(log, name) for log, names in zip(logs, chosen, strict=True) for name in names]
     told = [
         f"{log.path.name}{f' {offset_ns * 1e-9:+g} s' if offset_ns else ''}"
         for log, offset_ns in zip(logs, offsets_ns, strict=True)
     ]
-    run = _told(_joined(logs, offsets_ns, target), "merge", f"merged {', '.join(told)}")
-    return _write(target, run, empty, blocks, notes)
+    run = with_operation(joined_runs(logs, offsets_ns, target), "merge", f"merged {', '.join(told)}")
+    return write_changed(target, run, empty, blocks, notes)
 
 
 def relabel(
@@ -205,8 +200,8 @@ def relabel(
         raise BadInput(f"{log.path}: nothing to rename; give a topic or a component")
     names = _renamed_topics(log, topics or {})
     _check_components(log, components or {})
-    notes = _losses(log)
-    chosen = _readable(log, _ranked(log), notes)
+    notes = losses_of(log)
+    chosen = readable_log(log, ranked(log), notes)
 
     def renamed(stream: Stream) -> Stream:
         metadata = {key: names.get(value, value) for key, value in stream.metadata.items()}
@@ -215,10 +210,12 @@ def relabel(
             metadata["components"] = ",".join((components or {}).get(name, name) for name in known)
         return replace(stream, topic=names.get(stream.topic, stream.topic), metadata=metadata)
 
-    blocks = ([renamed(stream) for stream in block] for block in _blocks(log, chosen))
+    blocks = ([renamed(stream) for stream in block] for block in stream_blocks(log, chosen))
     pairs = [f"{old}={new}" for old, new in {**(topics or {}), **(components or {})}.items()]
-    run = _told(_moved(log, target), "relabel", f"relabelled {log.path.name} {' '.join(pairs)}")
-    return _write(target, run, [renamed(read_empty(log, topic)) for topic in chosen], blocks, notes)
+    run = with_operation(run_of(log, target), "relabel", f"relabelled {log.path.name} {' '.join(pairs)}")
+    return write_changed(
+        target, run, [renamed(read_empty(log, topic)) for topic in chosen], blocks, notes
+    )
 
 
 def constrain(
@@ -253,17 +250,17 @@ def constrain(
             raise BadInput(
                 f"{log.path}: has a topic {stream.topic} already; rename it first with fuselog relabel"
             )
-    notes = _losses(log)
+    notes = losses_of(log)
     for stream in added:
         told, total = int(stream["value"].sum()), len(stream)
         notes.append(f"{stream.topic}: holds at {told} of {total} stamps")
-    chosen = _readable(log, _ranked(log), notes)
+    chosen = readable_log(log, ranked(log), notes)
     empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
     names = " ".join(stream.topic for stream in added)
-    run = _told(
-        _moved(log, target), "constrain", f"constrained {log.path.name} by {chosen_unit}: {names}"
+    run = with_operation(
+        run_of(log, target), "constrain", f"constrained {log.path.name} by {chosen_unit}: {names}"
     )
-    return _write(target, run, empty, chain(_blocks(log, chosen), [added]), notes)
+    return write_changed(target, run, empty, chain(stream_blocks(log, chosen), [added]), notes)
 
 
 def _unit_of(log: Log, unit: str | None) -> str:
@@ -279,168 +276,6 @@ def _unit_of(log: Log, unit: str | None) -> str:
     if unit is not None and unit not in units:
         raise UnknownName(f"{log.path}: no inertial unit {unit}; {choices(unit, units)}")
     return unit or units[0]
-
-
-def _blocks(
-    log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
-) -> Blocks:
-    """Blocks of a span, each with its streams in the order of `topics`, which settles ties."""
-    for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
-        yield [block[topic] for topic in topics if topic in block]
-
-
-def _write(
-    target: Path,
-    run: RunMetadata,
-    empty: Sequence[Stream],
-    blocks: Iterable[list[Stream]],
-    notes: list[str],
-) -> Changed:
-    """Write the log; topics without messages are in it, as they were."""
-    messages = Counter({stream.topic: 0 for stream in empty})
-    with LogWriter(target, run) as writer:
-        writer.write(empty)
-        for block in blocks:
-            writer.write(block)
-            messages.update({stream.topic: len(stream) for stream in block})
-    return Changed(target, dict(messages), notes)
-
-
-def _ranked(log: Log) -> list[str]:
-    """The topics in the order in which the log declares them: so its writer ordered equal stamps."""
-    return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
-
-
-def _matched(log: Log, patterns: Sequence[str]) -> list[str]:
-    """The topics that are named, or match a pattern; all where there are none."""
-    for pattern in patterns:
-        if not any(fnmatchcase(topic, pattern) for topic in log.topics):
-            raise UnknownName(f"{log.path}: no topic {pattern}; {choices(pattern, log.topics)}")
-    return [
-        topic
-        for topic in _ranked(log)
-        if not patterns or any(fnmatchcase(topic, pattern) for pattern in patterns)
-    ]
-
-
-def _losses(log: Log) -> list[str]:
-    """What is missing from a log, or is in it beside its topics and is not carried over."""
-    foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
-    losses = [log.loss_statement] if log.loss_statement else []
-    if log.companions:
-        losses.append(
-            f"{log.path}: the companions for viewers are left out; to have them of the new log: "
-            "fuselog export LOG --to foxglove"
-        )
-    if foreign:
-        losses.append(
-            f"{log.path}: metadata of other programs is left out: {', '.join(sorted(foreign))}"
-        )
-    if attachments := log.container.attachments:
-        losses.append(
-            f"{log.path}: attachments, which fuselog does not read, are left out: "
-            f"{len(attachments)} ({', '.join(attachments)})"
-        )
-    return losses
-
-
-def _readable(log: Log, topics: Sequence[str], notes: list[str], asked: Sequence[str] = ()) -> list[str]:
-    """The topics that are columns; the messages and fields that are left out are noted.
-
-    Raises BadInput where a topic that is asked for by name, or every topic, is none.
-    """
-    chosen = []
-    for topic in topics:
-        stated = log.topics[topic]
-        try:
-            schema = read_empty(log, topic).schema
-        except BadInput as error:
-            if topic in asked:
-                raise
-            notes.append(f"{error}; its {stated.messages} messages are left out")
-            continue
-        chosen.append(topic)
-        described = log.container.schemas[log.container.channels[stated.channel_ids[0]].schema_id]
-        fields = message_class(described.data, described.name).DESCRIPTOR.fields
-        left_out = {field.name for field in fields} - {field.name for field in schema}
-        if left_out:
-            notes.append(
-                f"{log.path}: topic {topic}: fields that make no columns are left out: "
-                f"{', '.join(sorted(left_out))}"
-            )
-    if not chosen:
-        raise BadInput(
-            f"{log.path}: has no topic that fuselog reads; import it first, logs of ROS with: "
-            f"fuselog import ros {log.path}"
-        )
-    return chosen
-
-
-def _said_once(log: Log, topics: Sequence[str]) -> list[str]:
-    """Maps, priors, and topics all of whose messages have the first stamp of the log."""
-    first_ns, _ = LogSource(log).extent("publish_time")
-    early: Counter[str] = Counter()
-    for block in _blocks(log, topics, None, first_ns + 1):
-        early.update({stream.topic: len(stream) for stream in block})
-    return [
-        topic
-        for topic in topics
-        if (stated := log.topics[topic]).messages
-        and (
-            stated.schema_name == schemas.LANDMARK.full_name
-            or _is_prior(log, topic)
-            or stated.messages == early[topic]
-        )
-    ]
-
-
-def _is_prior(log: Log, topic: str) -> bool:
-    schema = log.topics[topic].schema_name
-    return schema == schemas.GAUSSIAN_ESTIMATE.full_name and not topic.startswith("/estimates/")
-
-
-@dataclass
-class _Thinner:
-    """Keeps the first stamp of every interval: so many stamps, or so much time.
-
-    `stamps` counts those that came before, `last` is the interval of the latest of them.
-    """
-
-    every: int = 0
-    rate_hz: float = 0.0
-    zero_ns: int = 0
-    stamps: int = 0
-    last: int | None = None
-
-    def thin(self, stream: Stream) -> Stream:
-        """What stays of the next block of the topic, which is not empty."""
-        times_ns, row = np.unique(stream.publish_time_ns, return_inverse=True)
-        if self.every:
-            interval = (self.stamps + np.arange(len(times_ns))) // self.every
-        else:  # stamps are rounded to nanoseconds
-            interval = np.floor((times_ns - self.zero_ns + 1) * (self.rate_hz * 1e-9)).astype(np.int64)
-        is_first = np.append(self.last is None or interval[0] != self.last, np.diff(interval) != 0)
-        self.stamps += len(times_ns)
-        self.last = int(interval[-1])
-        return stream.take(is_first[row])
-
-
-def _thinner(topic: str, rate: int | str, zero_ns: int) -> _Thinner:
-    """What thins a topic as `rate` says: 10 for every tenth stamp, "5Hz" for five a second."""
-    text = str(rate)
-    try:
-        if text.lower().endswith("hz"):
-            rate_hz = float(text[:-2])
-            if 0 < rate_hz < math.inf:
-                return _Thinner(rate_hz=rate_hz, zero_ns=zero_ns)
-        elif int(text) > 0:
-            return _Thinner(every=int(text))
-    except ValueError:
-        pass
-    raise BadInput(
-        f"decimate {topic}={text}: expected a whole number, such as 10 for every tenth stamp, or a "
-        "rate, such as 5Hz"
-    )
 
 
 def _offsets_ns(logs: Sequence[Log], offsets_s: Mapping[str, float]) -> list[int]:
@@ -526,34 +361,3 @@ def _check_components(log: Log, components: Mapping[str, str]) -> None:
             raise BadInput(
                 f"{log.path}: topic {topic} would have two components {twice[0]}; give another name"
             )
-
-
-def _moved(log: Log, target: Path) -> RunMetadata:
-    """The log's run, with the place of the log that estimates are of as it is seen from the target."""
-    run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
-    if "log" not in run.notes:
-        return run
-    place = os.path.relpath((log.path.parent / run.notes["log"]).resolve(), target.resolve().parent)
-    return replace(run, notes={**run.notes, "log": place})
-
-
-def _joined(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
-    """What the logs say of their run if they are of one, else only their notes, all of them."""
-    runs = [_moved(log, target) for log in logs]
-    notes: dict[str, str] = {}
-    for log, run in zip(logs, runs, strict=True):
-        for subject, fact in run.notes.items():
-            if subject == CHANGED_BY:
-                continue
-            is_new = notes.get(subject, fact) == fact
-            notes[subject if is_new else f"{subject} ({log.path.name})"] = fact
-    first, *others = (replace(run, notes=notes) for run in runs)
-    if all(other == first for other in others) and not any(offsets_ns):
-        return first
-    return RunMetadata(UNKNOWN, epoch_ns=max(0, first.epoch_ns + offsets_ns[0]), notes=notes)
-
-
-def _told(run: RunMetadata, command: str, done: str) -> RunMetadata:
-    """The run, with what a command did to its log, after what was done before."""
-    before = [run.notes[CHANGES]] if CHANGES in run.notes else []
-    return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done]), CHANGED_BY: command})

@@ -16,7 +16,7 @@ from recorders.atomic import whole_file, whole_folder
 from recorders.errors import BadInput, UnknownName, choices, some_of
 from recorders.log import Log, LogWriter, Stream, open_log, read_blocks, read_empty, schemas
 from recorders.trajectories import Trajectory, kitti_lines, tum_lines
-from replay.judging.errors.trajectories import trajectory_of
+from replay.judging.errors.trajectory_streams import trajectory_of
 
 To = Literal["tum", "kitti", "mot", "csv", "parquet", "foxglove"]
 SUFFIXES: dict[To, str] = {

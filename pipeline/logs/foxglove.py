@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from recorders.log import Companion, Stream, schemas
 from replay.engine.streams.measurements import PLANE, covariances_of
 from replay.judging.errors.evaluation import Floats
-from replay.judging.errors.trajectories import trajectory_of
+from replay.judging.errors.trajectory_streams import trajectory_of
 from replay.timeline.drawing.canvas import PALETTE, TRUTH
 from replay.timeline.drawing.plane import ellipses
 

@@ -20,7 +20,7 @@ from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model.binding import topics_of
 from replay.inference.model.model import Model
-from replay.inference.model.requirements import OWN_MODEL, names_state, nearest, nearest_parts
+from replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
 
 def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
@@ -90,7 +90,7 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
                 bound[name] = bind_model(name, topics, parameters, model=model, method=method)
             except BadInput as error:
                 lacks.append(str(error).removeprefix(f"estimator {name}: "))
-    used = (topic for each in bound.values() for one in each for topic in (*one.whole, *one.streams))
+    used = (topic for each in bound.values() for one in each for topic in (*one.static, *one.streams))
     return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
 
 

@@ -3,44 +3,35 @@
 Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """
 
-import hashlib
 import json
 import os
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
-
-from pipeline.runs.coverage import rows_of, untaken
+from pipeline.output.coverage import rows_of, untaken
 from pipeline.runs.initial_states import Origin, start_from
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, LogWriter, RunMetadata
-from recorders.recording import record_run
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.late import Late
 from replay.engine.replaying.replaying import BLOCK_MESSAGES, Report, collect, replay
 from replay.engine.replaying.usage import Row, Usage
 from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Ensemble, MemorySource, Source, ensemble_of, memory_source
-from replay.judging.errors.evaluation import Errors, Innovations, errors_at, split_topic
-from replay.judging.judge import TIME_BINS, Judge
-from replay.judging.metrics.measuring import Metric, Output, find_metrics, measure, plus
-from replay.judging.sets.errors import SetErrors
+from replay.engine.streams.sources import Source, ensemble_of
+from replay.judging.errors.evaluation import Errors, errors_at
+from replay.judging.judge import Judge
+from replay.judging.metrics.measuring import Metric, find_metrics, plus
 
 if TYPE_CHECKING:
     from replay.timeline.show import Drawing
 
 # Every run of an ensemble has up to three files open while it is replayed from logs; systems allow 1024.
 RUNS_AT_ONCE = 128
-# Of a run that was judged, so much is kept at least: its sums over time.
-KEPT_BYTES = 8 * TIME_BINS
 
 Item = TypeVar("Item")
 Settings = Mapping[str, Mapping[str, Any]]
@@ -283,7 +274,7 @@ def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str
     for each in bound:
         own = found.setdefault(each.name.partition("/")[0], {})
         values = each.parameters.model_dump() if each.parameters is not None else {}
-        for topic in (*each.streams, *each.whole):
+        for topic in (*each.streams, *each.static):
             metadata = source.topics[topic].metadata if topic in source.topics else {}
             for name in (name for name, value in values.items() if value is None and name in metadata):
                 own.setdefault(name, {}).setdefault(metadata[name], topic)
@@ -373,119 +364,6 @@ def judge_logs(
     return whole
 
 
-@dataclass(frozen=True)
-class Replayed:
-    """An ensemble in memory, what the estimators made of it, and how that compares with the truth."""
-
-    sources: Sequence[MemorySource]
-    outputs: dict[str, Ragged]
-    errors: list[Errors]
-    innovations: list[Innovations]
-    sets: list[SetErrors]
-
-    @property
-    def judged(self) -> list[Errors | Innovations | SetErrors | Output]:
-        """All that metrics may judge."""
-        outputs = [
-            Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
-            for topic, rows in self.outputs.items()
-        ]
-        return [*self.errors, *self.innovations, *self.sets, *outputs]
-
-    def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
-        """The metrics of these names, of all where none is given; see `measure`."""
-        return measure(self.judged, find_metrics(names))
-
-
-def record_ensemble(
-    scenario: str,
-    parameters: Mapping[str, Any],
-    seed: int,
-    runs: int,
-    progress: Progress = no_progress,
-    executor: Executor | None = None,
-    first_run: int = 0,
-    all_runs: int = 0,
-) -> Ensemble[MemorySource]:
-    """Record so many runs of a scenario, each from its own random stream of `seed`.
-
-    Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
-    where there are more.
-    """
-    record = partial(_record, scenario, dict(parameters), seed)
-    begin_s = time.perf_counter()
-    first = record(first_run)
-    took_s = time.perf_counter() - begin_s
-    # replay lays the runs end to end, which holds every column twice; estimates come on top
-    need_bytes = max(2 * runs * _size(first), all_runs * KEPT_BYTES)
-    all_runs = max(runs, all_runs)
-    require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
-    numbers = range(first_run + 1, first_run + runs)
-    others = executor.map(record, numbers) if executor else map(record, numbers)
-    return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
-
-
-def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
-    """Raise BadInput with what something takes, where that is more memory than is free."""
-    time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
-    import psutil  # which takes long to import
-
-    there_bytes = psutil.virtual_memory().available
-    if need_bytes > there_bytes:
-        need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))
-        raise BadInput(
-            f"{what} take at least {need} of memory, where {there} are free{time_too}; "
-            "ask for fewer runs or shorter ones"
-        )
-
-
-def _size(source: MemorySource) -> int:
-    """Bytes of all columns of a run."""
-    return sum(
-        column.nbytes
-        for stream in source.streams.values()
-        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
-    )
-
-
-def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:
-    return memory_source(*record_run(scenario, parameters, seed, run))
-
-
-def replay_ensemble(
-    sources: Sequence[MemorySource],
-    estimators: Settings,
-    *,
-    gap_limit_s: float,
-    progress: Progress = no_progress,
-) -> Replayed:
-    """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
-    return judge(sources, replay_in_memory(sources, estimators, progress=progress), gap_limit_s)
-
-
-def replay_in_memory(
-    sources: Sequence[Source],
-    estimators: Settings,
-    *,
-    order: Clock = "publish_time",
-    late: Late | None = None,
-    progress: Progress = no_progress,
-) -> dict[str, Ragged]:
-    """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
-    outputs: dict[str, Ragged] = {}
-    for label in progress(estimators, "replaying", len(estimators)):
-        bound = bind(label, sources, estimators[label])
-        blocks = replay_blocks(sources, bound, Report(), order=order, late=late)
-        outputs |= collect(list(block.values()) for block in blocks)
-    return outputs
-
-
-def judge(sources: Sequence[MemorySource], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
-    """Errors, innovations and set errors of a replay's outputs."""
-    judged = Judge(sources, {}, gap_limit_s=gap_limit_s).add(outputs)
-    return Replayed(sources, outputs, judged.errors, judged.innovations, judged.sets)
-
-
 def estimates_metadata(source: Source, estimators: Settings, path: Path, log: Path) -> RunMetadata:
     """What the estimates log at `path` says of itself: the run that it is of, the estimators, its log.
 
@@ -495,27 +373,3 @@ def estimates_metadata(source: Source, estimators: Settings, path: Path, log: Pa
     place = os.path.relpath(log.resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()}, default=str)
     return replace(run, notes={"log": place, "estimators": settings})
-
-
-def hash_streams(sources: Iterable[MemorySource]) -> str:
-    """SHA-256 over every column of every run: equal where the input data are equal."""
-    digest = hashlib.sha256()
-    for source in sources:
-        add_to_hash(digest, source)
-    return digest.hexdigest()
-
-
-def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
-    """Take a run's columns into a hash."""
-    for stream in source.streams.values():
-        for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
-            digest.update(np.ascontiguousarray(array).data)
-
-
-def hash_files(paths: Sequence[Path]) -> str:
-    """SHA-256 over the bytes of files."""
-    digest = hashlib.sha256()
-    for path in paths:
-        with path.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()

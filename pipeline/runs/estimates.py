@@ -1,12 +1,16 @@
-"""What an estimates log says of itself: which log it is of, and what its estimators were."""
+"""States of an estimates log which log and estimators it is of, and hashes what a replay was given."""
 
+import hashlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Log
 from recorders.parsing import parse_json
-from replay.engine.streams.sources import Source
+from replay.engine.streams.sources import MemorySource, Source
 
 
 def log_of_estimates(estimates: Log) -> Path:
@@ -32,3 +36,27 @@ def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
     except ValueError:
         return {}
     return stated if isinstance(stated, dict) else {}
+
+
+def hash_streams(sources: Iterable[MemorySource]) -> str:
+    """SHA-256 over every column of every run: equal where the input data are equal."""
+    digest = hashlib.sha256()
+    for source in sources:
+        add_to_hash(digest, source)
+    return digest.hexdigest()
+
+
+def add_to_hash(digest: "hashlib._Hash", source: MemorySource) -> None:
+    """Take a run's columns into a hash."""
+    for stream in source.streams.values():
+        for array in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values()):
+            digest.update(np.ascontiguousarray(array).data)
+
+
+def hash_files(paths: Sequence[Path]) -> str:
+    """SHA-256 over the bytes of files."""
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()

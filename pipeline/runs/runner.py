@@ -11,20 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.output.results import ErrorTables
-from pipeline.runs.ensemble import (
-    Part,
-    Pass,
-    Replayed,
-    Settings,
-    estimates_metadata,
-    hash_files,
-    hash_streams,
-    record_ensemble,
-    replay_ensemble,
-    replay_parts,
-)
+from pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
+from pipeline.runs.estimates import hash_files, hash_streams
 from pipeline.runs.experiment import Experiment, Setting, load_scenario
 from pipeline.runs.initial_states import order_of
+from pipeline.runs.recorded import Replayed, record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, open_log
 from recorders.parameters import merge

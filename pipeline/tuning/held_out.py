@@ -8,10 +8,10 @@ from collections.abc import Collection
 from dataclasses import replace
 
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.output.summary import summarise
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summarise
 from pipeline.tuning.outcome import START, TUNED
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput

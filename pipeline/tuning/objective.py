@@ -19,7 +19,7 @@ from pipeline.runs.executors import Team, threads
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
-from replay.engine.replaying.estimator import Bound, Opened, Opening, Recursive, bind
+from replay.engine.replaying.estimator import Bound, Initialization, Initialized, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
@@ -45,12 +45,12 @@ class Run(NamedTuple):
 
     ensemble: Ensemble[MemorySource]
     name: str
-    begun: Mapping[str, Opened] = {}
+    begun: Mapping[str, Initialized] = {}
 
 
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
     """What estimators read of a log, and its truths, in memory."""
-    topics = {topic for each in bound for topic in (*each.whole, *each.streams)}
+    topics = {topic for each in bound for topic in (*each.static, *each.streams)}
     topics |= {
         name
         for name, topic in source.topics.items()
@@ -262,9 +262,9 @@ class Objective:
 
     def begun(self, values: Floats, run: Run) -> Run:
         """The log, with how the estimator begins with these values (k,); BadInput as `replay`."""
-        begun: dict[str, Opened] = {}
+        begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
-        if any(_opening(each) for each in bound):
+        if any(_initialization(each) for each in bound):
             noting = [_with_find(each, partial(_note, begun, each)) for each in bound]
             next(replay(run.ensemble, noting), None)
         return run._replace(begun=begun)
@@ -307,14 +307,14 @@ class Objective:
         return cost if np.isfinite(cost) else np.inf
 
 
-def _opening(bound: Bound) -> Opening | None:
-    return bound.opening if isinstance(bound, Recursive) else None
+def _initialization(bound: Bound) -> Initialization | None:
+    return bound.initialization if isinstance(bound, Recursive) else None
 
 
-def _with_find(bound: Bound, find: Callable[..., Opened]) -> Bound:
+def _with_find(bound: Bound, find: Callable[..., Initialized]) -> Bound:
     """An estimator that finds its beginning in another way, if it has to find one."""
-    if isinstance(bound, Recursive) and bound.opening is not None:
-        return replace(bound, opening=replace(bound.opening, find=find))
+    if isinstance(bound, Recursive) and bound.initialization is not None:
+        return replace(bound, initialization=replace(bound.initialization, find=find))
     return bound
 
 
@@ -323,18 +323,18 @@ def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
     return {
         (name, topic): rows.stream.publish_time_ns.tolist()
         for name, opened in run.begun.items()
-        for topic, rows in opened.whole.items()
+        for topic, rows in opened.static.items()
     }
 
 
-def _note(begun: dict[str, Opened], bound: Bound, *first: Any) -> Opened:
-    opening = _opening(bound)
-    assert opening is not None
-    begun[bound.name] = opening.find(*first)
+def _note(begun: dict[str, Initialized], bound: Bound, *first: Any) -> Initialized:
+    initialization = _initialization(bound)
+    assert initialization is not None
+    begun[bound.name] = initialization.find(*first)
     return begun[bound.name]
 
 
-def _as_noted(opened: Opened, *_: Any) -> Opened:
+def _as_noted(opened: Initialized, *_: Any) -> Initialized:
     return opened
 
 

@@ -18,7 +18,7 @@ from pipeline.api.replays import Replay, replay
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
-from pipeline.runs.summary import summarise, summary_table
+from pipeline.output.summary import summarise, summary_table
 from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, profiles
 from pipeline.tuning.objective import Objective, innovations_in
 from pipeline.tuning.search import Coordinates

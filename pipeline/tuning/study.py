@@ -14,7 +14,7 @@ from pydantic import PositiveFloat
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from pipeline.tuning.tuning import tune

@@ -204,7 +204,7 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
     if isinstance(bound, Recursive) and is_assumed:
         start = bound.assumed[name]
     elif start is None:
-        read = [source.topics[topic] for topic in (*bound.streams, *bound.whole)]
+        read = [source.topics[topic] for topic in (*bound.streams, *bound.static)]
         start = stated(read, name, type(parameters))
     is_positive = least >= 0.0 or (given is not None and given[0] > 0.0)
     if is_positive and start <= 0.0:

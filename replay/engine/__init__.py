@@ -1,1 +1,1 @@
-"""One pass in time order over the runs of an ensemble, through several estimators at once."""
+"""Replays an ensemble of runs in time order, in one pass, through several estimators at once."""

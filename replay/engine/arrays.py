@@ -1,4 +1,4 @@
-"""What arrays are called in annotations, and functions that are put together and compiled."""
+"""Names the types of arrays and functions, and marks NamedTuples of arrays whose sizes vary."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar

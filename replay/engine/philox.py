@@ -1,4 +1,4 @@
-"""Random numbers inside kernels: Philox, a generator whose state is a counter and a run's own key.
+"""Draws random numbers inside kernels by Philox, whose state is a counter and a run's own key.
 
 A kernel that makes no arrays cannot hold a generator of NumPy; this one is a few words of a run's state.
 The words are those of `numpy.random.Philox`. Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as

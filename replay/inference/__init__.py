@@ -1,1 +1,1 @@
-"""Models and methods: how a state moves and is measured, and how any such state is estimated."""
+"""Describes how states move and are measured, and estimates any such state by any method."""

@@ -1,4 +1,4 @@
-"""All methods by name, and the estimator of one model by one of them."""
+"""Lists all methods by name, and makes the estimator of one model by one of them."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,7 +8,7 @@ from replay.engine.replaying.estimator import Estimator, set_by_variant
 from replay.inference.estimators import modelled_by
 from replay.inference.kalman.methods import FILTERS, Method
 from replay.inference.model.model import Model
-from replay.inference.modes.gaussian_sum import BANK
+from replay.inference.modes.gaussian_sum import GAUSSIAN_SUM
 from replay.inference.modes.imm import INTERACTING
 from replay.inference.particles.filter import BOOTSTRAP
 from replay.inference.smoothing.bound import POSTERIOR_BOUND
@@ -18,7 +18,7 @@ METHODS: Mapping[str, Method] = {
     **FILTERS,
     "smoother": SMOOTHING,
     "imm": INTERACTING,
-    "bank": BANK,
+    "bank": GAUSSIAN_SUM,
     "particles": BOOTSTRAP,
     "bound": POSTERIOR_BOUND,
 }

@@ -1,4 +1,4 @@
-"""Estimators made of a model and a method, as a replay takes them."""
+"""Makes estimators of a model and a method, and binds them to the topics of a log."""
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -23,19 +23,26 @@ from replay.inference.model.augmentation import (
     augmented_stage,
     begin,
     estimated,
-    with_walks,
+    with_gauss_markov,
 )
 from replay.inference.model.binding import Found, roles_of, topics_of
-from replay.inference.model.model import Model, ModelParameters, Motion
-from replay.inference.model.requirements import OWN_MODEL, elsewhere, names_state, nearest, needs_of
+from replay.inference.model.model import Model, Motion
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
     assumed_of,
     settings_of,
 )
 from replay.inference.model.stage import Stage, stage_of
+from replay.inference.requirements import (
+    OWN_MODEL,
+    elsewhere,
+    names_state,
+    nearest,
+    requirements_of,
+)
 from replay.inference.run.filtering import Filter, samplers_of
-from replay.inference.run.initialization import Beginning
-from replay.inference.run.out_of_sequence import Rewinding
+from replay.inference.run.initialization import Initializer
+from replay.inference.run.out_of_sequence import OutOfSequenceFilter
 
 
 @lru_cache(maxsize=256)
@@ -86,7 +93,7 @@ def modelled_by(
     of_name = f" ({name})" if settings else ""
     return Estimator(
         f"{model.summary}, {method.summary}{of_name}",
-        needs_of(model),
+        requirements_of(model),
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
@@ -110,9 +117,11 @@ class _OfAnyModel(Estimator[Any]):
         )
 
     @cached_property
-    def needs(self) -> str:
+    def requirements(self) -> str:
         """What a log must have."""
-        return " or ".join(f"({name}) {needs_of(model)}" for name, model in registered_models().items())
+        return " or ".join(
+            f"({name}) {requirements_of(model)}" for name, model in registered_models().items()
+        )
 
     @cached_property
     def parameters(self) -> type[Parameters]:
@@ -226,21 +235,21 @@ def bind_model(
             raise BadInput(f"estimator {label}: {error}") from error
         name = label + found.prefix
         samplers = samplers_of(stage, method, parameters)
-        settings = with_walks(numbers, added)
+        settings = with_gauss_markov(numbers, added)
         made_of = (name, found, stage, method, parameters, settings, samplers)
         filtering = (method.filtering or Filter)(*made_of)
         control = [found.control.name] if found.control else []
-        read = (*found.instead, *found.sensors)
+        read = (*found.fallbacks, *found.sensors)
         streams = (*control, *(topic.name for _, topic in read))
         assumed = assumed_of(label, own, found, parameters)
-        opening = Beginning(name, found, own, numbers, assumed).opening
-        whole = filtering.whole(topics)
+        initialization = Initializer(name, found, own, numbers, assumed).initialization
+        static = filtering.static(topics)
         priors = {found.prior.name: model.state}
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
-        made = Recursive(name, streams, whole, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, opening=opening, assumed=assumed)
-        bound.append(replace(made, rewinding=partial(_rewinding, made, filtering, begun)))
+        made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
+        made = replace(made, initialization=initialization, assumed=assumed)
+        bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 
 
@@ -284,16 +293,16 @@ def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topi
     return None
 
 
-def _rewinding(
+def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
     """The estimator that goes back for late messages; raises BadInput where the filter cannot."""
-    reason = filtering.cannot_rewind
+    reason = filtering.why_in_sequence
     if reason:
         raise BadInput(
             f"estimator {bound.name}: --late rewind: {reason}; give --late drop or --late wait:SECONDS"
         )
-    back = Rewinding(filtering, window_ns)
+    back = OutOfSequenceFilter(filtering, window_ns)
     return replace(bound, start=begun(back.start), run=back.run, finish=back.finish)
 
 

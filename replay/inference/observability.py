@@ -1,4 +1,4 @@
-"""Observability from a log: what the measurements of a window say of the state at its beginning.
+"""Measures observability from a log: what the measurements of a window say of the state at its start.
 
 The local Gramian W = sum Phi' H' R^-1 H Phi sums the information of all measurements, carried back by
 the derivatives Phi of the motion along one trajectory, the smoothed one. Scaled, D W D with D the
@@ -26,16 +26,21 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import Method, MethodParameters
 from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.steps import NOTHING_MEASURED, Note, Steps, Workspace, workspace
-from replay.inference.kalman.update import reading, sensor_derivative, sensor_noise, slots_of
-from replay.inference.linear_algebra.gaussian import kalman_step, keep_measured, multiply_into, whiten
-from replay.inference.linear_algebra.manifold import differencing, is_flat
+from replay.inference.kalman.steps import NOTHING_MEASURED, InnovationRecord, Steps, Workspace, workspace
+from replay.inference.kalman.update import (
+    innovation_components,
+    reading,
+    sensor_derivative,
+    sensor_noise,
+)
+from replay.inference.linear_algebra.gaussian import drop_missing, kalman_step, multiply_into, whiten
+from replay.inference.linear_algebra.manifold import boxminus, is_flat
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.filtering import State
+from replay.inference.run.filtering import FilterState
 from replay.inference.run.recursion import Estimates, filled, no_results, recursion
 from replay.inference.smoothing.affine import carrying
 from replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
@@ -59,7 +64,7 @@ class Gramian(NamedTuple):
     messages: Integers
 
 
-class Along(NamedTuple):
+class LinearizationTrajectory(NamedTuple):
     """The trajectory: its states (nodes, n), of every event the node, and memory for one offset."""
 
     mean: Floats
@@ -90,7 +95,7 @@ def _carried_by_motion(stage: Stage) -> Function:
     model = stage.model
     linearise = motion_derivative(model, stage.motion, by_state=True)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
-    subtract, flat, carry = differencing(model.kinds), is_flat(model.kinds), carrying(model.kinds)
+    subtract, flat, carry = boxminus(model.kinds), is_flat(model.kinds), carrying(model.kinds)
 
     def predict(
         run: int,
@@ -98,15 +103,17 @@ def _carried_by_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        event: int,
         work: Workspace,
     ) -> bool:
-        along, transition = work.samples[0], belief.transition[run]
-        node = along.node[use]
-        linearise(read_state(along.mean[node - 1]), read_control(control), duration_s, parameters, work)
+        trajectory, transition = work.samples[0], belief.transition[run]
+        node = trajectory.node[event]
+        linearise(
+            read_state(trajectory.mean[node - 1]), read_control(control), duration_s, parameters, work
+        )
         if not flat:
-            subtract(along.mean[node], work.state, along.offset, 0)
-            carry(along.offset[0], work.transition, work.step)
+            subtract(trajectory.mean[node], work.state, trajectory.offset, 0)
+            carry(trajectory.offset[0], work.transition, work.step)
         multiply_into(work.transition, transition, work.product)
         return True
 
@@ -116,7 +123,7 @@ def _carried_by_motion(stage: Stage) -> Function:
 def _added_by_sensor(stage: Stage, number: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     m, t = len(sensor.measured), model.tangent
-    read_state, read_about = tuple_of(model.size), reading(sensor).about
+    read_state, read_reference = tuple_of(model.size), reading(sensor).reference
     linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
 
     def update(
@@ -125,13 +132,15 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        event: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
-        along, innovation = work.samples[0], work.innovations[number]
+        trajectory, innovation = work.samples[0], work.innovations[number]
         cross = innovation.cross_covariance
-        linearise(read_state(along.mean[along.node[use]]), read_about(data), parameters, work)
+        linearise(
+            read_state(trajectory.mean[trajectory.node[event]]), read_reference(data), parameters, work
+        )
         innovation.covariance[:] = 0.0
         add_noise(innovation.covariance, data, parameters, work)
         for i in range(m):
@@ -141,7 +150,7 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
                 for k in range(t):
                     entry += work.rows[i, k] * belief.transition[run, k, column]
                 cross[column, i] = entry
-        size = keep_measured(innovation)
+        size = drop_missing(innovation)
         squared, _ = whiten(innovation, size)
         if size == 0 or np.isnan(squared):
             return NOTHING_MEASURED
@@ -168,7 +177,7 @@ def _summing(stage: Stage) -> tuple[Function, Steps]:
 class Observability(IteratedSmoother):
     """The smoothed trajectory of every run, and the Gramians of its windows along it."""
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """One message for every window, at its last stamp."""
         state, _ = self.ended(state)
         if not state.kept:
@@ -202,7 +211,7 @@ class Observability(IteratedSmoother):
         model = self.stage.model
         return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
-    def _scales(self, state: State) -> Floats:
+    def _scales(self, state: FilterState) -> Floats:
         """What a scaled component of one stands for (runs, t)."""
         scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
         for name, scale in self.parameters.scales.items():
@@ -225,17 +234,17 @@ class Observability(IteratedSmoother):
         last = np.maximum(span_ns // length_ns - 1, 0)
         return np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
 
-    def _gramians(self, state: State, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
+    def _gramians(self, state: FilterState, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
         """The Gramians at the last stamps of windows, and how many messages are in each."""
         stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
         t, (loop, steps) = stage.model.tangent, _summing(stage)
         ends = np.append(np.diff(window_of) != 0, True)[: len(window_of)]
         ends[offsets[1:][np.diff(offsets) > 0] - 1] = True
-        happenings = way.happenings
-        happenings = happenings._replace(is_due=happenings.is_due & ends[way.node])
+        events = way.events
+        events = events._replace(wants_estimate=events.wants_estimate & ends[way.node])
         due = np.append(0, np.cumsum(ends))[offsets]
         one = np.arange(runs + 1)
-        _, innovations = no_results(due, one, stage.model, len(slots_of(stage.sensors)))
+        _, innovations = no_results(due, one, stage.model, len(innovation_components(stage.sensors)))
         count = due[-1]
         found = Estimates(
             due[:-1].copy(), np.empty(count, np.int64), np.empty((count, 1)), np.empty((count, t, t))
@@ -249,9 +258,9 @@ class Observability(IteratedSmoother):
         settings = np.repeat(self.settings[None], runs, axis=0)
 
         def memory() -> Any:
-            return steps.memory((Along(way.states.mean, way.node, np.empty((1, t))),))
+            return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))
 
-        loop(runs, happenings, settings, self.gates, carried, found, innovations, scratch=memory)
+        loop(runs, events, settings, self.gates, carried, found, innovations, scratch=memory)
         return filled(found, due)
 
 

@@ -1,4 +1,4 @@
-"""All methods as estimators of any model: what `-e ekf` means."""
+"""Registers all methods as estimators of any model: what `-e ekf` means."""
 
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import of_any_model

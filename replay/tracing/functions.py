@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from replay.engine.compiling.kernels.identity import digest_of
+from replay.engine.compiling.identity import digest_of
 from replay.engine.compiling.kernels.numbers import REAL, Emitter, Number, constant
 from replay.engine.compiling.kernels.program import Instance, Program, called
 from replay.engine.compiling.kernels.values import Array, Record, entries, load, part_of, store

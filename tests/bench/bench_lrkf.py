@@ -25,7 +25,7 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState
 from stonesoup.updater.kalman import KalmanUpdater
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from recorders.models.reactor import react
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay

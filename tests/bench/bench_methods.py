@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from recorders.parameters import build
 from replay.engine.replaying.estimator import Bound
 from replay.engine.streams.sources import MemorySource

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.headings import equal_sigmas
 from recorders.models.planar import wrap_angle

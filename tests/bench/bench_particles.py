@@ -19,7 +19,7 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import ParticleState
 from stonesoup.updater.particle import ParticleUpdater
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from recorders.models.vehicles import noise_moments, turn
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from pipeline.runs.ensemble import replay_in_memory
+from pipeline.runs.recorded import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.streams.blocks import gather
 from replay.estimators.tracking.gaussian_mixture_phd import (

@@ -13,7 +13,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource

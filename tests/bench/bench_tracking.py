@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.runs.ensemble import replay_in_memory
+from pipeline.runs.recorded import replay_in_memory
 from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.streams.blocks import Block, gather, merge_events
 from replay.engine.streams.sources import MemorySource
@@ -19,7 +19,7 @@ from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import scans_of
 from replay.estimators.tracking.targets import targets_of
 from replay.estimators.tracking.tracker import TrackerParameters, find_sensors, settings_of, tracker_of
-from replay.inference.association.scanning import Scans
+from replay.inference.association.scans import Scans
 from replay.inference.association.tracking import track_scans
 from replay.inference.association.tracks import Tracks, no_tracks
 from tests.replay.estimators.scan_scenes import FIELD_M, VARIANCE_M2, Scene, simulate, source

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from time import process_time
 from typing import Any
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.streams.sources import MemorySource
 from replay.inference.all_methods import METHODS

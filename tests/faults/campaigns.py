@@ -21,7 +21,7 @@ from pipeline.runs.checkpoints import Kept
 from tests.faults import Tally
 
 COMMANDS = (
-    "run landmarks --runs 260 --logs 2 --set duration_s=1 --seed SEED --out out",
+    "run landmarks --runs 130 --logs 2 --set duration_s=1 --seed SEED --out out",
     "sweep landmarks --over robots=1,2 --runs 3 --set duration_s=1 --seed SEED --out out",
 )
 

@@ -5,7 +5,9 @@ the new; the next command leaves nothing else there or among the temporary files
 that an undisturbed one writes. A command that was asked to end (SIGTERM) clears up by itself.
 """
 
+import contextlib
 import hashlib
+import io
 import os
 import shutil
 import signal
@@ -14,13 +16,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rerun.chunk import RrdReader
 
+from pipeline.command_line import main
 from tests.faults import Tally
 
 FUSELOG = str(Path(sys.executable).with_name("fuselog"))
@@ -57,8 +59,10 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
         start.mkdir()
         (start / "notes.txt").write_text("mine")
         (start / "new.part").write_text("mine")
-        _fuselog("record landmarks -o", "log.mcap", start).communicate()
-        _fuselog("replay log.mcap -e ekf -o", "est.mcap", start).communicate()
+        with contextlib.chdir(start), contextlib.redirect_stdout(io.StringIO()):
+            assert main(["record", "landmarks", "-o", "log.mcap"]) == 0
+            assert main(["replay", "log.mcap", "-e", "ekf", "-o", "est.mcap"]) == 0
+        (start / "tmp").mkdir()
         wholes: dict[str, Whole] = {}
         while time.monotonic() < end and tried != most:
             command = list(COMMANDS)[tried % len(COMMANDS)]
@@ -154,7 +158,7 @@ def _fuselog(arguments: str, out: str, work: Path) -> subprocess.Popen[str]:
     )
 
 
-@contextmanager
+@contextlib.contextmanager
 def _copy_of(start: Path) -> Iterator[Path]:
     work = start.with_name("work")
     shutil.copytree(start, work)

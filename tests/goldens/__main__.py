@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.checking.golden import discrepancies
+from pipeline.checking.discrepancies import discrepancies
 from pipeline.checking.stored import read, write
 from recorders.errors import choices
 from tests.goldens import store

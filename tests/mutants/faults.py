@@ -270,7 +270,7 @@ FAULTS = [
         "tests/replay/engine/test_compile.py",
     ),
     Fault(
-        "replay/engine/compiling/keeping.py",
+        "replay/engine/compiling/kernel_cache.py",
         "{getattr(kind, 'fields', '')} ",
         "",
         "tests/replay/engine/test_compile.py",
@@ -571,25 +571,25 @@ FAULTS = [
         FAILING,
     ),
     Fault(
-        "replay/engine/replaying/supervision.py",
+        "replay/engine/replaying/monitor.py",
         "output.stream.publish_time_ns < self._end_ns[run]",
         "output.stream.publish_time_ns <= self._end_ns[run]",
         FAILING,
     ),
     Fault(
-        "replay/engine/replaying/supervision.py",
+        "replay/engine/replaying/soundness.py",
         "if time_ns[row] < last_ns:",
         "if time_ns[row] <= last_ns:",
         FAILING,
     ),
     Fault(
-        "replay/engine/replaying/supervision.py",
+        "replay/engine/replaying/soundness.py",
         "factor[i, column] = entry / factor[column, column]",
         "factor[i, column] = entry",
         FAILING,
     ),
     Fault(
-        "replay/engine/replaying/supervision.py",
+        "replay/engine/replaying/coverage.py",
         "median = np.argmax(2 * reached >= reached[-1], axis=0)",
         "median = np.argmax(reached >= reached[-1], axis=0)",
         FAILING,

@@ -35,6 +35,10 @@ def run(folder: Path, crew=None, runs: int = RUNS, **options) -> dict[str, bytes
     """Run the experiment; returns the bytes of all files of its result but for the timeline."""
     name, experiment = load_experiment("landmarks", SETTINGS, {"runs": runs})
     run_experiment(name, experiment, folder, logs=2, crew=crew, **options)
+    return contents(folder)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -51,6 +55,27 @@ def whole(tmp_path_factory) -> tuple[Path, dict[str, bytes]]:
     """The result of one process, and its folder."""
     folder = tmp_path_factory.mktemp("campaign") / "result"
     return folder, run(folder, errors=True)
+
+
+@pytest.fixture(scope="module")
+def without_errors(tmp_path_factory) -> tuple[Path, dict[str, bytes]]:
+    """The result of one process without its table of errors, and its place, where it is no longer."""
+    folder = tmp_path_factory.mktemp("campaign") / "result"
+    files = run(folder)
+    shutil.rmtree(folder)
+    return folder, files
+
+
+@pytest.fixture
+def place(without_errors) -> Path:
+    """Where that result was, since estimates state where their logs are."""
+    yield without_errors[0]
+    shutil.rmtree(without_errors[0], ignore_errors=True)
+
+
+@pytest.fixture
+def files(without_errors) -> dict[str, bytes]:
+    return without_errors[1]
 
 
 @pytest.fixture
@@ -112,11 +137,7 @@ class Backwards(Here):
         return future
 
 
-def test_a_stopped_campaign_goes_on_where_it_was(tmp_path, worked_off, monkeypatch, caplog):
-    place = tmp_path / "result"
-    files = run(place)
-    shutil.rmtree(place)
-    worked_off.clear()
+def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monkeypatch, caplog):
     counted = campaigns.Cell.packed
 
     def stopped(cell, folder):
@@ -368,12 +389,7 @@ def test_the_simulated_driver_is_the_limit_where_it_is_busy():
 
 
 @pytest.mark.paper
-def test_processes_give_the_same_bytes_also_after_a_kill(tmp_path):
-    place = tmp_path / "result"
-    files = run(place)
-    shutil.rmtree(place)
-    assert run(place, crew_of(2, None, RUNS)) == files
-    shutil.rmtree(place)
+def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
     command = [
         "run",
         "landmarks",
@@ -395,19 +411,16 @@ def test_processes_give_the_same_bytes_also_after_a_kill(tmp_path):
     begun.communicate()
     assert not place.exists()
     assert main([*command, "--workers", "2"]) == 0
-    assert (place / "result.json").read_bytes() == files["result.json"]
+    assert contents(place) == files
     assert not unfinished(place).exists()
 
 
 @pytest.mark.paper
-def test_dask_workers_give_the_same_bytes(tmp_path):
-    """Of a cluster of its own, and of one that is there, whose workers share no files with it."""
+def test_dask_workers_give_the_same_bytes(place, files):
+    """Of a cluster of its own, and of one that is there, whose worker shares no files with it."""
     distributed = pytest.importorskip("distributed")
-    place = tmp_path / "result"
-    files = run(place)
-    shutil.rmtree(place)
     assert run(place, crew_of(None, "local:2", RUNS)) == files
     shutil.rmtree(place)
     loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, **loopback) as cluster:
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **loopback) as cluster:
         assert run(place, crew_of(None, cluster.scheduler_address, RUNS)) == files

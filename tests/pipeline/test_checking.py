@@ -12,7 +12,8 @@ import pytest
 
 import fuselog as fl
 from fuselog.testing import assert_golden
-from pipeline.checking.golden import Replayed, checksums, discrepancies
+from pipeline.checking.discrepancies import discrepancies
+from pipeline.checking.golden import Replayed, checksums
 from pipeline.checking.stored import read, write
 from recorders.log import LogWriter
 

@@ -13,7 +13,7 @@ import pytest
 import rerun.blueprint as rrb
 
 import fuselog as fl
-from pipeline.comparing.comparing import _unlike
+from pipeline.comparing.groups import unlike_runs
 from replay.timeline.side_by_side import _alone
 
 Fuselog = Callable[..., Any]
@@ -152,9 +152,9 @@ def test_what_is_not_alike_is_said(logs: list[Path], estimates: Path, fuselog: F
 def test_different_truths_are_said(estimates: Path) -> None:
     [[first, second]] = fl.compare(estimates, estimators=["ekf", "ukf"]).groups
     run = next(iter(second.truths))
-    assert not [note for note in _unlike(first, second) if "truths" in note]
+    assert not [note for note in unlike_runs(first, second) if "truths" in note]
     moved = replace(second, truths={**second.truths, run: "another"})
-    [note] = [note for note in _unlike(first, moved) if "truths" in note]
+    [note] = [note for note in unlike_runs(first, moved) if "truths" in note]
     assert note == f"ekf and ukf have different truths in 1 run: {run}"
 
 

@@ -18,7 +18,8 @@ from numpy.testing import assert_allclose
 from pipeline.output.charts import Chart
 from pipeline.output.claims import Claim
 from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.runs.ensemble import hash_files, hash_streams, record_ensemble
+from pipeline.output.summary import summarise
+from pipeline.runs.estimates import hash_files, hash_streams
 from pipeline.runs.experiment import (
     Experiment,
     Setting,
@@ -27,7 +28,7 @@ from pipeline.runs.experiment import (
     load_experiment,
     run_experiment,
 )
-from pipeline.runs.summary import summarise
+from pipeline.runs.recorded import record_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas
 from recorders.parameters import build

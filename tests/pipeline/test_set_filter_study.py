@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import record_ensemble
 from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.runs.recorded import record_ensemble
 from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
 from recorders.errors import BadInput
 

@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import record_ensemble
 from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.runs.recorded import record_ensemble
 from pipeline.studies.networks.cooperative_stress import (
     CooperativeStressOptions,
     _edited,

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from fuselog.testing import assert_same
-from pipeline.checking.golden import TOLERANCE, Replayed, Tolerance, arithmetic, discrepancies
+from pipeline.checking.discrepancies import discrepancies
+from pipeline.checking.golden import TOLERANCE, Replayed, Tolerance, arithmetic
 from pipeline.checking.stored import Golden, read
 from recorders.errors import BadInput
 from recorders.registry import available

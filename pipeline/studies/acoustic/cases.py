@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Record, Setting, load_scenario
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square

@@ -13,8 +13,9 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams, record_ensemble
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import record_ensemble
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import share_holds
 from recorders.errors import BadInput

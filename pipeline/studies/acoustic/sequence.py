@@ -14,8 +14,9 @@ from pydantic import Field
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Interval, errors_named, mean_interval, require_spread
 from recorders.parameters import Parameters

@@ -14,10 +14,11 @@ from scipy.stats import norm
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, thinned
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from pipeline.studies.biometrics.claims import (
     CASES,
     METHODS,

@@ -16,10 +16,10 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from pipeline.studies.navigation.outages import (
     COASTED,
     FIX,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput

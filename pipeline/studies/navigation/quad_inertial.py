@@ -18,10 +18,11 @@ from scipy.spatial.transform import Rotation
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams, replay_in_memory
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from pipeline.studies.toolkit.repetitions import rms_length
 from recorders.errors import BadInput
 from recorders.importers.tables.mapping import read_mapping, recordings_in

@@ -18,8 +18,9 @@ from pydantic import PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval
 from recorders.errors import BadInput

@@ -16,10 +16,11 @@ from pydantic import NonNegativeFloat
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.output.summary import summarise
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summarise
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.streams.blocks import gather

@@ -7,8 +7,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Record, Setting, load_scenario
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square
 from recorders.errors import BadInput

@@ -15,16 +15,12 @@ from pydantic import PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.ensemble import hash_streams, replay_in_memory
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval
-from recorders.models.optical import (
-    TARGETS,
-    bias_components,
-    clock_component,
-    moving_target_components,
-)
+from recorders.models.optical import TARGETS, bias_components, clock_component, moving_target_components
 from recorders.parameters import Parameters
 from recorders.simulators.moving_optical import MovingOpticalParameters
 from replay.engine.arrays import Floats

@@ -9,10 +9,10 @@ import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.parameters import Parameters

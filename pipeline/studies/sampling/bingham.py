@@ -16,8 +16,9 @@ from pydantic import PositiveInt
 
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study, load_scenario
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import require_spread, rmse_of_runs
 from recorders.errors import BadInput

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 
 from pipeline.output.charts import Axis, Panel, curve
-from pipeline.runs.ensemble import replay_in_memory
 from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import Parameters

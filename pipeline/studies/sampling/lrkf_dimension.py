@@ -18,8 +18,9 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.ensemble import hash_streams, judge, replay_in_memory
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.recorded import judge, replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval, rmse_of_runs
 from pipeline.studies.tracking.tracking import lower

@@ -13,7 +13,7 @@ import pandas as pd
 from pipeline.output.charts import Chart
 from pipeline.output.claims import Claim, judged, named
 from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Record, Setting, Study
 from pipeline.studies.sampling.linearization import (
     REFERENCE,

@@ -17,8 +17,9 @@ from pydantic import PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams, require_memory
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed, require_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import rmse_of_runs
 from recorders.errors import BadInput

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval

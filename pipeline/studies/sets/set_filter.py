@@ -12,7 +12,7 @@ import pandas as pd
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.ensemble import hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds

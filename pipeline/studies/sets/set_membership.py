@@ -13,8 +13,9 @@ import pandas as pd
 from pipeline.output.charts import Axis, Chart, Panel, curve, path
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from replay.judging.errors.evaluation import split_topic
 from replay.judging.sets.evaluation import JudgedSets, frames_of, judge_sets

@@ -5,9 +5,9 @@ add their own tables, figures and claims.
 """
 
 from pipeline.output.results import Outcome
+from pipeline.output.summary import summarise
 from pipeline.runs.campaigns import judge
 from pipeline.runs.experiment import Experiment, Setting, Study
-from pipeline.runs.summary import summarise
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:

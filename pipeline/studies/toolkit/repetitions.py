@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri, stdtrit
 
 from pipeline.output.charts import Axis, Series, curve
-from pipeline.runs.ensemble import Replayed
+from pipeline.runs.recorded import Replayed
 from recorders.errors import BadInput
 from replay.judging.errors.evaluation import Errors
 

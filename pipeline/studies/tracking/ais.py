@@ -11,10 +11,11 @@ from pydantic import NonNegativeInt, PositiveFloat
 from pipeline.output.charts import Axis, Chart, Panel, curve, level, thinned
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import Replayed, hash_streams
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.judging.metrics.measuring import Output

@@ -14,10 +14,11 @@ from pydantic import PositiveFloat
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams, replay_in_memory
+from pipeline.output.summary import summary_table
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from pipeline.studies.tracking.tracking import (
     difference,
     lower,

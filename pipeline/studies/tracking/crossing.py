@@ -11,9 +11,9 @@ import pandas as pd
 from pipeline.output.charts import Axis, Chart, Panel, band, curve
 from pipeline.output.claims import Claim
 from pipeline.output.results import Outcome
+from pipeline.output.summary import summary_table
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.runs.summary import summary_table
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval
 from pipeline.studies.tracking.tracking import difference, lower, means_of, table_of
 from recorders.parameters import Parameters

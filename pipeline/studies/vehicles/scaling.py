@@ -16,8 +16,9 @@ from pydantic import PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
-from pipeline.runs.ensemble import hash_streams, judge, replay_in_memory
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import judge, replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.vehicles.cases import scores_of
 from recorders.errors import BadInput

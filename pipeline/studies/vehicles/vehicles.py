@@ -12,8 +12,9 @@ import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
 from pipeline.output.results import MetricValue, Outcome
-from pipeline.runs.ensemble import hash_streams, replay_in_memory
+from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.vehicles.cases import (
     TRACK_BYTES,

@@ -1,4 +1,4 @@
-"""Estimators from plain functions: what they are given and what they return.
+"""Makes estimators from plain functions, and defines what these are given and return.
 
 Begin with `functions`.
 """

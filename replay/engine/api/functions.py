@@ -1,4 +1,4 @@
-"""Estimators from plain functions: what is alike in all of them, written once.
+"""Makes estimators from plain functions: binding, outputs and failures are the same for all of them.
 
 `recursive` makes an estimator of a function that follows one run through its messages, compiled or not;
 `batch` of one that solves whole streams. Both find their topics, once for every robot or other prefix
@@ -20,6 +20,7 @@ from recorders.parameters import Parameters, ParametersType
 from replay.engine.api.inputs import Given, Messages, OneRun, generator_of, messages_of
 from replay.engine.api.outputs import Estimates, Outputs, Solved
 from replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
+from replay.engine.renamed import renamed
 from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import bindings, resolved
@@ -30,12 +31,13 @@ from replay.engine.vectors.components import Components
 Generators = tuple[np.random.Generator | None, ...]
 
 
+@renamed(whole="static")
 def recursive(
     summary: str,
     *,
     parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
     streams: Mapping[str, Schema],
-    whole: Mapping[str, Schema],
+    static: Mapping[str, Schema],
     components: Components,
     truth: str = "",
     measured: Components | None = None,
@@ -55,14 +57,14 @@ def recursive(
         summary: what it is, in one line.
         parameters: their type; without one there are none.
         streams: the topics to follow, with their schemas; see `bindings` for their names.
-        whole: the topics that `start` needs whole, such as a map or a prior. Gaussian estimates among
-            them are priors: of the estimate's components, see `Given.prior`.
+        static: the topics that `start` needs from beginning to end, such as a map or a prior. Gaussian
+            estimates among them are priors: of the estimate's components, see `Given.prior`.
         components: the estimate's components by name, with their kinds.
         truth: the topic with the truth of what is estimated.
         measured: the components of the innovations, where `follow` tells of them.
         vectors: what is wanted of the vectors that topics of `streams` hold, by topic. What the log
             does not say of them is refused; without an entry here vectors come as the log has them.
-        optional: which of `streams` and `whole` a log may lack.
+        optional: which of `streams` and `static` a log may lack.
         outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
         draws: whether random numbers are drawn: `follow` then gets the run's own generator as its last
             argument, `follow_all` those of all runs. It depends on the parameter `seed` and the run's
@@ -91,7 +93,7 @@ def recursive(
     >>> nearest = recursive(
     ...     "shortest range so far",
     ...     streams={"/range": schemas.RANGE},
-    ...     whole={},
+    ...     static={},
     ...     components={"range_m": "linear"},
     ...     start=start,
     ...     follow=follow,
@@ -126,7 +128,7 @@ def recursive(
         if follow_all is not None:
             follow_all(*arguments, *([generators] if draws else []))
         else:
-            loop()(len(generators), *arguments, own=generators if draws else None)
+            loop()(len(generators), *arguments, per_run=generators if draws else None)
 
     def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
         made = Outputs(
@@ -140,11 +142,11 @@ def recursive(
             return _Carried(settings, state, np.zeros(runs, bool), (None,) * runs)
 
         def begin(given: dict[str, Ragged]) -> _Carried | None:
-            maps = {each: given[found[each].name] for each in whole if each in found}
+            maps = {each: given[found[each].name] for each in static if each in found}
             return started(maps, next(iter(maps.values())).runs) if maps else None
 
         def advance(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
-            # without anything whole, the first block is what tells how many runs there are
+            # without static topics, the first block is what tells how many runs there are
             settings, before, told, generators = carried or started({}, len(block.events.offsets) - 1)
             state = type(before)(*(array.copy() for array in before))
             messages, skipped = messages_of(block, wanted, values)
@@ -158,10 +160,10 @@ def recursive(
             outcome = made.of_block(messages, results, np.flatnonzero(failing))
             return _Carried(settings, state, told, generators), [*outcome, *made.of_skipped(skipped)]
 
-        read, needed = _topics(found, streams), _topics(found, whole)
-        return Recursive(name, read, needed, begin, advance, _priors(found, whole, components))
+        read, needed = _topics(found, streams), _topics(found, static)
+        return Recursive(name, read, needed, begin, advance, _priors(found, static, components))
 
-    return _estimator(summary, parameters, {**streams, **whole}, optional, bind)
+    return _estimator(summary, parameters, {**streams, **static}, optional, bind)
 
 
 def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
@@ -188,12 +190,13 @@ def _drawn_on(generators: Generators, messages: Messages, parameters: Any) -> Ge
     )
 
 
+@renamed(whole="static")
 def batch(
     summary: str,
     *,
     parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
     streams: Mapping[str, Schema],
-    whole: Mapping[str, Schema],
+    static: Mapping[str, Schema],
     components: Components,
     truth: str = "",
     measured: Components | None = None,
@@ -205,7 +208,7 @@ def batch(
 
     Args as for `recursive`, and:
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
-        solve: solve(given) gets the streams and whole topics of all runs, by the names asked for;
+        solve: solve(given) gets the streams and static topics of all runs, by the names asked for;
             `each_run` makes it of a function of one run.
 
     The mean of all ranges:
@@ -217,7 +220,7 @@ def batch(
     >>> average = batch(
     ...     "mean range",
     ...     streams={"/range": schemas.RANGE},
-    ...     whole={},
+    ...     static={},
     ...     components={"range_m": "linear"},
     ...     solve=each_run(mean_range),
     ... )
@@ -242,10 +245,10 @@ def batch(
             runs = next(iter(streams_of.values())).runs
             return made.of_solved(solve(Given(values, found, streams_of, runs)), runs)
 
-        read, needed = _topics(found, streams), _topics(found, whole)
-        return Batch(name, read, needed, solve_all, _priors(found, whole, components))
+        read, needed = _topics(found, streams), _topics(found, static)
+        return Batch(name, read, needed, solve_all, _priors(found, static, components))
 
-    return _estimator(summary, parameters, {**streams, **whole}, optional, bind)
+    return _estimator(summary, parameters, {**streams, **static}, optional, bind)
 
 
 def each_run(
@@ -279,11 +282,11 @@ def each_run(
 
 
 def _priors(
-    found: Mapping[str, Topic], whole: Mapping[str, Schema], components: Components
+    found: Mapping[str, Topic], static: Mapping[str, Schema], components: Components
 ) -> dict[str, Components]:
     return {
         found[name].name: components
-        for name, schema in whole.items()
+        for name, schema in static.items()
         if schema is schemas.GAUSSIAN_ESTIMATE and name in found
     }
 
@@ -305,11 +308,11 @@ def _estimator(
             for prefix, found in bindings(topics, asked, optional)
         ]
 
-    needs = [
+    requirements = [
         f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
         for name, schema in asked.items()
     ]
-    return Estimator(summary, ", ".join(needs), parameters, bind)
+    return Estimator(summary, ", ".join(requirements), parameters, bind)
 
 
 class _Carried(NamedTuple):

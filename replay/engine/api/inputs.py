@@ -1,4 +1,4 @@
-"""What estimators from plain functions are given: whole streams, one run of them, a block's messages."""
+"""Defines what estimators from plain functions are given: streams, one run, a block's messages."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ Integers = NDArray[np.int64]
 class Given(Mapping[str, Ragged], Generic[ParametersType]):
     """What is given of all runs; topics go by the names under which an estimator asked for them.
 
-    It maps those that are given whole to their streams: of a recursion what it starts from, of a batch
+    It maps the static topics to their streams: of a recursion what it starts from, of a batch
     all. A topic that is optional and that the log lacks is not in it.
     """
 
     parameters: ParametersType
     topics: Mapping[str, Topic]
-    whole: Mapping[str, Ragged]
+    static: Mapping[str, Ragged]
     runs: int
 
     def stated(self, topic: str, name: str) -> float:
@@ -46,19 +46,19 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
         They are of the estimate's components, in their order, whatever the log's order is. NaN where a
         run has none that can be used: it has failed, and gets no messages.
         """
-        return gaussians(self.whole[topic])
+        return gaussians(self.static[topic])
 
     def __getitem__(self, topic: str) -> Ragged:
-        """A whole topic, all runs end to end."""
-        return self.whole[topic]
+        """A static topic, all runs end to end."""
+        return self.static[topic]
 
     def __iter__(self) -> Iterator[str]:
         """The names of what is given."""
-        return iter(self.whole)
+        return iter(self.static)
 
     def __len__(self) -> int:
         """How many topics are given."""
-        return len(self.whole)
+        return len(self.static)
 
 
 @dataclass(frozen=True, eq=False)

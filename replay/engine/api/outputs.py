@@ -1,4 +1,4 @@
-"""What estimators from plain functions fill or return, and the output topics that are made of it."""
+"""Defines what estimators from plain functions fill or return, and makes output topics of it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -53,8 +53,8 @@ class Solution(NamedTuple):
     cost: Floats
 
 
-class Told(NamedTuple):
-    """What a batch says beside its estimates: stamps (n,), and columns by the fields of a schema."""
+class Diagnostics(NamedTuple):
+    """Numbers that a batch gives beside its estimates: stamps (n,), and columns by a schema's fields."""
 
     time_ns: Integers
     columns: Mapping[str, NDArray]
@@ -87,7 +87,7 @@ class Estimates(NamedTuple):
     covariance: Floats
     solution: Solution | None = None
     innovations: Measured | None = None
-    further: Mapping[str, Told] = MappingProxyType({})
+    further: Mapping[str, Diagnostics] = MappingProxyType({})
 
 
 class Solved(NamedTuple):

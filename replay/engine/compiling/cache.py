@@ -1,4 +1,4 @@
-"""The user's cache: what fuselog can make again, kept on disk, never trusted when damaged or foreign.
+"""Keeps results that can be computed again in the user's cache; damaged or foreign files are not used.
 
 A file is one line of text, which begins with the SHA-256 of all that follows it and says what made the
 file, and then the content.

@@ -1,4 +1,4 @@
-"""Loops over runs of plain functions, compiled and shared among the cores.
+"""Compiles functions of one run into loops over all runs, which the cores share.
 
 A kernel is a plain Python function over numbers and arrays, with all that it calls. One that makes no
 arrays is written in LLVM's text by ourselves (`replay.engine.compiling.kernels`), in milliseconds; any
@@ -73,10 +73,11 @@ def compile_over_runs(
             time, and is several times as fast.
         title: what it is to who waits until it is compiled, such as "ekf of robot".
 
-    Returns `loop(runs, *arguments, scratch=None, own=None)`; its results do not depend on the number of
-    runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
-    `run_once`: arrays that one run after another may work in. Or that is `own[run]`, such as the run's
-    generator of random numbers; a run whose own is None is left out.
+    Returns `loop(runs, *arguments, scratch=None, per_run=None)`; its results do not depend on the number
+    of runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
+    `run_once`: arrays that one run after another may work in. Or that is `per_run[run]`, such as the
+        run's
+    generator of random numbers; a run for which that is None is left out.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
 
     For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an
@@ -113,15 +114,15 @@ def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
         runs: int,
         *arguments: Any,
         scratch: Callable[[], Any] | None = None,
-        own: Sequence[Any] | None = None,
+        per_run: Sequence[Any] | None = None,
     ) -> None:
         memory = [scratch()] if scratch else []
         with np.errstate(all="ignore"):
             for run in range(runs):
-                if own is None:
+                if per_run is None:
                     run_once(run, *arguments, *memory)
-                elif own[run] is not None:
-                    run_once(run, *arguments, own[run])
+                elif per_run[run] is not None:
+                    run_once(run, *arguments, per_run[run])
 
     return loop
 
@@ -131,19 +132,21 @@ def _share(
     runs: int,
     *arguments: Any,
     scratch: Callable[[], Any] | None = None,
-    own: Sequence[Any] | None = None,
+    per_run: Sequence[Any] | None = None,
 ) -> None:
     """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
 
     def prepared() -> Callable[[int, int], None]:
-        if own is None:
+        if per_run is None:
             return loop.of(arguments, [scratch()] if scratch else [])
-        of_own = {run: loop.of((*arguments, each)) for run, each in enumerate(own) if each is not None}
+        by_run = {
+            run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None
+        }
 
         def through(first: int, end: int) -> None:
             for run in range(first, end):
-                if run in of_own:
-                    of_own[run](run, run + 1)
+                if run in by_run:
+                    by_run[run](run, run + 1)
 
         return through
 

@@ -1,4 +1,4 @@
-"""Kernels that make arrays, compiled by numba together with all that they call, once per source text.
+"""Compiles kernels that make arrays through numba, with all that they call, once per source text.
 
 numba's own disk cache finds module-level functions only, does not notice that a function from another
 file has changed, and stops on a damaged file. So the sources of a kernel and of everything it calls
@@ -20,9 +20,9 @@ import numba
 import numpy as np
 from numba.core.errors import NumbaError
 
-from replay.engine.compiling.bundling import Bundle, DoesNotCompile
 from replay.engine.compiling.inlining import Inlined
-from replay.engine.compiling.keeping import execute, load
+from replay.engine.compiling.kernel_cache import execute, load
+from replay.engine.compiling.kernel_source import DoesNotCompile, KernelSource
 
 # Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
 _PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
@@ -31,28 +31,28 @@ vars(_PARTS).update(collections=collections, numba=numba, numpy=np, Inlined=Inli
 
 def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function as numba compiles it."""
-    bundle = Bundle()
-    name = bundle.add(function.__name__, function)
+    source = KernelSource()
+    name = source.add(function.__name__, function)
     names = ", ".join(inspect.signature(function).parameters)
     text = f"def kernel({names}):\n    return {name}({names})"
-    return _compile(bundle, name, text, f"{function.__module__}.{function.__name__}")
+    return _compile(source, name, text, f"{function.__module__}.{function.__name__}")
 
 
 class _Loop:
     """A function of one run as a loop over runs."""
 
     def __init__(self, run_once: Callable[..., None], title: str = "") -> None:
-        bundle = Bundle()
-        kernel = bundle.add("run_once", run_once)
+        source = KernelSource()
+        kernel = source.add("run_once", run_once)
         names = ", ".join(list(inspect.signature(run_once).parameters)[1:])
         text = (
             f"def kernel(first, end, {names}):\n"
             "    for run in range(first, end):\n"
             f"        {kernel}(run, {names})"
         )
-        self._name, self._places = run_once.__name__, bundle.places
+        self._name, self._places = run_once.__name__, source.places
         title = title or f"{run_once.__module__}.{run_once.__name__}"
-        self._loop = _compile(bundle, kernel, text, title)
+        self._loop = _compile(source, kernel, text, title)
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
         """The loop for these arguments."""
@@ -77,11 +77,11 @@ class _Loop:
 loop_of = _Loop
 
 
-def _compile(bundle: Bundle, called: str, definition: str, title: str) -> Callable[..., Any]:
+def _compile(source: KernelSource, called: str, definition: str, title: str) -> Callable[..., Any]:
     """The function `kernel` that calls one that a bundle holds; `title` says what it is."""
-    for own, source in bundle.definitions.items():
-        if own not in vars(_PARTS):
-            execute(source, own, _PARTS)
+    for name, defined in source.definitions.items():
+        if name not in vars(_PARTS):
+            execute(defined, name, _PARTS)
     needed = f"import numba\nfrom {_PARTS.__name__} import {called}"
-    text = f"{needed}\n@numba.njit(nogil=True, {bundle.options})\n{definition}\n"
+    text = f"{needed}\n@numba.njit(nogil=True, {source.options})\n{definition}\n"
     return load(text, title)

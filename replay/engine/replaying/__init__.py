@@ -1,4 +1,4 @@
-"""The replay itself: estimators, late messages, and what is watched meanwhile.
+"""Replays: takes estimators through messages, in order or late, and monitors their runs.
 
 Begin with `replaying`.
 """

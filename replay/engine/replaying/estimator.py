@@ -1,4 +1,4 @@
-"""What an estimator is to a replay: its parameters, the topics it binds to, and what is asked of it.
+"""Defines an estimator as a replay sees it: its parameters, its topics, and how it is called.
 
 An estimator is bound to topics and turns ragged streams into ragged streams. A recursive one is handed
 the blocks of its topics one after another and carries a state from block to block; a batch one gets
@@ -16,33 +16,35 @@ from recorders.errors import BadInput
 from recorders.log import Clock, Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
-from replay.engine.compiling.bundling import DoesNotCompile
+from replay.engine.compiling.kernel_source import DoesNotCompile
+from replay.engine.renamed import renamed
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.sources import Source, ensemble_of
 from replay.engine.vectors.components import Components
 
 
-class Opened(NamedTuple):
-    """What is taken from the first messages of a log: whole topics to start from, and what is told."""
+class Initialized(NamedTuple):
+    """What the first messages of a log give: static topics to start from, and output streams."""
 
-    whole: dict[str, Ragged]
-    told: list[Ragged]
+    static: dict[str, Ragged]
+    outputs: list[Ragged]
 
 
 @dataclass(frozen=True)
-class Opening:
+class Initialization:
     """How an estimator finds what a log does not state, such as where to begin.
 
     Attributes:
         topics: those whose first messages it is handed.
-        find: (first messages, the topics that `start` needs whole, clock) -> what there is to start
+        find: (first messages, the static topics, clock) -> what there is to start
             from; by the clock by which the replay stamps estimates.
     """
 
     topics: tuple[str, ...]
-    find: Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock], Opened]
+    find: Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock], Initialized]
 
 
+@renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True)
 class Recursive:
     """An estimator that goes through its topics in time.
@@ -50,38 +52,39 @@ class Recursive:
     Attributes:
         name: what its output topics begin with, `/estimates/` + name.
         streams: the topics that `run` is handed, in the order its `Events.topic` counts them.
-        whole: the topics that `start` needs whole, such as a map or a prior.
-        start: whole topics -> the state before the first block.
+        static: the topics that `start` needs from beginning to end, such as a map or a prior.
+        start: static topics -> the state before the first block.
         run: state and block -> the state after it, and the output streams. States are values: `run`
             never changes the one it is handed.
-        priors: the whole topics that are Gaussian priors, and the components that are wanted of each.
+        priors: the static topics that are Gaussian priors, and the components that are wanted of each.
             `start` gets one message of these for every run, as wanted, NaN where the run cannot start;
             see `replay.engine.streams.priors`.
-        given: whole topics that are not read from the runs, see `pipeline.runs.initial_states`.
+        given: static topics that are not read from the runs, see `pipeline.runs.initial_states`.
         finish: the state after the last block -> the outputs that waited for messages which did not
             come any more.
         parameters: those that it was bound with, defaults included.
-        rewinding: the same estimator for a block's messages in the order in which they came, whose
+        out_of_sequence: the same estimator for a block's messages in the order in which they came, whose
             stamps go back by up to so many nanoseconds; None where it cannot go back. Raises BadInput
             where its parameters do not let it.
-        opening: how it finds what a log does not state; None where that states all.
+        initialization: how it finds what a log does not state; None where that states all.
         assumed: the parameters that are assumed, since the log does not state them.
     """
 
     name: str
     streams: tuple[str, ...]
-    whole: tuple[str, ...]
+    static: tuple[str, ...]
     start: Callable[[dict[str, Ragged]], Any]
     run: Callable[[Any, Block], tuple[Any, list[Ragged]]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
     finish: Callable[[Any], list[Ragged]] | None = None
     parameters: Parameters | None = None
-    rewinding: "Callable[[int], Recursive] | None" = None
-    opening: Opening | None = None
+    out_of_sequence: "Callable[[int], Recursive] | None" = None
+    initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
 
 
+@renamed(whole="static")
 @dataclass(frozen=True)
 class Batch:
     """An estimator that needs everything at once: `solve` turns its topics into output streams.
@@ -91,7 +94,7 @@ class Batch:
 
     name: str
     streams: tuple[str, ...]
-    whole: tuple[str, ...]
+    static: tuple[str, ...]
     solve: Callable[[dict[str, Ragged]], list[Ragged]]
     priors: Mapping[str, Components] = field(default_factory=dict)
     given: Mapping[str, Ragged] = field(default_factory=dict)
@@ -101,6 +104,7 @@ class Batch:
 Bound = Recursive | Batch
 
 
+@renamed(needs="requirements")
 @dataclass(frozen=True)
 class Estimator(Generic[ParametersType]):
     """A registered estimator: what it is, its parameters, and how it binds to the topics of a log.
@@ -111,7 +115,7 @@ class Estimator(Generic[ParametersType]):
     """
 
     summary: str
-    needs: str
+    requirements: str
     parameters: type[ParametersType]
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
     variant: str | None = None
@@ -187,10 +191,10 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
         raise BadInput(f"{first.name}: {error}") from error
     if not bound:
         raise BadInput(
-            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.needs}; "
+            f"{first.name}: estimator {label} does not fit this log: it needs {estimator.requirements}; "
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
-    read = dict.fromkeys(topic for each in bound for topic in (*each.whole, *each.streams))
+    read = dict.fromkeys(topic for each in bound for topic in (*each.static, *each.streams))
     ensemble_of(sources).require_alike(read)
     return [
         each if each.parameters is not None else replace(each, parameters=parameters) for each in bound

@@ -1,4 +1,4 @@
-"""Messages that come late: left out, waited for, or gone back for.
+"""Handles messages that arrive late: drops them, waits for them, or goes back for them.
 
 In the order of arrival (log time) the stamps at which things were measured (publish time) go back
 wherever a message was late. `taking_late` makes of an estimator one that is handed its messages as they
@@ -82,12 +82,12 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
             "leave out --late"
         )
     if late.policy == "rewind":
-        if bound.rewinding is None:
+        if bound.out_of_sequence is None:
             raise BadInput(
                 f"estimator {bound.name}: only an estimator made of a model and a method can go "
                 "back to a late message; give --late drop or --late wait:SECONDS"
             )
-        bound = bound.rewinding(late.window_ns)
+        bound = bound.out_of_sequence(late.window_ns)
     return replace(
         bound,
         start=partial(_start, bound),
@@ -112,8 +112,8 @@ class _State(NamedTuple):
     arrived_ns: Integers | None = None
 
 
-def _start(bound: Recursive, whole: dict[str, Ragged]) -> _State:
-    return _State(bound.start(whole), {})
+def _start(bound: Recursive, static: dict[str, Ragged]) -> _State:
+    return _State(bound.start(static), {})
 
 
 def _run(bound: Recursive, late: Late, state: _State, block: Block) -> tuple[_State, list[Ragged]]:

@@ -1,4 +1,4 @@
-"""The replay: one time-ordered pass over the runs of an ensemble, several estimators at once."""
+"""Replays the runs of an ensemble in one time-ordered pass, through several estimators at once."""
 
 import sys
 from collections import defaultdict
@@ -15,14 +15,14 @@ from recorders.errors import BadInput
 from recorders.log import Clock
 from replay.engine.replaying.estimator import Batch, Bound, Recursive, code_of
 from replay.engine.replaying.late import Late, taking_late
-from replay.engine.replaying.supervision import Watch
+from replay.engine.replaying.monitor import RunMonitor
 from replay.engine.replaying.usage import Usage
 from replay.engine.streams.blocks import Block, Ragged, gather, join, merge_events
 from replay.engine.streams.priors import start_of_runs
 from replay.engine.streams.sources import Ensemble, Source, ensemble_of
 
 BLOCK_MESSAGES = 1 << 18
-# Of a run, those that an opening looks at.
+# Of a run, those that an initialization looks at.
 FIRST_MESSAGES = 1 << 15
 # Of the product of two standard deviations: rounding is far below.
 ASYMMETRIC = 1e-6
@@ -70,7 +70,7 @@ def replay(
         is_part: whether there are more runs than these. Then it is no bad input that an estimator can
             follow none of them: they fail, and the report says so.
 
-    A run that an estimator cannot follow fails alone, see `replay.engine.replaying.supervision`; the
+    A run that an estimator cannot follow fails alone, see `replay.engine.replaying.monitor`; the
     failures come last.
     Raises BadInput where an estimator can follow no run, no run has a message for it, a run's span
     begins after the prior of an estimator (see `pipeline.runs.initial_states`), or it cannot do as
@@ -79,52 +79,54 @@ def replay(
     if late is not None:
         estimators = [taking_late(bound, late) for bound in estimators]
     ensemble = ensemble_of(sources)
-    read = ensemble.read(sorted({topic for bound in estimators for topic in bound.whole}))
-    wholes = [{topic: read[topic] for topic in bound.whole} | dict(bound.given) for bound in estimators]
-    for bound, whole in zip(estimators, wholes, strict=True):
-        _refuse_old_priors(bound, ensemble, whole, order)
-        _refuse_asymmetric_priors(bound, ensemble, whole)
+    read = ensemble.read(sorted({topic for bound in estimators for topic in bound.static}))
+    statics = [
+        {topic: read[topic] for topic in bound.static} | dict(bound.given) for bound in estimators
+    ]
+    for bound, static in zip(estimators, statics, strict=True):
+        _refuse_old_priors(bound, ensemble, static, order)
+        _refuse_asymmetric_priors(bound, ensemble, static)
     stamps: Clock = order if late is None else "publish_time"
-    watches = [
-        Watch(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
+    monitors = [
+        RunMonitor(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
     ]
-    for watch, whole in zip(watches, wholes, strict=True):
-        watch.whole = whole
-        watch.usage.note_start(whole)
+    for monitor, static in zip(monitors, statics, strict=True):
+        monitor.static = static
+        monitor.usage.note_start(static)
     told: list[Ragged] = []
-    opening = partial(_open, ensemble, order, stamps, told)
-    states, refused = _start(estimators, watches, wholes, opening)
+    initialization = partial(_open, ensemble, order, stamps, told)
+    states, refused = _start(estimators, monitors, statics, initialization)
     if refused and not is_part:
         raise next(iter(refused.values()))
     if told:
         yield told
-    for bound, watch, given in zip(estimators, watches, states, strict=True):
+    for bound, monitor, given in zip(estimators, monitors, states, strict=True):
         if isinstance(bound, Batch):
             for block in _required(ensemble, bound.streams, order, sys.maxsize):
-                yield watch.receive(watch.take(partial(_solve, bound, given), block))
+                yield monitor.receive(monitor.take(partial(_solve, bound, given), block))
     streamed = {topic for bound in estimators if isinstance(bound, Recursive) for topic in bound.streams}
     for block in _required(ensemble, sorted(streamed), order, block_messages):
         outputs: list[Ragged] = []
-        for index, (bound, watch) in enumerate(zip(estimators, watches, strict=True)):
+        for index, (bound, monitor) in enumerate(zip(estimators, monitors, strict=True)):
             if isinstance(bound, Recursive):
                 streams = {topic: block[topic] for topic in bound.streams}
                 work = partial(_advance, bound, states[index], order)
-                states[index], produced = watch.take(work, streams)
-                outputs += watch.receive(produced)
+                states[index], produced = monitor.take(work, streams)
+                outputs += monitor.receive(produced)
         yield outputs
-    for bound, watch, state in zip(estimators, watches, states, strict=True):
+    for bound, monitor, state in zip(estimators, monitors, states, strict=True):
         if isinstance(bound, Recursive) and bound.finish is not None and state is not _REFUSED:
-            yield watch.receive(watch.take(partial(_finish, bound, bound.finish, state), {}))
-    yield [failures for watch in watches for failures in watch.finish()]
+            yield monitor.receive(monitor.take(partial(_finish, bound, bound.finish, state), {}))
+    yield [failures for monitor in monitors for failures in monitor.finish()]
     if report is not None:
         report.refused |= refused
-        for watch in watches:
-            if watch.refused is not None:
-                report.refused[watch.name] = watch.refused
-            report.seconds[watch.name.partition("/")[0]] += watch.seconds
-            report.coverage += watch.coverage()
-            report.usages[watch.name] = watch.usage
+        for monitor in monitors:
+            if monitor.refused is not None:
+                report.refused[monitor.name] = monitor.refused
+            report.seconds[monitor.name.partition("/")[0]] += monitor.seconds
+            report.coverage += monitor.coverage()
+            report.usages[monitor.name] = monitor.usage
 
 
 def _open(
@@ -133,25 +135,25 @@ def _open(
     stamps: Clock,
     told: list[Ragged],
     bound: Bound,
-    whole: Mapping[str, Ragged],
+    static: Mapping[str, Ragged],
 ) -> dict[str, Ragged]:
     """What an estimator starts from that is found in the first messages; `told` gets what it says."""
-    if not isinstance(bound, Recursive) or bound.opening is None:
+    if not isinstance(bound, Recursive) or bound.initialization is None:
         return {}
-    topics = bound.opening.topics
+    topics = bound.initialization.topics
     nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
     first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
     with code_of(bound.name):
-        found = bound.opening.find(first, whole, stamps)
-    told += found.told
-    return found.whole
+        found = bound.initialization.find(first, static, stamps)
+    told += found.outputs
+    return found.static
 
 
 def _start(
     estimators: Sequence[Bound],
-    watches: Sequence[Watch],
-    wholes: Sequence[Mapping[str, Ragged]],
-    opening: Callable[[Bound, Mapping[str, Ragged]], dict[str, Ragged]],
+    monitors: Sequence[RunMonitor],
+    statics: Sequence[Mapping[str, Ragged]],
+    initialization: Callable[[Bound, Mapping[str, Ragged]], dict[str, Ragged]],
 ) -> tuple[list[Any], dict[str, BadInput]]:
     """The states of recursions and what batches are given; _REFUSED where there is none.
 
@@ -160,17 +162,17 @@ def _start(
     """
     states: list[Any] = []
     told_of: dict[str, list[BadInput | None]] = {}
-    for bound, watch, whole in zip(estimators, watches, wholes, strict=True):
+    for bound, monitor, static in zip(estimators, monitors, statics, strict=True):
         told = told_of.setdefault(bound.name.partition("/")[0], [])
         try:
-            given, unable = start_of_runs({**whole, **opening(bound, whole)}, bound.priors)
-            watch.exclude(unable)
+            given, unable = start_of_runs({**static, **initialization(bound, static)}, bound.priors)
+            monitor.exclude(unable)
             with code_of(bound.name):
                 states.append(given if isinstance(bound, Batch) else bound.start(given))
-            starts = len(unable) < watch.runs
+            starts = len(unable) < monitor.runs
             told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
         except BadInput as error:
-            watch.exclude(dict.fromkeys(range(watch.runs), str(error)))
+            monitor.exclude(dict.fromkeys(range(monitor.runs), str(error)))
             states.append(_REFUSED)
             told.append(error)
     refused = {
@@ -207,12 +209,12 @@ def _finish(
 
 
 def _refuse_old_priors(
-    bound: Bound, ensemble: Ensemble[Source], whole: Mapping[str, Ragged], order: Clock
+    bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged], order: Clock
 ) -> None:
     """Raise BadInput where an estimator would begin a span with the state of an earlier time."""
-    for topic in (bound.priors.keys() & whole.keys()) - bound.given.keys():
+    for topic in (bound.priors.keys() & static.keys()) - bound.given.keys():
         for run, start_ns in ensemble.starts_ns.items():
-            times_ns = whole[topic].of_run(run).times(order)[:1]
+            times_ns = static[topic].of_run(run).times(order)[:1]
             if len(times_ns) and times_ns[0] < start_ns:
                 raise BadInput(
                     f"{ensemble[run].name}: the replay would start {bound.name} from {topic}, which is "
@@ -222,11 +224,11 @@ def _refuse_old_priors(
 
 
 def _refuse_asymmetric_priors(
-    bound: Bound, ensemble: Ensemble[Source], whole: Mapping[str, Ragged]
+    bound: Bound, ensemble: Ensemble[Source], static: Mapping[str, Ragged]
 ) -> None:
     """Raise BadInput where a prior's covariance is none, whose triangles would give two answers."""
-    for topic in bound.priors.keys() & whole.keys():
-        covariance = whole[topic].stream["covariance"]
+    for topic in bound.priors.keys() & static.keys():
+        covariance = static[topic].stream["covariance"]
         size = isqrt(covariance.shape[1])
         if not len(covariance) or size**2 != covariance.shape[1]:
             continue
@@ -235,7 +237,7 @@ def _refuse_asymmetric_priors(
         apart = np.abs(matrix - matrix.swapaxes(1, 2))
         wrong = (apart > ASYMMETRIC * deviation[:, :, None] * deviation[:, None, :]).any(axis=(1, 2))
         if wrong.any():
-            run = int(np.searchsorted(whole[topic].offsets, np.argmax(wrong), "right")) - 1
+            run = int(np.searchsorted(static[topic].offsets, np.argmax(wrong), "right")) - 1
             raise BadInput(
                 f"{ensemble[run].name}: the covariance of {topic} is not symmetric; mend the prior"
             )

@@ -1,4 +1,4 @@
-"""What became of the measurements that an estimator was given: used, gated, skipped, or nothing at all.
+"""Counts what became of an estimator's measurements: used, gated, skipped, or without effect.
 
 It is counted from what goes in and comes out, for any estimator: messages by topic, innovations, and
 what the estimator says that it skipped.
@@ -81,9 +81,9 @@ class Usage:
     speaks: bool = False
     doubtful: dict[str, str] = field(default_factory=dict)
 
-    def note_start(self, whole: Mapping[str, Ragged]) -> None:
+    def note_start(self, static: Mapping[str, Ragged]) -> None:
         """Look at the streams that the estimator begins with."""
-        for topic, ragged in whole.items():
+        for topic, ragged in static.items():
             if ragged.stream.schema.full_name == LANDMARK:
                 for run in range(ragged.runs):
                     self._note_map(topic, ragged.of_run(run))
@@ -99,8 +99,8 @@ class Usage:
                 f"landmark {number[worst]} is stated at two places, {apart_m[worst]:.3g} m apart"
             )
 
-    def note_given(self, streams: Mapping[str, Ragged], whole: Mapping[str, Ragged]) -> None:
-        """Count a block of messages; `whole` are the streams that the estimator began with."""
+    def note_given(self, streams: Mapping[str, Ragged], static: Mapping[str, Ragged]) -> None:
+        """Count a block of messages; `static` are the streams that the estimator began with."""
         for topic, ragged in streams.items():
             stream = ragged.stream
             self.given[topic] += len(stream)
@@ -110,7 +110,7 @@ class Usage:
             facts = self.facts.setdefault(topic, Counter())
             facts["are infinite"] += int(_infinite(stream).sum())
             facts["repeat the message before"] += int(_repeated(stream).sum())
-            maps = [each.stream for each in whole.values() if each.stream.schema.full_name == LANDMARK]
+            maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
             if maps and "target_id" in stream.columns:
                 known = np.concatenate([each["landmark_id"] for each in maps])
                 facts["are of targets that the map lacks"] += int(

@@ -1,4 +1,4 @@
-"""Streams of many runs laid end to end, where they are read from, and what estimators make of them.
+"""Lays streams of many runs end to end, reads them, and makes streams of what estimators return.
 
 Begin with `blocks`.
 """

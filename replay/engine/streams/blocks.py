@@ -1,4 +1,4 @@
-"""Ragged columns: the streams of many runs laid end to end, and their merged order of events."""
+"""Lays the streams of many runs end to end in ragged columns, and merges their events in time order."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -58,13 +58,13 @@ CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
 class Block(NamedTuple):
     """What an estimator gets at once: a span of its topics, in all runs.
 
-    `came` (n, 2) says of every event when it was taken and its place in the file, where that is not its
-    stamp's order alone; see `replay.engine.replaying.late`.
+    `arrival` (n, 2) says of every event when it was taken and its place in the file, where that is not
+    its stamp's order alone; see `replay.engine.replaying.late`.
     """
 
     streams: dict[str, Ragged]
     events: Events
-    came: NDArray[np.int64] | None = None
+    arrival: NDArray[np.int64] | None = None
 
     def column(self, *names: str, missing: float = np.nan) -> NDArray:
         """One field of every event: the first of `names` that its topic has, else `missing`."""

@@ -1,4 +1,4 @@
-"""What the channels of a log state, and which of its topics are numbered: what estimators bind by."""
+"""Reads what the channels of a log state, and finds the topics that estimators bind to."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache

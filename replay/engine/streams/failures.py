@@ -1,4 +1,4 @@
-"""Which runs an estimator could not follow to the end, when and why: one place that states and reads it.
+"""States and reads which runs an estimator could not follow to the end, when and why.
 
 A failure is a message whose number stands for a sentence; the channel's metadata lists the sentences as
 JSON. Streams that differ only in their lists are one stream when they are joined.

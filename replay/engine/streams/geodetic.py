@@ -1,4 +1,4 @@
-"""Geodetic fixes as positions in the log's plane: east, north and up from one origin.
+"""Converts geodetic fixes to positions in the log's plane: east, north and up from one origin.
 
 The origin is what the log's channels state, else a run's first fix.
 """

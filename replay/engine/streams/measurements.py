@@ -1,4 +1,4 @@
-"""Vectors that sensors measure, and their covariances, by the components that their streams state."""
+"""Reads vectors that sensors measure, and their covariances, by the components that streams state."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The prior rule: components by name, and a run without a usable prior fails alone."""
+"""Reads priors by component names; a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -112,21 +112,21 @@ def no_priors(runs: int, components: Components, reason: str) -> Priors:
 
 
 def start_of_runs(
-    whole: Mapping[str, Ragged], priors: Mapping[str, Components]
+    static: Mapping[str, Ragged], priors: Mapping[str, Components]
 ) -> tuple[dict[str, Ragged], dict[int, str]]:
     """What an estimator starts from, and why some runs cannot start.
 
     Args:
-        whole: whole topics of all runs.
+        static: topics of all runs.
         priors: which of them are priors, and the components that are wanted of each.
 
     Returns the topics, where a prior is now one message for every run, of the wanted components in their
     order, NaN where the run cannot start; and the reasons by run, which may be all of them.
     Raises BadInput where a topic is no such prior, see `priors_of`.
     """
-    found, failed = dict(whole), dict[int, str]()
+    found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():
-        read = priors_of(whole[topic], components)
+        read = priors_of(static[topic], components)
         for run, reason in enumerate(read.reasons):
             if reason:
                 failed.setdefault(run, reason)

@@ -1,4 +1,4 @@
-"""What estimators say, as streams: states, innovations, what was passed over, and who failed."""
+"""Makes streams of what estimators return: states, innovations, skipped messages, failures."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -48,7 +48,7 @@ def state_stream(
 def gaussian_stream(
     topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Means (n, d) and covariances (n, t, t); what is no number ends its run, see `supervision`."""
+    """Means (n, d) and covariances (n, t, t); what is no number ends its run, see `monitor`."""
     columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
     schema = schemas.GAUSSIAN_ESTIMATE
     return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)

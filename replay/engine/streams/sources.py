@@ -1,4 +1,4 @@
-"""Where a replay reads from: log files, or recordings that are still in memory; one run or many."""
+"""Reads the runs of a replay: from log files, or from recordings in memory; one run or many."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

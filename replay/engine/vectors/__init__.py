@@ -1,4 +1,4 @@
-"""Vectors by the names of their components: their tangent spaces and covariances.
+"""Describes vectors by the names of their components, their tangent spaces and covariances.
 
 Begin with `tangent`.
 """

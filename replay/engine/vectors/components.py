@@ -1,11 +1,11 @@
-"""A vector's components by the names that its channel states; their order never matters."""
+"""Matches a vector's components by the names that its channel states; their order never matters."""
 
 from collections.abc import Mapping, Sequence
 from typing import cast
 
 from recorders.errors import BadInput
 from recorders.models.states import state_metadata
-from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, things
+from replay.engine.vectors.tangent import TANGENT_WIDTHS, Kind, are_kinds, manifold_blocks
 
 Components = Mapping[str, Kind]
 
@@ -49,11 +49,13 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
     columns = match_components(stated, wanted, where)
     rows_of: list[range] = []
     end = 0
-    for kind, numbers in things(list(stated_components(stated, wanted, where).values())):
+    for kind, numbers in manifold_blocks(list(stated_components(stated, wanted, where).values())):
         begin, end = end, end + TANGENT_WIDTHS[kind]
         rows_of += [range(begin, end)] * (numbers.stop - numbers.start)
     return [
-        row for _, numbers in things(list(wanted.values())) for row in rows_of[columns[numbers.start]]
+        row
+        for _, numbers in manifold_blocks(list(wanted.values()))
+        for row in rows_of[columns[numbers.start]]
     ]
 
 

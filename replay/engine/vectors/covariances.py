@@ -1,4 +1,4 @@
-"""Covariances: whether they are any, and errors measured by them (NEES, NIS).
+"""Tests covariances for definiteness, and normalises errors by them (NEES, NIS).
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
 """

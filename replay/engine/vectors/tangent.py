@@ -1,4 +1,4 @@
-"""Components that are no vector space: angles, axes and orientations, and their errors in tangent space.
+"""Compares and interpolates angles, axes and orientations in their tangent space.
 
 Every component of a state has a kind. The two of an axis, and the four of a quaternion, stand side by
 side and are equal to their negatives; their error is the rotation from truth to estimate in the body's
@@ -35,7 +35,7 @@ def are_kinds(kinds: Sequence[str]) -> bool:
     return True
 
 
-def things(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
+def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
     """Kind and columns of every number, angle, axis and quaternion."""
     index = 0
     while index < len(kinds):
@@ -51,7 +51,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
     of kind "rotation".
     """
     found: list[tuple[str, str]] = []
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         name = components[columns.start]
         stem = name.rpartition("_")[0] or name
         if kind == "quaternion":
@@ -64,7 +64,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
 def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
     """Estimate - truth, both (n, components), in the tangent space (n, tangent components)."""
     parts = []
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         if kind in ("axis", "quaternion"):
             relative = compose(conjugate(truth[:, columns]), estimate[:, columns])
             parts.append(rotation_vector(relative))
@@ -77,7 +77,7 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
 def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
     """States (n, components) on the shortest way from left to right, at weights (n,) from 0 to 1."""
     value = np.empty(left.shape)
-    for kind, columns in things(kinds):
+    for kind, columns in manifold_blocks(kinds):
         here, there = left[:, columns], right[:, columns]
         value[:, columns] = (
             _slerp(here, there, weight)

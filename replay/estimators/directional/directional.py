@@ -212,7 +212,7 @@ def _of_unit_vectors(
         summary,
         parameters=parameters,
         streams={topic: schema},
-        whole={},
+        static={},
         components=kinds,  # type: ignore[arg-type]
         truth="truth",
         vectors={topic: Vectors({topic: len(kinds)})},
@@ -229,7 +229,7 @@ def _of_headings(
         summary,
         parameters=parameters,
         streams={"headings": schemas.VECTOR_MEASUREMENT},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=components,
         truth="truth",
         vectors={"headings": Vectors({"value": components})},

@@ -38,8 +38,8 @@ HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s
 def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> list[Bound]:
     sensors = list(numbered(topics, "sensor", "detections", schemas.SHOT_DETECTION))
     streams = [f"/sensor{s}/detections" for s in sensors]
-    whole = [f"/sensor{s}/position" for s in sensors]
-    if not sensors or not set(whole) <= set(topics):
+    static = [f"/sensor{s}/position" for s in sensors]
+    if not sensors or not set(static) <= set(topics):
         return []
     worlds = {_world(topics[f"/sensor{s}/detections"]) for s in sensors}
     if len(worlds) > 1:
@@ -50,7 +50,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
     setting = Setting(
         parameters.mode, noise, medium, parameters.estimate_sensors, parameters.cross_covariances
     )
-    return [Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, setting))]
+    return [Batch(name, tuple(streams), tuple(static), partial(_solve, name, sensors, setting))]
 
 
 def _world(topic: Topic) -> tuple[Noise, Medium]:

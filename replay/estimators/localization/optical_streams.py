@@ -66,8 +66,8 @@ def _bind(
 ) -> list[Bound]:
     sensors = list(numbered(topics, "sensor", "line_of_sight", schemas.LINE_OF_SIGHT))
     streams = [f"/sensor{s}/line_of_sight" for s in sensors]
-    whole = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
-    if not sensors or not set(whole) <= set(topics):
+    static = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
+    if not sensors or not set(static) <= set(topics):
         return []
     sigma = [
         [
@@ -78,7 +78,9 @@ def _bind(
     ]
     known = known_biases(sensors, parameters)
     return [
-        Batch(name, tuple(streams), tuple(whole), partial(_solve, name, sensors, np.array(sigma), known))
+        Batch(
+            name, tuple(streams), tuple(static), partial(_solve, name, sensors, np.array(sigma), known)
+        )
     ]
 
 

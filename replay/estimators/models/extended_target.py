@@ -15,7 +15,8 @@ from recorders.models.extended_target import SCALE_VARIANCE, quadratic, surface_
 from recorders.models.planar import Components
 from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 STATES = 4
 
@@ -39,7 +40,7 @@ def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
     return size, size, place, place
 
 
-def measure(target: Components, noise: Components, about: Any, parameters: Any) -> Components:
+def measure(target: Components, noise: Components, reference: Any, parameters: Any) -> Components:
     """A point of the surface and its squares, with noise of two scales and of the point itself."""
     x, y = surface_point(target, (noise[0], noise[1]))
     return quadratic((x + noise[2], y + noise[3]))
@@ -59,7 +60,7 @@ def read(stream: Stream) -> Floats:
 def moments(
     mean: Floats,
     covariance: Floats,
-    about: Any,
+    reference: Any,
     parameters: Any,
     predicted: Floats,
     spread: Floats,

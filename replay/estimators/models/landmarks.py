@@ -18,7 +18,9 @@ from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE
 from replay.engine.vectors.tangent import Kind
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Control, Map, Model, ModelParameters, Motion, Sensor, Start
+from replay.inference.model.model import Control, Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start
 
 POSE: Mapping[str, Kind] = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE)
@@ -115,7 +117,7 @@ def bearing_noise(parameters: Any) -> Components:
     return (parameters.sigma_bearing_rad**2,)
 
 
-def be_there(pose: Components, about: Any, parameters: Any) -> Components:
+def be_there(pose: Components, reference: Any, parameters: Any) -> Components:
     """The pose itself."""
     return pose[0], pose[1], pose[2]
 
@@ -125,7 +127,7 @@ def pose_noise(parameters: Any) -> Components:
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
 
 
-def be_turned(pose: Components, about: Any, parameters: Any) -> Components:
+def be_turned(pose: Components, reference: Any, parameters: Any) -> Components:
     """The heading alone."""
     return (pose[2],)
 
@@ -206,7 +208,7 @@ ODOMETRY = Control(
     schemas.ODOMETRY,
     ("forward_mps", "turn_radps"),
     estimates=True,
-    instead=(TURN_RATE,),
+    fallbacks=(TURN_RATE,),
 )
 # Of logs that were not made for this model: wheels that slip as an indoor robot's may.
 START = Start(
@@ -225,10 +227,10 @@ ROBOT = Model(
             {**RANGE, **BEARING},
             see,
             sight_noise,
-            about=LANDMARKS,
+            reference=LANDMARKS,
         ),
-        Sensor("range", schemas.RANGE, RANGE, see_range, range_noise, about=LANDMARKS),
-        Sensor("bearing", schemas.BEARING, BEARING, see_bearing, bearing_noise, about=LANDMARKS),
+        Sensor("range", schemas.RANGE, RANGE, see_range, range_noise, reference=LANDMARKS),
+        Sensor("bearing", schemas.BEARING, BEARING, see_bearing, bearing_noise, reference=LANDMARKS),
         Sensor(
             "pose",
             schemas.POSE,
@@ -253,7 +255,7 @@ ROBOT = Model(
     MOTION,
     control=ODOMETRY,
     output="pose",
-    estimable={**SIGHT_ERRORS, **DRIVE_ERRORS},
+    augmentable={**SIGHT_ERRORS, **DRIVE_ERRORS},
     start=START,
 )
 RECKONING = Model(
@@ -265,7 +267,7 @@ RECKONING = Model(
     control=ODOMETRY,
     output="pose",
     needs_sensor=False,
-    estimable=DRIVE_ERRORS,
+    augmentable=DRIVE_ERRORS,
     start=START,
     takes_fixes=False,
 )

@@ -4,8 +4,8 @@ The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`recorders.
 nothing stands still and nothing is synchronised. A message states the sensor's pose by the sensor's own
 clock, so that a clock that is ahead by c says what the targets were c before its stamp:
     (azimuth, elevation) = angles of R(bias) R(pose)' (target(t - c) - place).
-Biases and clocks are `estimable`, see `replay.inference.model.augmentation`: `estimate_drift` lets them
-walk.
+Biases and clocks are `augmentable`, see `replay.inference.model.augmentation`: `estimate_drift` lets
+them walk.
 """
 
 from typing import Any
@@ -26,7 +26,8 @@ from recorders.models.optical import (
 from recorders.models.planar import Component, Components
 from replay.engine.streams.measurements import SPACE
 from replay.engine.vectors.tangent import Kind
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 
 class MovingSightParameters(ModelParameters):
@@ -96,16 +97,16 @@ def to_body(orientation: Components, x: Components) -> Components:
     )
 
 
-def sight(state: Components, about: Components, bias: Components, clock_s: Any) -> Components:
-    """Azimuth and elevation in rad of a target; `about` has its number, and the sensor's pose."""
-    second = 1.0 * (about[0] == 2.0)
+def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
+    """Azimuth and elevation in rad of a target; `reference` has its number, and the sensor's pose."""
+    second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (
-        one[0] + second * (other[0] - one[0]) - about[1],
-        one[1] + second * (other[1] - one[1]) - about[2],
-        one[2] + second * (other[2] - one[2]) - about[3],
+        one[0] + second * (other[0] - one[0]) - reference[1],
+        one[1] + second * (other[1] - one[1]) - reference[2],
+        one[2] + second * (other[2] - one[2]) - reference[3],
     )
-    pose = (about[4], about[5], about[6], about[7])
+    pose = (reference[4], reference[5], reference[6], reference[7])
     return azimuth_elevation(rotate(bias, to_body(pose, offset)))
 
 
@@ -117,9 +118,9 @@ def sight_noise(parameters: Any) -> Components:
 def _sensor(number: int) -> Sensor:
     biases, clock = tuple(bias_components(number)), clock_component(number)
 
-    def see(state: Components, about: Components, parameters: Any) -> Components:
+    def see(state: Components, reference: Components, parameters: Any) -> Components:
         bias = tuple(getattr(parameters, name) for name in biases)
-        return sight(state, about, bias, getattr(parameters, clock))
+        return sight(state, reference, bias, getattr(parameters, clock))
 
     return Sensor(
         f"sensor{number}/moving_line_of_sight",
@@ -131,7 +132,7 @@ def _sensor(number: int) -> Sensor:
     )
 
 
-def first_target(state: Components, about: Any, parameters: Any) -> Components:
+def first_target(state: Components, reference: Any, parameters: Any) -> Components:
     """Where it says that it is."""
     return state[0], state[1], state[2]
 
@@ -156,5 +157,5 @@ MOVING_SIGHTS = Model(
         ),
     ),
     Motion(move, move_noise, linear=True),
-    estimable=_BIASES | _CLOCKS,
+    augmentable=_BIASES | _CLOCKS,
 )

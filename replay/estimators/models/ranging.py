@@ -4,7 +4,7 @@
 Velocities are random walks. Radios err by more than white noise: they have a bias, `bias_range_m`, an
 error of each anchor or each pair of anchor and tag that lasts for seconds, and outliers where the line
 of sight is blocked. All three are options, see `replay.inference.model.augmentation` and
-`replay.inference.linear_algebra.gaussian.widening`.
+`replay.inference.linear_algebra.gaussian.inflation`.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,9 @@ from recorders.models.planar import Components
 from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import SPACE
 from replay.engine.vectors.tangent import Kind
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 HEADINGS = 8  # from which a pose is sought
 _NS = 1e-9
@@ -102,16 +104,16 @@ def see(state: Components, anchor: Components, parameters: Any) -> Components:
     return (distance(here, anchor) + parameters.bias_range_m,)
 
 
-def see_by_tag(state: Components, about: Components, parameters: Any) -> Components:
-    """The range of an anchor from a tag on the body, which `about` has behind the anchor."""
+def see_by_tag(state: Components, reference: Components, parameters: Any) -> Components:
+    """The range of an anchor from a tag on the body, which `reference` has behind the anchor."""
     cosine, sine = np.cos(state[2]), np.sin(state[2])
-    ahead, left, up = about[3], about[4], about[5]
+    ahead, left, up = reference[3], reference[4], reference[5]
     tag = (
         state[0] + cosine * ahead - sine * left,
         state[1] + sine * ahead + cosine * left,
         parameters.height_m + up,
     )
-    return (distance(tag, about) + parameters.bias_range_m,)
+    return (distance(tag, reference) + parameters.bias_range_m,)
 
 
 def see_noise(parameters: Any) -> Components:
@@ -231,12 +233,18 @@ RANGING_POSITION = Model(
     RangingParameters,
     (
         Sensor(
-            "ranges", schemas.ANCHOR_RANGE, RANGE, see, see_noise, about=ANCHORS, delay="range_delay_s"
+            "ranges",
+            schemas.ANCHOR_RANGE,
+            RANGE,
+            see,
+            see_noise,
+            reference=ANCHORS,
+            delay="range_delay_s",
         ),
     ),
     Motion(move, move_noise, linear=True),
     start=Start({}, ASSUMED, find=find_position),
-    estimable=ERRORS,
+    augmentable=ERRORS,
     takes_fixes=False,
 )
 RANGING_POSE = Model(
@@ -250,12 +258,12 @@ RANGING_POSE = Model(
             RANGE,
             see_by_tag,
             see_noise,
-            about=(ANCHORS, TAGS),
+            reference=(ANCHORS, TAGS),
             delay="range_delay_s",
         ),
     ),
     Motion(move_pose, move_pose_noise, linear=True),
     start=Start({}, {**ASSUMED, "turn_acceleration_density": 1.0}, find=find_pose),
-    estimable=ERRORS,
+    augmentable=ERRORS,
     takes_fixes=False,
 )

@@ -13,7 +13,8 @@ from recorders.log import schemas
 from recorders.models.planar import Components
 from recorders.models.reactor import CONSUMED, PRODUCED, react, total_pressure
 from replay.engine.arrays import Floats
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 
 class ReactorParameters(ModelParameters):
@@ -56,7 +57,7 @@ def moments(
             covariance[row, column] += mixed + gain[row] * gain[column] * variance
 
 
-def read(pressures: Components, about: Any, parameters: Any) -> Components:
+def read(pressures: Components, reference: Any, parameters: Any) -> Components:
     """What the sensor reads."""
     return total_pressure(pressures)
 

@@ -3,7 +3,7 @@
 A report has the muzzle blast's direction of arrival, the bullet's direction as the shockwave tells it,
 and the shockwave's lead. All are of the place from which the shot was fired: the sound has travelled
 since. Reports may be wrong, by an echo or a shockwave of another shot: to Gaussian methods as a whole,
-see `replay.inference.linear_algebra.gaussian.widening`; to `particles:N` each component by itself.
+see `replay.inference.linear_algebra.gaussian.inflation`; to `particles:N` each component by itself.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,9 @@ from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE
 from replay.estimators.localization.rays import intersect_rays
 from replay.inference.linear_algebra.gaussian import LOG_TWO_PI
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 _NS = 1e-9
 HALF_TURN = float(np.pi)
@@ -138,11 +140,11 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
     places = dict(zip(sensors["landmark_id"].tolist(), sensors["position_m"][:, :2], strict=True))
     known = reports.take(np.isin(reports["sensor_id"], sensors["landmark_id"]))
     heard = np.stack([known[name] for name in HEARD], axis=1)
-    about = np.array([places[sensor] for sensor in known["sensor_id"].tolist()]).reshape(-1, 2)
+    reference = np.array([places[sensor] for sensor in known["sensor_id"].tolist()]).reshape(-1, 2)
     time_ns = known.publish_time_ns
     ends = np.searchsorted(time_ns, time_ns + round(parameters.start_s / _NS), side="right")
     for begin, end in enumerate(ends.tolist()):
-        shot = _best_shot(heard[begin:end], about[begin:end], parameters)
+        shot = _best_shot(heard[begin:end], reference[begin:end], parameters)
         if shot is not None:
             sigma = np.repeat(
                 [parameters.start_sigma_m, parameters.start_sigma_rad, parameters.start_sigma_mps],
@@ -214,12 +216,12 @@ MOVING_SHOOTER = Model(
             HEARD,
             hear,
             hear_noise,
-            about=SENSORS,
+            reference=SENSORS,
             log_likelihood=log_likelihood,
         ),
     ),
     Motion(move, move_noise, linear=True),
     start=Start({}, ASSUMED, find=find_shooter),
-    estimable={"speed_of_sound_mps": "linear"},
+    augmentable={"speed_of_sound_mps": "linear"},
     takes_fixes=False,
 )

@@ -17,7 +17,9 @@ from recorders.models.planar import Components
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.measurements import SPACE
 from replay.estimators.models.ranging import distance
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 # A source is sought on a grid about the microphones, so many times as large as they are apart, and from
 # the best of its points on.
@@ -47,9 +49,9 @@ def stay(state: Components, control: Components, duration_s: Any, parameters: An
     return x, y, z, reference
 
 
-def hear(state: Components, about: Components, parameters: Any) -> Components:
+def hear(state: Components, reference: Components, parameters: Any) -> Components:
     """By how much later a sound comes at the first of two points than at the second, and errs there."""
-    away = distance(state, about), distance(state, (about[3], about[4], about[5]))
+    away = distance(state, reference), distance(state, (reference[3], reference[4], reference[5]))
     return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
 
 
@@ -73,9 +75,9 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
     places = dict(zip(points["landmark_id"].tolist(), points["position_m"], strict=True))
     pairs = np.stack([first["microphone_id"], first["reference_id"]], axis=1)
     known = np.array([pair[0] in places and pair[1] in places for pair in pairs.tolist()], bool)
-    about = np.array([[*places[m], *places[r]] for m, r in pairs[known].tolist()]).reshape(-1, 6)
+    reference = np.array([[*places[m], *places[r]] for m, r in pairs[known].tolist()]).reshape(-1, 6)
     measured = first["difference_s"][known]
-    array = np.unique(about.reshape(-1, 3), axis=0)
+    array = np.unique(reference.reshape(-1, 3), axis=0)
     is_flat = len(array) > 0 and np.ptp(array[:, 2]) == 0.0
     free = 2 if is_flat else 3
     if len(measured) < free:
@@ -89,10 +91,10 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
     def residuals(place: Floats) -> Floats:
         state = (*place, *middle[free:], 0.0)
-        return (hear(state, about.T, parameters)[0] - measured) / sigma
+        return (hear(state, reference.T, parameters)[0] - measured) / sigma
 
     def slopes(place: Floats) -> Floats:
-        away = np.append(place, middle[free:]) - about.reshape(-1, 2, 3)
+        away = np.append(place, middle[free:]) - reference.reshape(-1, 2, 3)
         toward = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), NEAR_M)
         return (toward[:, 0] - toward[:, 1])[:, :free] / (parameters.speed_of_sound_mps * sigma)[:, None]
 
@@ -153,13 +155,13 @@ SOUND_SOURCE = Model(
             schemas.ARRIVAL_DIFFERENCE,
             {"difference_s": "linear"},
             hear,
-            about=(MICROPHONES, REFERENCES),
+            reference=(MICROPHONES, REFERENCES),
             read=read_differences,
             covariance=read_variances,
         ),
     ),
     Motion(stay, linear=True),
     start=Start({}, find=find_source),
-    estimable={"speed_of_sound_mps": "linear"},
+    augmentable={"speed_of_sound_mps": "linear"},
     takes_fixes=False,
 )

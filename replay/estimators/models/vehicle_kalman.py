@@ -18,7 +18,8 @@ from recorders.models.states import PLANE_MOTION
 from recorders.models.vehicles import noise_moments, turn
 from replay.engine.streams.measurements import PLANE
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Switching
+from replay.inference.model.model import Model, Motion, Sensor, Switching
+from replay.inference.model.parameters import ModelParameters
 
 
 class VehicleParameters(ModelParameters):
@@ -80,7 +81,7 @@ def mode_rates(parameters: Any) -> Components:
     )
 
 
-def position(state: Components, about: Any, parameters: Any) -> Components:
+def position(state: Components, reference: Any, parameters: Any) -> Components:
     """Where the vehicle is."""
     return state[0], state[2]
 

@@ -30,7 +30,8 @@ from replay.estimators.navigation.samples import (
     read_samples,
     stated_or,
 )
-from replay.inference.model.model import ModelParameters, Started
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Started
 from replay.inference.run.initialization import WIDER
 
 LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
@@ -142,7 +143,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     return Started(start_ns, mean, covariance, how)
 
 
-def suspect(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
+def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
     """What looks wrong in the first samples of a body whose start is known.
 
     It is what `align` refuses, and only said here: the body may begin in motion.

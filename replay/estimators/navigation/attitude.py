@@ -23,7 +23,9 @@ from replay.estimators.navigation.navigation import UNIT as CARRIED
 from replay.estimators.navigation.samples import STANDARD_GRAVITY_MPS2
 from replay.estimators.orientation.orientation import ORIENTATION
 from replay.estimators.orientation.triad import triad
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Start, Started
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start, Started
 
 PERIOD_NS = 1_000_000_000
 BIAS: Mapping[str, Kind] = {f"gyro_bias_{axis}_radps": "linear" for axis in "xyz"}
@@ -82,13 +84,13 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
     return turned, turned, turned, bias, bias, bias, moved, moved, moved, field, field
 
 
-def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
+def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """The variances that a gap of the unit adds."""
     turned, moved = (parameters.gap_turn_radps * duration_s) ** 2, parameters.sigma_velocity_mps**2
     return turned, turned, turned, 0.0, 0.0, 0.0, moved, moved, moved, 0.0, 0.0
 
 
-def velocity(state: Components, about: Any, parameters: Any) -> Components:
+def velocity(state: Components, reference: Any, parameters: Any) -> Components:
     """The velocity, which is zero on average."""
     _, _, _, _, _, _, _, vx, vy, vz, _, _ = state
     return vx, vy, vz
@@ -100,7 +102,7 @@ def velocity_noise(parameters: Any) -> Components:
     return variance, variance, variance
 
 
-def feel_north(state: Components, about: Any, parameters: Any) -> Components:
+def feel_north(state: Components, reference: Any, parameters: Any) -> Components:
     """The magnetic field in the body's axes: that of the place has no part to the east."""
     qw, qx, qy, qz, _, _, _, _, _, _, north, up = state
     return into_body((qw, qx, qy, qz), (0.0, north, up))
@@ -186,7 +188,7 @@ ATTITUDE = Model(
         ),
         Sensor(UNIT.topic, UNIT.schema, FIELD, feel_north, field_noise, read=read_field),
     ),
-    Motion(move, move_noise, lost=lost),
+    Motion(move, move_noise, gap_noise=gap_noise),
     control=UNIT,
     start=Start({}, find=find),
     by_name=True,

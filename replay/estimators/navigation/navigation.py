@@ -22,13 +22,14 @@ from replay.engine.vectors.tangent import Kind
 from replay.estimators.navigation.alignment import (
     AlignmentParameters,
     align,
+    check_prior,
     specific_force,
-    suspect,
     turn_rate,
 )
 from replay.estimators.navigation.sensors import carried_sensors
 from replay.estimators.navigation.turning import WITH_HEADING
-from replay.inference.model.model import Control, Model, Motion, Sensor, Start
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.start import Start
 
 LEVER: Mapping[str, Kind] = {f"lever_{axis}_m": "linear" for axis in "xyz"}
 MOUNTING: Mapping[str, Kind] = {f"mounting_{turn}_rad": "angle" for turn in ("roll", "pitch", "yaw")}
@@ -117,7 +118,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
     return placed + moved + turned + gyro + accelerometer
 
 
-def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
+def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
     """The variances that a gap of the unit adds: of where it may have gone and turned meanwhile."""
     speed_squared = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
     gained = (parameters.gap_acceleration_mps2 * duration_s) ** 2
@@ -127,7 +128,7 @@ def lost(state: Components, duration_s: Any, parameters: Any) -> Components:
     return moved, moved, moved, gained, gained, gained, tilted, tilted, turned, *(0.0,) * 6
 
 
-def position(state: Components, about: Any, parameters: Any) -> Components:
+def position(state: Components, reference: Any, parameters: Any) -> Components:
     """Where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
@@ -204,9 +205,9 @@ INERTIAL = Model(
         ),
         *carried_sensors(UNIT),
     ),
-    Motion(move, move_noise, lost=lost),
+    Motion(move, move_noise, gap_noise=gap_noise),
     control=UNIT,
-    start=Start({}, HANDHELD, find=align, suspect=suspect),
+    start=Start({}, HANDHELD, find=align, check_prior=check_prior),
     correct=WITH_HEADING,
-    estimable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
+    augmentable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
 )

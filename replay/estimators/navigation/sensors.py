@@ -18,14 +18,14 @@ from replay.estimators.navigation.alignment import turn_rate
 from replay.inference.model.model import Control, Sensor
 
 
-def be_headed(state: Components, about: Any, parameters: Any) -> Components:
+def be_headed(state: Components, reference: Any, parameters: Any) -> Components:
     """The direction of the body's forward axis in the plane, from east to north."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     east, north, _ = into_plane((qw, qx, qy, qz), (1.0, 0.0, 0.0))
     return (np.arctan2(north, east),)
 
 
-def be_high(state: Components, about: Any, parameters: Any) -> Components:
+def be_high(state: Components, reference: Any, parameters: Any) -> Components:
     """The height over the plane's origin."""
     _, _, pz, _, _, _, _, _, _, _, _, _, _, _, _, _ = state
     return (pz,)
@@ -41,7 +41,7 @@ def roll_along(state: Components, samples: Components, parameters: Any) -> Compo
     return (1.0 + parameters.wheel_scale) * (x + a), y + b, z + c
 
 
-def stand(state: Components, about: Any, parameters: Any) -> Components:
+def stand(state: Components, reference: Any, parameters: Any) -> Components:
     """The velocity, which is zero where the body stands."""
     _, _, _, vx, vy, vz, _, _, _, _, _, _, _, _, _, _ = state
     return vx, vy, vz
@@ -53,17 +53,17 @@ def stay_on_wheels(state: Components, samples: Components, parameters: Any) -> C
     return left, up
 
 
-def feel_north(state: Components, about: Any, parameters: Any) -> Components:
+def feel_north(state: Components, reference: Any, parameters: Any) -> Components:
     """The magnetic field in the body's axes."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     field = parameters.field_east_ut, parameters.field_north_ut, parameters.field_up_ut
     return into_body((qw, qx, qy, qz), field)
 
 
-def see_anchor(state: Components, about: Components, parameters: Any) -> Components:
-    """The range of an anchor from a tag on the body, which `about` has behind the anchor."""
+def see_anchor(state: Components, reference: Components, parameters: Any) -> Components:
+    """The range of an anchor from a tag on the body, which `reference` has behind the anchor."""
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
-    ax, ay, az, tx, ty, tz = about
+    ax, ay, az, tx, ty, tz = reference
     x, y, z = into_plane((qw, qx, qy, qz), (tx, ty, tz))
     return (distance((px + x, py + y, pz + z), (ax, ay, az)),)
 
@@ -197,7 +197,7 @@ def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
             RANGE,
             see_anchor,
             range_noise,
-            about=(ANCHORS, TAGS),
+            reference=(ANCHORS, TAGS),
             delay="range_delay_s",
         ),
     )

@@ -46,8 +46,8 @@ def step_to(state: Components, target: Components, slope: Components) -> Compone
     up = into_body(orientation, UP)
     down = _times(-1.0, up)
     w, x, y, z = product((orientation[0], *_times(-1.0, orientation[1:])), target[6:10])
-    about = _dot(up, (x, y, z))
-    turn = 2.0 * np.arctan2(about, w) if w >= 0.0 else 2.0 * np.arctan2(-about, -w)
+    reference = _dot(up, (x, y, z))
+    turn = 2.0 * np.arctan2(reference, w) if w >= 0.0 else 2.0 * np.arctan2(-reference, -w)
     half = 0.5 * turn
     w, x, y, z = product((np.cos(half), *_times(-np.sin(half), up)), (w, x, y, z))
     tilt = 2.0 * x / w, 2.0 * y / w, 2.0 * z / w

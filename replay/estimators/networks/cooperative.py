@@ -99,13 +99,13 @@ def _compiled() -> Function:
     return compile_over_runs(cooperate, allocates=False)
 
 
-def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
+def begin(static: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
     """All robots at their priors, and the maps.
 
     A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
     that is so for all, or the map is not planar.
     """
-    priors = [_prior(whole[f"{prefix}/prior"]) for prefix in prefixes]
+    priors = [_prior(static[f"{prefix}/prior"]) for prefix in prefixes]
     reasons = np.stack([each.reasons for each in priors], axis=1)
     if (reasons != "").all():
         raise BadInput(f"{reasons[0, 0]}; the filter cannot start")
@@ -120,7 +120,7 @@ def begin(whole: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
         np.stack([each.time_ns for each in priors], axis=1),
         np.full(runs, ALL_WELL),
     )
-    return State(carried, points_of(whole["/landmarks"], LANDMARKS), reasons, reasons == "")
+    return State(carried, points_of(static["/landmarks"], LANDMARKS), reasons, reasons == "")
 
 
 def _prior(prior: Ragged) -> Priors:

@@ -8,7 +8,7 @@ from recorders.models.constant_velocity import noise_moments
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.estimators.networks.covariance_intersection import Memory, fuse_by, memory_for
 from replay.estimators.networks.estimates import Estimate, blend, determinant, inverted, one_of
-from replay.inference.linear_algebra.gaussian import coast, copy_gaussian
+from replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
 
 
 class Activities(NamedTuple):
@@ -121,7 +121,9 @@ class Results(NamedTuple):
 
 def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
     """Predict with constant velocity, in place."""
-    coast(mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s))
+    predict_constant_velocity(
+        mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s)
+    )
 
 
 def observe(

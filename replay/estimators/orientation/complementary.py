@@ -206,7 +206,7 @@ VQF = batch(
     "VQF of Laidig and Seel, by the package vqf",
     parameters=VqfParameters,
     streams={"inertial": schemas.INERTIAL_SAMPLE},
-    whole={},
+    static={},
     components=ORIENTATION,
     truth="truth",
     solve=each_run(solve_vqf),

@@ -27,7 +27,14 @@ from replay.distributions.bingham_kernels import (
 )
 from replay.engine.arrays import Floats, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.estimators.orientation.triad import all_finite, carry, diagonal, increment, isotropic, triad
+from replay.estimators.orientation.triad import (
+    all_finite,
+    fill_diagonal,
+    fill_isotropic,
+    triad,
+    turn_back,
+    turn_quaternion,
+)
 
 _NS = 1e-9
 
@@ -269,7 +276,7 @@ def _reckon(
     turn, count = np.empty(3), max(state.rest_samples[run], 1)
     for i in range(3):
         turn[i] = (rate[i] - (sums[0, i] / count if unbiased else 0.0)) * duration_s
-    compose(orientation.copy(), increment(turn[0], turn[1], turn[2]), orientation)
+    compose(orientation.copy(), turn_quaternion(turn[0], turn[1], turn[2]), orientation)
     estimates.orientation[row] = orientation
     variance = model.attitude_sigma_rad**2 + model.drift_sigma_rad**2 * (elapsed_s - model.rest_s)
     for i in range(3):
@@ -320,14 +327,14 @@ def _accumulate(
     else:
         bias, count = state.rate_sum[run], max(state.rest_samples[run], 1)
         increment = state.increment[run]
-        step = increment(
+        step = turn_quaternion(
             (rate[0] - bias[0] / count) * duration_s,
             (rate[1] - bias[1] / count) * duration_s,
             (rate[2] - bias[2] / count) * duration_s,
         )
         compose((increment[0], increment[1], increment[2], increment[3]), step, increment)
-        carry(step, state.force[run])
-        carry(step, state.field[run])
+        turn_back(step, state.force[run])
+        turn_back(step, state.field[run])
     for i in range(3):
         state.force[run, i] += force[i]
         state.field[run, i] += field[i]
@@ -348,14 +355,14 @@ def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: 
     moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
     if z[0] < 0.0:
         turn_columns(axes, state.increment[run])
-        isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
+        fill_isotropic(model.drift_sigma_rad * math.sqrt(elapsed_s), noise)
         integrate(noise, moments, work)
-        diagonal(moments, work)
+        fill_diagonal(moments, work)
         predict(axes, z, work)
     attitude = triad(state.force[run], state.field[run])
     if math.isfinite(attitude[0]):
-        isotropic(model.attitude_sigma_rad, noise)
-        diagonal(noise, work)
+        fill_isotropic(model.attitude_sigma_rad, noise)
+        fill_diagonal(noise, work)
         update(axes, z, work, attitude)
     local_moments(axes, z, moments, work)
     for i in range(3):
@@ -380,7 +387,7 @@ def _dead_reckon(
         for j in range(3):
             covariance[i, j] = state.covariance[run, i, j]
     for i in range(3):
-        carry(increment, covariance[i])
+        turn_back(increment, covariance[i])
     for i in range(3):
-        carry(increment, covariance[:, i])
+        turn_back(increment, covariance[:, i])
         covariance[i, i] += model.drift_sigma_rad**2 * elapsed_s

@@ -91,7 +91,7 @@ def of_inertial_samples(
         summary,
         parameters=parameters,
         streams={"inertial": schemas.INERTIAL_SAMPLE},
-        whole={},
+        static={},
         components=ORIENTATION,
         truth="truth",
         vectors={"inertial": Vectors(dict.fromkeys(FIELDS, 3))},

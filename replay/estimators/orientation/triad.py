@@ -18,13 +18,13 @@ def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
     return math.isfinite(total)
 
 
-def isotropic(sigma_rad: float, z: NDArray) -> None:
+def fill_isotropic(sigma_rad: float, z: NDArray) -> None:
     """Fill concentrations about the identity, in the order of a quaternion's components."""
     z[:] = -2.0 / sigma_rad**2
     z[0] = 0.0
 
 
-def increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
+def turn_quaternion(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
     """The quaternion of a rotation vector."""
     x, y, z = 0.5 * x_rad, 0.5 * y_rad, 0.5 * z_rad
     angle = math.sqrt(x * x + y * y + z * z)
@@ -32,7 +32,7 @@ def increment(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, f
     return math.cos(angle), scale * x, scale * y, scale * z
 
 
-def carry(turned: Vector, vector: NDArray) -> None:
+def turn_back(turned: Vector, vector: NDArray) -> None:
     """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
     a, b, c = vector[0], vector[1], vector[2]
@@ -68,7 +68,7 @@ def unit(vector: Components) -> Components:
     return x / length, y / length, z / length
 
 
-def diagonal(values: NDArray, out: NDArray) -> None:
+def fill_diagonal(values: NDArray, out: NDArray) -> None:
     """Fill a diagonal matrix."""
     out[:] = 0.0
     for i in range(len(values)):

@@ -63,26 +63,26 @@ def _compiled() -> Callable[..., None]:
     return compile_over_runs(follow, allocates=False)
 
 
-def start(whole: Mapping[str, Ragged], *, most: int) -> Mixture | None:
+def start(static: Mapping[str, Ragged], *, most: int) -> Mixture | None:
     """A component of weight 1 at each prior; None where there is none: then nothing is known yet.
 
     Raises BadInput where there is no room for all.
     """
-    if not whole:
+    if not static:
         return None
-    runs = next(iter(whole.values())).runs
-    if len(whole) > most:
+    runs = next(iter(static.values())).runs
+    if len(static) > most:
         raise BadInput(
-            f"{len(whole)} priors are more than {most} components; give --set most_components=..."
+            f"{len(static)} priors are more than {most} components; give --set most_components=..."
         )
     mixture = no_components(runs, most)
-    for component, prior in enumerate(whole.values()):
+    for component, prior in enumerate(static.values()):
         time_ns, mean, covariance = gaussians(prior)
         mixture.weight[:, component] = 1.0
         mixture.mean[:, component] = mean
         mixture.covariance[:, component] = covariance
         mixture.time_ns[:] = time_ns
-    mixture.used[:] = len(whole)
+    mixture.used[:] = len(static)
     return mixture
 
 

@@ -11,10 +11,10 @@ from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     cholesky,
-    coast,
     copy_gaussian,
+    downdate,
     kalman_step,
-    reduce_covariance,
+    predict_constant_velocity,
     whiten,
 )
 
@@ -130,7 +130,7 @@ def prepare(mean: Floats, covariance: Floats, variance: float, work: Work, paren
     kalman_step(innovation, 2, work.step)
     after = work.seen_covariance[parent]
     copy_gaussian(mean, covariance, work.step, after)
-    reduce_covariance(after, gain, 2)
+    downdate(after, gain, 2)
     return True
 
 
@@ -314,7 +314,7 @@ def follow(run: int, scans: Scans, mixture: Mixture, settings: Settings, sets: S
             noise = noise_moments(settings.acceleration_sigma_mps2, duration_s)
             for component in range(mixture.used[run]):
                 mean, covariance = mixture.mean[run, component], mixture.covariance[run, component]
-                coast(mean, covariance, duration_s, (2, 1), noise)
+                predict_constant_velocity(mean, covariance, duration_s, (2, 1), noise)
         mixture.time_ns[run] = scans.time_ns[scan]
         count = update(run, scan, scans, mixture, settings, work)
         groups = merge(count, settings, work) if count >= 0 else -1

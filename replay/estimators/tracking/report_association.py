@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Booleans, Floats, Integers, varying
-from replay.inference.association.association import Memory as AssociationMemory
-from replay.inference.association.association import Weights, nearest
+from replay.inference.association.association import nearest
+from replay.inference.association.clusters import AssociationMemory, Weights
 
 LEVELS = 4
 

@@ -39,7 +39,7 @@ from replay.estimators.tracking.report_association import (
     Tracks,
     track,
 )
-from replay.inference.association.association import Weights, memory_for
+from replay.inference.association.clusters import Weights, memory_for
 
 FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=LEVELS)]
 

@@ -10,7 +10,7 @@ import numpy as np
 from recorders.log import schemas
 from recorders.models.planar import Component, Components
 from replay.engine.streams.measurements import PLANE
-from replay.inference.association.scanning import ScanSensor
+from replay.inference.association.scans import ScanSensor
 
 
 def away(target: Components, origin: Any) -> tuple[Any, Any]:

@@ -13,7 +13,7 @@ from recorders.log import Stream
 from replay.engine.arrays import Floats, Integers
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.inference.association.scanning import Scans, ScanSensor
+from replay.inference.association.scans import Scans, ScanSensor
 
 ORIGIN = "origin"
 

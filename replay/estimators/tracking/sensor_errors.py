@@ -14,11 +14,12 @@ from recorders.errors import BadInput
 from replay.engine.arrays import Floats
 from replay.engine.vectors.components import Components
 from replay.estimators.tracking.targets import Targets
-from replay.inference.association.scanning import ScanSensor
-from replay.inference.association.tracking import Newborn
+from replay.inference.association.scans import ScanSensor
+from replay.inference.association.tracker import Newborn
 from replay.inference.linear_algebra.manifold import is_flat
-from replay.inference.model.model import Model, Motion, trial_state
+from replay.inference.model.model import Model, Motion
 from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
 
 BY_SORT = ("registration", "correlated")
 

@@ -16,19 +16,13 @@ from recorders.registry import load
 from replay.engine.arrays import Floats
 from replay.engine.streams.channels import stated
 from replay.engine.vectors.tangent import tangent_components
-from replay.inference.association.tracking import Newborn
-from replay.inference.model.model import (
-    Model,
-    ModelParameters,
-    Motion,
-    check_motion,
-    check_switching,
-    switching_of,
-)
-from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.association.tracker import Newborn
+from replay.inference.model.model import Model, Motion
+from replay.inference.model.parameters import ModelParameters, number_fields, settings_type
 from replay.inference.model.settings import TracedParameters
 from replay.inference.model.stage import Stage
-from replay.inference.run.initialization import unknown
+from replay.inference.model.validation import check_motion, check_switching, switching_of
+from replay.inference.run.first_messages import unknown
 
 POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 

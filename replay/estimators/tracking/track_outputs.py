@@ -12,8 +12,8 @@ from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.results import innovation_stream, named
 from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import Found
-from replay.inference.association.scanning import Scans
-from replay.inference.association.tracking import Told
+from replay.inference.association.outputs import TrackOutputs
+from replay.inference.association.scans import Scans
 from replay.inference.association.tracks import NEVER
 from replay.inference.model.stage import Stage
 
@@ -24,7 +24,7 @@ UNUSED = (
 
 
 def track_outputs(
-    name: str, found: Found, stage: Stage, scans: Scans, told: Told, *, repeated: int = 0
+    name: str, found: Found, stage: Stage, scans: Scans, told: TrackOutputs, *, repeated: int = 0
 ) -> list[Ragged]:
     """The streams of the tracker `name` for these scans.
 
@@ -50,13 +50,13 @@ def _bounds(ends: Integers) -> Integers:
     return np.concatenate([[0], np.cumsum(ends)])
 
 
-def _track_stamps(scans: Scans, told: Told) -> Integers:
+def _track_stamps(scans: Scans, told: TrackOutputs) -> Integers:
     """The stamps of all tracks after all scans."""
     used = told.confirmed != NEVER
     return np.repeat(scans.time_ns[used], told.confirmed[used])
 
 
-def _of_tracks(topic: str, stage: Stage, scans: Scans, told: Told) -> Iterator[Ragged]:
+def _of_tracks(topic: str, stage: Stage, scans: Scans, told: TrackOutputs) -> Iterator[Ragged]:
     """After every scan how many tracks there are, which, and how probably each exists."""
     metadata, ends = named(stage.model.state), told.end[:, 0]
     used = np.flatnonzero(told.confirmed != NEVER)
@@ -84,7 +84,7 @@ def _of_tracks(topic: str, stage: Stage, scans: Scans, told: Told) -> Iterator[R
     yield Ragged(stream, _bounds(ends))
 
 
-def _modes(topic: str, stage: Stage, scans: Scans, told: Told) -> Iterator[Ragged]:
+def _modes(topic: str, stage: Stage, scans: Scans, told: TrackOutputs) -> Iterator[Ragged]:
     """How probable the modes of each track are, where there are several."""
     if not stage.modes:
         return
@@ -99,7 +99,7 @@ def _modes(topic: str, stage: Stage, scans: Scans, told: Told) -> Iterator[Ragge
     yield Ragged(stream, _bounds(ends))
 
 
-def _associations(topic: str, found: Found, scans: Scans, told: Told) -> Ragged:
+def _associations(topic: str, found: Found, scans: Scans, told: TrackOutputs) -> Ragged:
     """Which detection of a scan is which track's, and how probably."""
     ends = told.end[:, 1]
     track, scan, detection = _filled(told.pair, ends).T
@@ -117,7 +117,7 @@ def _associations(topic: str, found: Found, scans: Scans, told: Told) -> Ragged:
     return Ragged(stream, _bounds(ends))
 
 
-def _of_scans(topic: str, scans: Scans, told: Told, repeated: int) -> Iterator[Ragged]:
+def _of_scans(topic: str, scans: Scans, told: TrackOutputs, repeated: int) -> Iterator[Ragged]:
     """What was approximated, what was not used, and how many scans were used again."""
     approximated = np.flatnonzero(told.approximated)
     tracks = told.approximated[approximated]
@@ -137,7 +137,7 @@ def _of_scans(topic: str, scans: Scans, told: Told, repeated: int) -> Iterator[R
     yield Ragged(stream, np.minimum(scans.offsets, repeated))
 
 
-def _innovations(topic: str, found: Found, scans: Scans, told: Told) -> Iterator[Ragged]:
+def _innovations(topic: str, found: Found, scans: Scans, told: TrackOutputs) -> Iterator[Ragged]:
     """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
     ends = told.end[:, 1]
     pair, probability = _filled(told.pair, ends), _filled(told.associated, ends)

@@ -31,8 +31,8 @@ def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
             "out smoothed, or take another model, or one of its modes"
         )
 
-    def start(whole: Mapping[str, Ragged]) -> State:
-        return State(tracker.start(dict(whole)), ())
+    def start(static: Mapping[str, Ragged]) -> State:
+        return State(tracker.start(dict(static)), ())
 
     def run(state: State, block: Block) -> tuple[State, list[Ragged]]:
         after, said = tracker.run(state.tracker, block)
@@ -45,10 +45,10 @@ def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
             for each in outputs
         ]
 
-    return replace(tracker, start=start, run=run, finish=finish, rewinding=_cannot_rewind)
+    return replace(tracker, start=start, run=run, finish=finish, out_of_sequence=_refuse_out_of_sequence)
 
 
-def _cannot_rewind(_: int) -> Recursive:
+def _refuse_out_of_sequence(_: int) -> Recursive:
     raise BadInput(
         "smoothed tracks use later detections in any case; replay them in the order of the stamps, or "
         "with --late wait:SECONDS"

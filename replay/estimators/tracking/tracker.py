@@ -35,9 +35,9 @@ from replay.estimators.tracking.scans import ORIGIN, Found
 from replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.tracking.targets import Targets, targets_of
 from replay.estimators.tracking.track_smoother import smoothing_tracks
-from replay.estimators.tracking.tracker_run import Setup, run, run_rewinding, start
+from replay.estimators.tracking.tracker_run import Setup, run, run_out_of_sequence, start
 from replay.inference.association.scanning import measuring
-from replay.inference.association.tracking import Tracker
+from replay.inference.association.tracker import Tracker
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.stage import stage_of
 
@@ -283,10 +283,14 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
     read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
 
-    def rewinding(back_ns: int) -> Recursive:
-        return Recursive(name, read, (), start, partial(run_rewinding, setup=setup, back_ns=back_ns))
+    def out_of_sequence(back_ns: int) -> Recursive:
+        return Recursive(
+            name, read, (), start, partial(run_out_of_sequence, setup=setup, back_ns=back_ns)
+        )
 
-    tracking = Recursive(name, read, (), start, partial(run, setup=setup), rewinding=rewinding)
+    tracking = Recursive(
+        name, read, (), start, partial(run, setup=setup), out_of_sequence=out_of_sequence
+    )
     if not parameters.smoothed:
         return [tracking]
     if settings.errors.names:

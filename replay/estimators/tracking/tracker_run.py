@@ -10,8 +10,10 @@ from replay.engine.streams.blocks import Block, Ragged, gather, join
 from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import Fixes, Found, latest_fixes, scans_of
 from replay.estimators.tracking.track_outputs import track_outputs
-from replay.inference.association.scanning import Scans, in_time, take_scans
-from replay.inference.association.tracking import Newborn, Told, Tracker, of_last, track_scans
+from replay.inference.association.outputs import TrackOutputs, of_last
+from replay.inference.association.scans import Scans, in_time, take_scans
+from replay.inference.association.tracker import Newborn, Tracker
+from replay.inference.association.tracking import track_scans
 from replay.inference.association.tracks import Tracks, no_tracks
 
 
@@ -31,11 +33,11 @@ class Setup(NamedTuple):
         shared = self.newborn.covariance[first : first + count, first : first + count]
         return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
-    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+    def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
         """The tracks after some scans, and what is said of them."""
         return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
-    def outputs(self, scans: Scans, told: Told, *, repeated: int = 0) -> list[Ragged]:
+    def outputs(self, scans: Scans, told: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
         """The streams of what is said of these scans; see `track_outputs`."""
         return track_outputs(self.name, self.found, self.tracker.stage, scans, told, repeated=repeated)
 
@@ -45,7 +47,7 @@ class State(NamedTuple):
 
     Attributes:
         fixes: by topic and run.
-        tracks: of all runs; where scans may come late those of one run each, see `Rewinding`.
+        tracks: of all runs; where scans may come late those of one run each, see `OutOfSequenceState`.
     """
 
     fixes: Fixes
@@ -81,7 +83,7 @@ def _scans(state: State, block: Block, setup: Setup) -> tuple[Scans, Fixes]:
     return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
 
 
-class Rewinding(NamedTuple):
+class OutOfSequenceState(NamedTuple):
     """One run whose scans may come late.
 
     Attributes:
@@ -95,7 +97,7 @@ class Rewinding(NamedTuple):
     head: Tracks
 
 
-def run_rewinding(
+def run_out_of_sequence(
     state: State | None, block: Block, *, setup: Setup, back_ns: int
 ) -> tuple[State, list[Ragged]]:
     """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
@@ -106,14 +108,14 @@ def run_rewinding(
     nothing = setup.no_tracks(1)
     scans, fixes = _scans(state or _begin(block, setup, None), block, setup)
     none = take_scans(scans, np.empty(0, np.int64))
-    runs = [Rewinding(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
+    runs = [OutOfSequenceState(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
     after, outputs = [], []
     for number, before in enumerate(runs):
-        rewinding, said = before, list[list[Ragged]]()
+        out_of_sequence, said = before, list[list[Ragged]]()
         for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
-            rewinding, told = _take(rewinding, take_scans(scans, rows), setup, back_ns)
+            out_of_sequence, told = _take(out_of_sequence, take_scans(scans, rows), setup, back_ns)
             said += told
-        after.append(rewinding)
+        after.append(out_of_sequence)
         outputs.append([join(parts) for parts in zip(*said, strict=True)])
     filled = next((each for each in outputs if each), [])
     empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
@@ -121,7 +123,7 @@ def run_rewinding(
     return State(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
 
 
-def _stretches(before: Rewinding, scans: Scans, first: int, end: int) -> Iterator[Integers]:
+def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
     """The rows of a run's scans that can be used together: those that go on in time, and late ones."""
     known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
     newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
@@ -131,10 +133,10 @@ def _stretches(before: Rewinding, scans: Scans, first: int, end: int) -> Iterato
 
 
 def _take(
-    rewinding: Rewinding, arrived: Scans, setup: Setup, back_ns: int
-) -> tuple[Rewinding, list[list[Ragged]]]:
+    out_of_sequence: OutOfSequenceState, arrived: Scans, setup: Setup, back_ns: int
+) -> tuple[OutOfSequenceState, list[list[Ragged]]]:
     """One run after scans that go on in time, or after one that is late; and what is said then."""
-    base, pending, head = rewinding
+    base, pending, head = out_of_sequence
     repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
     pending = in_time(pending, arrived)
     if repeated:
@@ -148,4 +150,4 @@ def _take(
     if settled.any():
         base, _ = setup.track(base, take_scans(pending, rows[settled]))
         pending = take_scans(pending, rows[~settled])
-    return Rewinding(base, pending, head), outputs
+    return OutOfSequenceState(base, pending, head), outputs

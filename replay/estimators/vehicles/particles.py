@@ -112,8 +112,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ParticlesParameter
     return bind_vehicles(name, topics, "set", sensor, begin, advance)
 
 
-def _start(method: Method, setup: Setup, whole: Mapping[str, Ragged]) -> Cloud:
-    carried = start(setup, whole)
+def _start(method: Method, setup: Setup, static: Mapping[str, Ragged]) -> Cloud:
+    carried = start(setup, static)
     runs = len(carried.mean)
     covariance = carried.covariance if method.kind == "associations" else np.empty((runs, 0, 0))
     joint = Joint(

@@ -178,11 +178,11 @@ def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
     return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))
 
 
-def start(setup: Setup, whole: Mapping[str, Ragged]) -> Carried:
+def start(setup: Setup, static: Mapping[str, Ragged]) -> Carried:
     """Every run's priors."""
-    runs = next(iter(whole.values())).runs
+    runs = next(iter(static.values())).runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
-    for vehicle, prior in enumerate(whole.values()):
+    for vehicle, prior in enumerate(static.values()):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
         time_ns, mean[:, own], covariance[:, own, own] = gaussians(prior)
     registered, failed = np.zeros((2, runs), bool)

@@ -1,1 +1,1 @@
-"""Tracks of many targets from unordered detections; begin with `tracking`."""
+"""Tracks many targets from unordered detections; begin with `tracking`."""

@@ -1,4 +1,4 @@
-"""Unordered scans of any sensors, and what one says of tracks: the parts of a tracker that see.
+"""Predicts what a scan measures of tracks, and updates them by it: the sensors' part of a tracker.
 
 A kind of sensors says what it measures of a target, how probable a detection is and how dense clutter.
 With probabilities b_j of a scan's detections and b_0 of none, a track's mean moves by the mean of the
@@ -15,18 +15,15 @@ theirs, weighed by the modes' probabilities, and given that it is the track's, s
 afterwards, and its Gaussian the shares of this for probabilities (Blom, Bloem, IEEE TAC 45(2), 2000).
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import Schema
 from recorders.models.states import PLANE_MOTION
 from replay.engine.arrays import Booleans, Floats, Function, Integers, varying
-from replay.engine.vectors.components import Components
-from replay.inference.association.association import Memory as AssociationMemory
-from replay.inference.association.association import Weights, memory_for
+from replay.inference.association.clusters import AssociationMemory, Weights, memory_for
+from replay.inference.association.scans import Scans, ScanSensor
 from replay.inference.association.shared_bias import Pool, pool_of
 from replay.inference.association.tracks import Tracks
 from replay.inference.kalman.steps import Workspace, workspace
@@ -38,86 +35,8 @@ from replay.inference.model.model import Model, Sensor
 from replay.inference.model.stage import Stage, traced_sensor
 
 
-@dataclass(frozen=True, eq=False)
-class ScanSensor:
-    """A kind of sensor of unordered scans.
-
-    Its functions take a target as (x_m, vx_mps, y_m, vy_mps), whatever the model's state is, and
-    `origin`, where the sensor is when it scans.
-
-    Attributes:
-        leaf, schema, fields: of the topic with its detections, beside that of its scans.
-        measured: the components of a detection.
-        measure: (target, origin, parameters) -> what it measures of a target.
-        noise: (target, origin, parameters) -> variances, or the rows of a lower triangle.
-        detection: (target, origin, parameters) -> how probable it is that the target is detected.
-        clutter: (detection, parameters) -> how many false detections there are per unit of what is
-            measured.
-        birth: (detection, origin, parameters) -> the position of a target that is there, the rows of
-            the lower triangle of its covariance, and how many m^2 of the plane a unit of what is
-            measured has there; None where a detection does not say enough.
-    """
-
-    leaf: str
-    schema: Schema
-    fields: tuple[str, ...]
-    measured: Components
-    measure: Function
-    noise: Function
-    detection: Function
-    clutter: Function
-    birth: Function | None = None
-
-
-class Scans(NamedTuple):
-    """The scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
-
-    Attributes:
-        offsets: (runs + 1,).
-        time_ns, sensor, kind, number: (scans,), whose each is: of which sensor, of which kind of
-            sensors, and its number there.
-        first, end: (scans,), its detections.
-        origin: (scans, 2), where the sensor is.
-        detection: (detections, 2), what is measured.
-    """
-
-    offsets: Integers
-    time_ns: Integers
-    sensor: Integers
-    kind: Integers
-    number: Integers
-    first: Integers
-    end: Integers
-    origin: Floats
-    detection: Floats
-
-
-BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
-
-
-def take_scans(scans: Scans, rows: Integers) -> Scans:
-    """Some of the scans, in this order, as those of one run."""
-    own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
-    counts = own["end"] - own["first"]
-    ends = np.cumsum(counts)
-    detections = np.arange(int(counts.sum())) + np.repeat(own["first"] - ends + counts, counts)
-    own |= {"first": ends - counts, "end": ends}
-    return Scans(np.array([0, len(rows)]), **own, detection=scans.detection[detections])
-
-
-def in_time(first: Scans, second: Scans) -> Scans:
-    """The scans of both, of one run, in time order; of equal stamps those of the first come first."""
-    shifted = second._replace(
-        first=second.first + len(first.detection), end=second.end + len(first.detection)
-    )
-    own = {name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in BY_SCAN}
-    detection = np.concatenate([first.detection, second.detection])
-    both = Scans(np.array([0, len(own["time_ns"])]), **own, detection=detection)
-    return take_scans(both, np.argsort(both.time_ns, kind="stable"))
-
-
 @varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
-class Memory(NamedTuple):
+class ScanMemory(NamedTuple):
     """What one core works in; axes are tracks, their modes, and the detections of a scan.
 
     Attributes:
@@ -165,10 +84,10 @@ class Memory(NamedTuple):
     shift: Floats
 
 
-def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> Memory:
+def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> ScanMemory:
     """Memory for so many errors that tracks share, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
-    return Memory(
+    return ScanMemory(
         motion=motion,
         step=workspace(stage),
         pool=pool_of(shared, size, places),
@@ -211,8 +130,8 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
     """What of a kind of sensors is as a model's sensor is, which may read parameters of these names."""
     target, inner = target_of(model), kind.measure
 
-    def measure(state: Any, about: Any, parameters: Any) -> Any:
-        return inner(target(state), about, parameters)
+    def measure(state: Any, reference: Any, parameters: Any) -> Any:
+        return inner(target(state), reference, parameters)
 
     own = Sensor(kind.leaf, kind.schema, kind.measured, measure, fields={"origin": 2})
     return traced_sensor(model, own, names)
@@ -259,7 +178,7 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Functio
         covariance: Floats,
         origin: Floats,
         parameters: Any,
-        memory: Memory,
+        memory: ScanMemory,
     ) -> float:
         state, here = read_state(mean), read_origin(origin)
         linearise(state, here, parameters, memory.step)
@@ -332,7 +251,7 @@ def comparing(kind: ScanSensor) -> Function:
     """`compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
     m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
 
-    def compare(track: int, mode: int, detection: int, memory: Memory) -> float:
+    def compare(track: int, mode: int, detection: int, memory: ScanMemory) -> float:
         factor, white = memory.spread[track, mode], memory.white[track, mode, detection]
         squared = 0.0
         for i in range(m):
@@ -352,7 +271,7 @@ def updating(model: Model, kind: ScanSensor) -> Function:
     find_slope = sloping(model.kinds, model.correct)
 
     def update(
-        track: int, mode: int, detections: int, mean: Floats, covariance: Floats, memory: Memory
+        track: int, mode: int, detections: int, mean: Floats, covariance: Floats, memory: ScanMemory
     ) -> None:
         given, moment, shift, step = memory.given, memory.moment, memory.shift, memory.step.step
         for i in range(m):
@@ -388,7 +307,7 @@ def updating(model: Model, kind: ScanSensor) -> Function:
 
 
 def split_by_mode(
-    run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: Memory
+    run: int, track: int, mode: int, detections: int, tracks: Tracks, memory: ScanMemory
 ) -> float:
     """Fill a track's associations in one of its modes; returns how probable the mode is after them."""
     probability, given = memory.probability[track], memory.given
@@ -408,7 +327,7 @@ def split_by_mode(
     return after
 
 
-def join_near(first: int, end: int, scans: Scans, within: float, memory: Memory) -> int:
+def join_near(first: int, end: int, scans: Scans, within: float, memory: ScanMemory) -> int:
     """Fill the detections of a scan, each chain of those within a distance as their mean.
 
     Chains are in the order of their first detections.

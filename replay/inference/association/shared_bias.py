@@ -1,4 +1,4 @@
-"""Errors of sensors as part of the state that all tracks share, by Gaussians of one track each.
+"""Estimates errors of sensors that all tracks share, as part of every track's state.
 
 Given the errors b, targets are independent: a joint Gaussian of all of them is one of b and, for every
 track, one of its target given b. A track's Gaussian is of its target and of b, whose marginal is the

@@ -1,4 +1,4 @@
-"""When a track is taken for one of a target, and when it ends: parts that go with any association.
+"""Confirms and ends tracks, by counts or by probabilities of existence, for any association.
 
     existence   how probable it is that the target exists (Musicki, Evans, IEEE TAES 40(3), 2004)
     hits        detected in M of its first N chances, see Bar-Shalom, Li, Kirubarajan, 2001, 7.8
@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.association.association import Weights, existence_after
+from replay.inference.association.association import existence_after
+from replay.inference.association.clusters import Weights
 from replay.inference.association.tracks import Tracks
 
 # A miss says nothing of a young track where the sensor detects less than every second target.

@@ -1,4 +1,4 @@
-"""The way back over tracks: each estimate of a track, given the detections that came later too.
+"""Smooths tracks backwards: each estimate of a track, given later detections too.
 
 Which detections are a track's stays as the tracker found it; given that, its states are a chain of
 Gaussians that one motion ties together, and `replay.inference.smoothing.backward_pass` goes back over
@@ -13,7 +13,13 @@ import numpy as np
 from replay.engine.arrays import Floats, Integers
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import Estimates
-from replay.inference.smoothing.backward_pass import FOREVER_NS, Nodes, back_memory, going_back, no_later
+from replay.inference.smoothing.backward_pass import (
+    FOREVER_NS,
+    Nodes,
+    back_memory,
+    backward_pass_over_runs,
+    no_later,
+)
 
 
 def smooth_tracks(
@@ -36,7 +42,7 @@ def smooth_tracks(
         np.empty(covariance.shape),
     )
     arguments = (nodes, offsets, offsets[1:], FOREVER_NS, no_later(runs, n, n), offsets[:-1], smoothed)
-    going_back(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
+    backward_pass_over_runs(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
     back = np.argsort(order)
     return smoothed.mean[back], smoothed.covariance[back]
 

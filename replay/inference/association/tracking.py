@@ -1,4 +1,4 @@
-"""The tracker of many targets, put together from parts that do not know each other.
+"""Tracks many targets: predicts, associates, updates, begins and ends tracks scan by scan.
 
 A model's motion moves every track, that of each mode where it has several (an IMM inside); sensors say
 what a scan measures of a track (see `replay.inference.association.scanning`); an association says how
@@ -6,185 +6,45 @@ probable it is that each track has each detection (`association`); what is left 
 and a management says which tracks are those of targets, and which end (`track_management`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from replay.engine.arrays import Floats, Function, Integers, varying
+from replay.engine.arrays import Floats, Function
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.vectors.tangent import tangent_components
 from replay.inference.association.association import ASSOCIATIONS
+from replay.inference.association.births import beginning, births_of, ending
+from replay.inference.association.outputs import (
+    TrackOutputs,
+    blank_outputs,
+    writing_pairs,
+    writing_tracks,
+)
 from replay.inference.association.scanning import (
-    BY_SCAN,
-    Memory,
-    Scans,
-    ScanSensor,
+    ScanMemory,
     comparing,
-    correlating,
     join_near,
     memory_of,
     observing,
     split_by_mode,
-    take_scans,
     target_of,
     updating,
 )
+from replay.inference.association.scans import BY_SCAN, Scans
 from replay.inference.association.shared_bias import pool_errors
 from replay.inference.association.track_management import MANAGEMENTS, Evidence
-from replay.inference.association.tracks import NEVER, Tracks, are_near, drop, expected
-from replay.inference.kalman.predict import linear_motion, nothing
-from replay.inference.kalman.steps import Gaussian, Steps, gaussian_filter
-from replay.inference.linear_algebra.gaussian import copy_gaussian
-from replay.inference.linear_algebra.tuples import range_of, tuple_of
-from replay.inference.model.model import Model
+from replay.inference.association.tracker import (
+    Newborn,
+    Tracker,
+    believing,
+    choosing,
+    moving,
+)
+from replay.inference.association.tracks import NEVER, Tracks
+from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.settings import reading_settings
-from replay.inference.model.stage import Stage
-from replay.inference.modes.imm import Belief, interacting_steps
-
-
-class Tracker(NamedTuple):
-    """A tracker put together.
-
-    Attributes:
-        stage: the targets' model, with one of its motions or all modes.
-        kinds: of sensors.
-        association, management: by name, see `ASSOCIATIONS` and `MANAGEMENTS`.
-        names: the parameters that the parts read, in the order of the columns of the settings.
-        shared: where in the state the sensors' errors begin, and how many of them all tracks share, see
-            `replay.inference.association.shared_bias`.
-    """
-
-    stage: Stage
-    kinds: tuple[ScanSensor, ...]
-    association: str
-    management: str
-    names: tuple[str, ...]
-    shared: tuple[int, int]
-
-    @property
-    def sizes(self) -> tuple[int, int, int]:
-        """How many modes the model has, and how many components its state and tangent space."""
-        return max(1, len(self.stage.modes)), self.stage.model.size, self.stage.model.tangent
-
-
-class Newborn(NamedTuple):
-    """A target of which only the position is known.
-
-    Attributes:
-        mean, covariance: (n,), (t, t); their entries of the position stand for none.
-        mode: (modes,), the modes' probabilities.
-    """
-
-    mean: Floats
-    covariance: Floats
-    mode: Floats
-
-
-@varying(2)
-class Told(NamedTuple):
-    """What is said after every scan; scan s of run r has the rows of that number.
-
-    Attributes:
-        end: (runs, 2), how many rows of tracks and of associations a run has filled.
-        confirmed: (scans,), how many tracks there are; NEVER where the scan was too old to be used.
-        approximated: (scans,), tracks in clusters too large to go through.
-        turned_away: (scans,), detections that begin no track because there is no room.
-        number, mean, covariance, probability, existence: (runs, rows, ...), of confirmed tracks;
-            `probability` is that of their modes.
-        pair: (runs, rows, 3), track, scan and detection; associated: (runs, rows), how probable.
-        white, factor: (runs, rows, 2) and (runs, rows, 2, 2), a pair's whitened innovation in its
-            likeliest mode, and Cholesky's factor of the innovation covariance; a bearing's stand first.
-    """
-
-    end: Integers
-    confirmed: Integers
-    approximated: Integers
-    turned_away: Integers
-    number: Integers
-    mean: Floats
-    covariance: Floats
-    probability: Floats
-    existence: Floats
-    pair: Integers
-    associated: Floats
-    white: Floats
-    factor: Floats
-
-
-class Rows(NamedTuple):
-    """Where one run's estimates go, as `replay.inference.kalman.steps.Steps.estimate` fills them in."""
-
-    mean: Floats
-    covariance: Floats
-    probability: Floats
-
-
-def moving(stage: Stage) -> Steps:
-    """How tracks move: those of several modes as interacting multiple models do."""
-    if not stage.modes:
-        return gaussian_filter(stage, linear_motion(stage), ())
-    alone = (stage._replace(motion=motion, modes=()) for motion in stage.modes)
-    return interacting_steps(stage, [gaussian_filter(each, linear_motion(each), ()) for each in alone])
-
-
-def believing(stage: Stage) -> Function:
-    """`belief(run, tracks)`: the tracks of a run as the filters have them, first axis = place."""
-
-    def of_one(run: int, tracks: Tracks) -> Gaussian:
-        return Gaussian(tracks.mean[run, :, 0], tracks.covariance[run, :, 0])
-
-    def of_modes(run: int, tracks: Tracks) -> Belief:
-        return Belief(tracks.mean[run], tracks.covariance[run], tracks.mode[run], tracks.log_mode[run])
-
-    return of_modes if stage.modes else of_one
-
-
-def choosing(functions: list[Function]) -> Function:
-    """`call(kind, ...)`: the function of this number."""
-
-    def call(kind: int, *arguments: Any) -> Any:
-        for number in range_of(1, len(functions)):
-            if kind == number:
-                return functions[number](*arguments)
-        return functions[0](*arguments)
-
-    return call
-
-
-class Births(NamedTuple):
-    """How detections begin tracks, by kind of sensors.
-
-    Attributes:
-        begins: whether those of a kind do.
-        number: of a kind that does, its number in `birth`.
-        birth: (number, detection, origin, parameters) -> see `ScanSensor.birth`.
-    """
-
-    begins: tuple[bool, ...]
-    number: tuple[int, ...]
-    birth: Function
-
-
-def births_of(kinds: Sequence[ScanSensor]) -> Births:
-    """The births of these kinds of sensors."""
-    begins = tuple(kind.birth is not None for kind in kinds)
-    births = [kind.birth for kind in kinds if kind.birth is not None]
-    number = tuple(sum(begins[:k]) for k in range(len(kinds)))
-    return Births(begins, number, choosing(births))
-
-
-def place_of(model: Model) -> tuple[int, int]:
-    """Where the position stands in the state."""
-    names = list(model.state)
-    return names.index("x_m"), names.index("y_m")
-
-
-def corner_of(model: Model) -> tuple[int, int]:
-    """Where the position stands in the tangent space."""
-    tangent = [name for name, _ in tangent_components(list(model.state), model.kinds)]
-    return tangent.index("x_m"), tangent.index("y_m")
 
 
 def tracking(tracker: Tracker, read: Function) -> Function:
@@ -193,9 +53,9 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
     stage, associate = tracker.stage, ASSOCIATIONS[tracker.association]
-    advance, weigh, take_in = advancing(tracker), weighing(tracker), taking_in(tracker)
+    advance, weigh, process = advancing(tracker), association_weights(tracker), processing(tracker)
     end_tracks, begin_tracks = ending(tracker), beginning(tracker)
-    tell_pairs, tell_tracks = telling_pairs(tracker.sizes[0]), telling_tracks(stage)
+    write_pairs, write_tracks = writing_pairs(tracker.sizes[0]), writing_tracks(stage)
 
     def follow(
         run: int,
@@ -203,8 +63,8 @@ def tracking(tracker: Tracker, read: Function) -> Function:
         settings: Floats,
         newborn: Newborn,
         tracks: Tracks,
-        told: Told,
-        memory: Memory,
+        outputs: TrackOutputs,
+        memory: ScanMemory,
     ) -> None:
         """Take one run through its scans."""
         for scan in range(scans.offsets[run], scans.offsets[run + 1]):
@@ -215,18 +75,18 @@ def tracking(tracker: Tracker, read: Function) -> Function:
             count = join_near(scans.first[scan], scans.end[scan], scans, p.joined_within_m, memory)
             weigh(run, scan, count, scans, tracks, p, memory)
             used = tracks.used[run]
-            told.approximated[scan] = associate(
+            outputs.approximated[scan] = associate(
                 memory.weights, used, count, memory.probability, memory.association
             )
             for detection in range(count):
                 memory.left[detection] = 1.0
                 for place in range(used):
                     memory.left[detection] -= memory.probability[place, 1 + detection]
-            tell_pairs(run, scan, count, tracks, told, memory)
-            take_in(run, scan, count, scans, tracks, p, memory)
+            write_pairs(run, scan, count, tracks, outputs, memory)
+            process(run, scan, count, scans, tracks, p, memory)
             end_tracks(run, tracks, p)
-            told.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
-            tell_tracks(run, scan, tracks, told, memory)
+            outputs.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
+            write_tracks(run, scan, tracks, outputs, memory)
 
     return follow
 
@@ -236,7 +96,7 @@ def advancing(tracker: Tracker) -> Function:
     belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
     wait, _, _ = MANAGEMENTS[tracker.management]
 
-    def advance(run: int, time_ns: int, tracks: Tracks, p: Any, memory: Memory) -> None:
+    def advance(run: int, time_ns: int, tracks: Tracks, p: Any, memory: ScanMemory) -> None:
         """Predict all tracks."""
         duration_s = (time_ns - tracks.time_ns[run]) * 1e-9
         if tracks.time_ns[run] != NEVER and duration_s > 0.0:
@@ -249,7 +109,7 @@ def advancing(tracker: Tracker) -> Function:
     return advance
 
 
-def weighing(tracker: Tracker) -> Function:
+def association_weights(tracker: Tracker) -> Function:
     """`weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
@@ -268,7 +128,7 @@ def weighing(tracker: Tracker) -> Function:
         return total
 
     def weigh(
-        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
+        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: ScanMemory
     ) -> None:
         """Fill the weights of all pairs, and which detections are outside all gates."""
         kind, weights, origin = scans.kind[scan], memory.weights, read_pair(scans.origin[scan])
@@ -310,14 +170,14 @@ def weighing(tracker: Tracker) -> Function:
     return weigh
 
 
-def taking_in(tracker: Tracker) -> Function:
-    """`take_in(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
+def processing(tracker: Tracker) -> Function:
+    """`process(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     update = choosing([updating(model, kind) for kind in kinds])
     _, judge, _ = MANAGEMENTS[tracker.management]
     begins, (shared_at, shared) = births_of(kinds).begins, tracker.shared
 
-    def correct(run: int, place: int, count: int, kind: int, tracks: Tracks, memory: Memory) -> None:
+    def correct(run: int, place: int, count: int, kind: int, tracks: Tracks, memory: ScanMemory) -> None:
         """Update a track's Gaussians and the probabilities of its modes by its associations."""
         for mode in range(modes):
             after = split_by_mode(run, place, mode, count, tracks, memory)
@@ -330,8 +190,8 @@ def taking_in(tracker: Tracker) -> Function:
             tracks.mode[run, place, mode] = after
             tracks.log_mode[run, place, mode] = np.log(after) if after > 0.0 else -np.inf
 
-    def take_in(
-        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: Memory
+    def process(
+        run: int, scan: int, count: int, scans: Scans, tracks: Tracks, p: Any, memory: ScanMemory
     ) -> None:
         """Update all tracks by the associations, and what is known of their targets' existence."""
         kind, sensor, now_ns = scans.kind[scan], scans.sensor[scan], tracks.time_ns[run]
@@ -351,181 +211,11 @@ def taking_in(tracker: Tracker) -> Function:
         if shared > 0:
             pool_errors(run, shared_at, tracks, memory.pool)
 
-    return take_in
-
-
-def ending(tracker: Tracker) -> Function:
-    """`end_tracks(run, tracks, p)`: which tracks are over."""
-    names = list(tracker.stage.model.state)
-    x, y = place_of(tracker.stage.model)
-    has_velocity = "vx_mps" in names and "vy_mps" in names
-    velocity = (names.index("vx_mps"), names.index("vy_mps")) if has_velocity else (x, y)
-    _, _, is_over = MANAGEMENTS[tracker.management]
-
-    def is_another(run: int, place: int, tracks: Tracks, p: Any) -> bool:
-        """Whether an older confirmed track is about where this confirmed one is, and moves alike."""
-        for other in range(place if tracks.is_confirmed[run, place] else 0):
-            if (
-                tracks.is_confirmed[run, other]
-                and are_near(run, place, other, (x, y), p.same_within_m, tracks)
-                and (
-                    not has_velocity or are_near(run, place, other, velocity, p.same_within_mps, tracks)
-                )
-            ):
-                return True
-        return False
-
-    def end_tracks(run: int, tracks: Tracks, p: Any) -> None:
-        """Take out the tracks that are over, and second ones of a target."""
-        place = 0
-        while place < tracks.used[run]:
-            if is_over(run, place, tracks, p) or is_another(run, place, tracks, p):
-                drop(run, place, tracks)
-            else:
-                place += 1
-
-    return end_tracks
-
-
-def beginning(tracker: Tracker) -> Function:
-    """`begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
-    model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
-    (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
-    begins, birth_number, birth = births_of(kinds)
-    correlate, read_pair = nothing, tuple_of(2)
-    if shared_at < model.size:
-        correlations = [
-            correlating(model, kind, corner, tracker.names) for kind in kinds if kind.birth is not None
-        ]
-        correlate = choosing(correlations)
-
-    def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:
-        """Whether a confirmed track is too near for another one to begin."""
-        for place in range(tracks.used[run]):
-            apart = np.hypot(
-                at_x - expected(run, place, x, tracks), at_y - expected(run, place, y, tracks)
-            )
-            if tracks.is_confirmed[run, place] and apart < p.birth_distance_m:
-                return True
-        return False
-
-    def first_existence(
-        run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: Memory
-    ) -> float:
-        """How probable it is that a detection is of a target that no track is of; 0 to begin none."""
-        if p.undetected_per_m2 > 0.0:
-            share = memory.undetected[detection] / memory.clutter[detection]
-            existence = memory.left[detection] * share
-            return existence if existence >= p.ending_existence else 0.0
-        is_another = not memory.is_free[detection] or is_taken(run, at_x, at_y, tracks, p)
-        return 0.0 if is_another else p.birth_existence
-
-    def begin_tracks(
-        run: int,
-        scan: int,
-        count: int,
-        scans: Scans,
-        tracks: Tracks,
-        newborn: Newborn,
-        p: Any,
-        memory: Memory,
-    ) -> int:
-        """Begin tracks with the detections that may be of no other; returns how many had no room."""
-        kind, turned_away = scans.kind[scan], 0
-        for detection in range(count if begins[kind] else 0):
-            measured, origin = read_pair(memory.place[detection]), read_pair(scans.origin[scan])
-            (at_x, at_y), triangle, _ = birth(birth_number[kind], measured, origin, p)
-            existence = first_existence(run, detection, at_x, at_y, tracks, p, memory)
-            if existence == 0.0:
-                continue
-            place = tracks.used[run]
-            if place == tracks.number.shape[1]:
-                turned_away += 1
-                continue
-            tracks.used[run] += 1
-            tracks.met[run] += 1
-            tracks.number[run, place] = tracks.met[run]
-            for mode in range(modes):
-                mean, covariance = tracks.mean[run, place, mode], tracks.covariance[run, place, mode]
-                copy_gaussian(newborn.mean, newborn.covariance, mean, covariance)
-                mean[x], mean[y] = at_x, at_y
-                covariance[corner[0], corner[0]], covariance[corner[1], corner[1]] = (
-                    triangle[0],
-                    triangle[2],
-                )
-                covariance[corner[0], corner[1]] = covariance[corner[1], corner[0]] = triangle[1]
-                for i in range(shared):
-                    mean[shared_at + i] = tracks.shared_mean[run, i]
-                    for j in range(shared):
-                        known = tracks.shared_covariance[run, i, j]
-                        covariance[shared_at + i, shared_at + j] = known
-                number = birth_number[kind]
-                correlate(number, mean, covariance, scans.origin[scan], p, memory.step)
-                probability = newborn.mode[mode]
-                tracks.mode[run, place, mode] = probability
-                tracks.log_mode[run, place, mode] = np.log(probability) if probability > 0.0 else -np.inf
-            tracks.existence[run, place] = existence
-            tracks.is_confirmed[run, place] = existence >= p.confirming_existence
-            tracks.hits[run, place] = tracks.chances[run, place] = 1
-            tracks.score[run, place] = tracks.best_score[run, place] = 0.0
-            tracks.seen_ns[run, place] = tracks.time_ns[run]
-            for sensor in range(tracks.updated_ns.shape[2]):
-                tracks.updated_ns[run, place, sensor] = NEVER
-        return turned_away
-
-    return begin_tracks
-
-
-def telling_pairs(modes: int) -> Function:
-    """`tell_pairs(run, scan, count, tracks, told, memory)`: the associations of confirmed tracks."""
-
-    def tell_pairs(run: int, scan: int, count: int, tracks: Tracks, told: Told, memory: Memory) -> None:
-        """Tell which detections went to confirmed tracks."""
-        for place in range(tracks.used[run]):
-            for detection in range(count if tracks.is_confirmed[run, place] else 0):
-                if memory.probability[place, 1 + detection] > 0.0:
-                    row = told.end[run, 1]
-                    told.pair[run, row, 0] = tracks.number[run, place]
-                    told.pair[run, row, 1], told.pair[run, row, 2] = scan, detection
-                    told.associated[run, row] = memory.probability[place, 1 + detection]
-                    likeliest = 0
-                    for mode in range(1, modes):
-                        likelihood = memory.likelihood[place, mode, detection]
-                        if likelihood > memory.likelihood[place, likeliest, detection]:
-                            likeliest = mode
-                    white = memory.white[place, likeliest, detection]
-                    factor = memory.spread[place, likeliest]
-                    copy_gaussian(white, factor, told.white[run, row], told.factor[run, row])
-                    told.end[run, 1] = row + 1
-
-    return tell_pairs
-
-
-def telling_tracks(stage: Stage) -> Function:
-    """`tell_tracks(run, scan, tracks, told, memory)`: the confirmed tracks."""
-    belief_of, estimate = believing(stage), moving(stage).estimate
-
-    def tell_tracks(run: int, scan: int, tracks: Tracks, told: Told, memory: Memory) -> None:
-        """Tell the confirmed tracks as they are now."""
-        belief = belief_of(run, tracks)
-        rows = Rows(told.mean[run], told.covariance[run], told.probability[run])
-        told.confirmed[scan] = 0
-        for place in range(tracks.used[run]):
-            if tracks.is_confirmed[run, place]:
-                row = told.end[run, 0]
-                told.number[run, row] = tracks.number[run, place]
-                estimate(place, belief, rows, row, memory.motion)
-                told.existence[run, row] = tracks.existence[run, place]
-                told.end[run, 0] = row + 1
-                told.confirmed[scan] += 1
-
-    return tell_tracks
+    return process
 
 
 # So many scans of a run go through the loop at once, which bounds the room for what is said of them.
 BATCH = 1000
-BY_TRACK = ("number", "mean", "covariance", "probability", "existence")
-BY_PAIR = ("associated", "white", "factor")
 
 
 @lru_cache(maxsize=16)
@@ -536,7 +226,7 @@ def _compiled(tracker: Tracker) -> Callable[..., None]:
 
 def track_scans(
     tracker: Tracker, scans: Scans, settings: Floats, newborn: Newborn, before: Tracks
-) -> tuple[Tracks, list[tuple[Scans, Told]]]:
+) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
     """The tracks after the scans; and by batch, its scans and what was said of them.
 
     `settings` (sensors, names) are the parameters for each sensor.
@@ -554,53 +244,13 @@ def track_scans(
             offsets=np.concatenate([[0], np.cumsum(bounds[1] - bounds[0])]),
             **{name: getattr(scans, name)[rows] for name in BY_SCAN},
         )
-        told = _no_told(batch, runs, places, tracker.sizes)
+        outputs = blank_outputs(batch, runs, places, tracker.sizes)
         memory = partial(_memory, tracker, places, largest)
-        _compiled(tracker)(runs, batch, settings, newborn, tracks, told, scratch=memory)
-        said.append((batch, told))
+        _compiled(tracker)(runs, batch, settings, newborn, tracks, outputs, scratch=memory)
+        said.append((batch, outputs))
     return tracks, said
 
 
-def _memory(tracker: Tracker, places: int, detections: int) -> Memory:
+def _memory(tracker: Tracker, places: int, detections: int) -> ScanMemory:
     motion = moving(tracker.stage).memory(())
     return memory_of(tracker.stage, motion, tracker.shared[1], places, detections)
-
-
-def _no_told(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> Told:
-    """Room for all that could be said: memory that is not written takes none."""
-    modes, n, t = sizes
-    counts = np.diff(scans.offsets)
-    detections = np.add.reduceat(np.append(scans.end - scans.first, 0), scans.offsets[:-1])
-    rows = places * int(counts.max(initial=0))
-    pairs = places * int(np.where(counts > 0, detections, 0).max(initial=0))
-    return Told(
-        end=np.zeros((runs, 2), np.int64),
-        confirmed=np.full(len(scans.time_ns), NEVER),
-        approximated=np.zeros(len(scans.time_ns), np.int64),
-        turned_away=np.zeros(len(scans.time_ns), np.int64),
-        number=np.empty((runs, rows), np.int64),
-        mean=np.empty((runs, rows, n)),
-        covariance=np.empty((runs, rows, t, t)),
-        probability=np.empty((runs, rows, modes)),
-        existence=np.empty((runs, rows)),
-        pair=np.empty((runs, pairs, 3), np.int64),
-        associated=np.empty((runs, pairs)),
-        white=np.empty((runs, pairs, 2)),
-        factor=np.empty((runs, pairs, 2, 2)),
-    )
-
-
-def of_last(scans: Scans, told: Told) -> tuple[Scans, Told]:
-    """The last scan of one run, and what was said of it."""
-    last = len(scans.time_ns) - 1
-    count, (end, paired) = max(int(told.confirmed[last]), 0), told.end[0]
-    is_of_it = told.pair[0, :paired, 1] == last
-    by_scan = {name: getattr(told, name)[last:] for name in ("confirmed", "approximated", "turned_away")}
-    by_track = {name: getattr(told, name)[:, end - count : end] for name in BY_TRACK}
-    return take_scans(scans, np.array([last])), Told(
-        end=np.array([[count, int(is_of_it.sum())]]),
-        **by_scan,
-        **by_track,
-        pair=told.pair[:, :paired][:, is_of_it] - np.array([0, last, 0]),
-        **{name: getattr(told, name)[:, :paired][:, is_of_it] for name in BY_PAIR},
-    )

@@ -1,4 +1,4 @@
-"""Tracks of many targets: what is kept of each, and how one is taken out.
+"""Holds the tracks of many targets in columns, and takes one out.
 
 A track is a Gaussian for each of its model's modes, with the modes' probabilities; a model of one motion
 has one mode, which is certain.

@@ -1,4 +1,4 @@
-"""Prediction and update of recursive Gaussian filters, and the methods made of them.
+"""Predicts and updates recursive Gaussian filters, and lists the methods made of these steps.
 
 Begin with `steps`.
 """

@@ -1,4 +1,4 @@
-"""The extended filter and those of samples, put together of the parts of one form.
+"""Puts the extended filter and those of samples together of the parts of one form.
 
 What a filter carries is a mean and what stands for its covariance, see `Form`. Plain filters carry the
 covariance itself; the parts of square-root forms are in `replay.inference.kalman.square_root`.
@@ -16,13 +16,13 @@ from replay.inference.model.stage import Stage
 
 
 class Parts(NamedTuple):
-    """What the filters of one form are put together of; each part makes a function for a stage.
+    """Holds what the filters of one form are put together of; each part makes a function for a stage.
 
     Attributes:
         form: what stands for a covariance.
         linear_motion, sampled_motion: (stage), (stage, samples) -> `predict`, see `gaussian_filter`.
         linear_update, sampled_update: (stage, number), (stage, number, samples) -> a sensor's update.
-        lost_motion: (stage) -> the prediction in a gap of the control.
+        gap_motion: (stage) -> the prediction in a gap of the control.
     """
 
     form: Form
@@ -30,7 +30,7 @@ class Parts(NamedTuple):
     sampled_motion: Function
     linear_update: Function
     sampled_update: Function
-    lost_motion: Function
+    gap_motion: Function
 
 
 def _linear_update(stage: Stage, number: int) -> Function:
@@ -45,15 +45,15 @@ PLAIN = Parts(COVARIANCES, linear_motion, sampled_motion, _linear_update, _sampl
 
 
 def extended(stage: Stage, parts: Parts = PLAIN) -> Steps:
-    """The steps of an extended Kalman filter."""
+    """Make the steps of an extended Kalman filter."""
     updates = tuple(parts.linear_update(stage, number) for number in range(len(stage.sensors)))
     return gaussian_filter(
-        stage, parts.linear_motion(stage), updates, form=parts.form, lost_motion=parts.lost_motion
+        stage, parts.linear_motion(stage), updates, form=parts.form, gap_motion=parts.gap_motion
     )
 
 
 def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
-    """Regression at samples; what is linear is passed on exactly instead."""
+    """Make steps by regression at samples; what is linear is passed on exactly."""
     model, motion = stage.model, stage.motion
     dimensions: list[int] = []
     shapes: list[tuple[int, tuple[str, ...]]] = []
@@ -79,5 +79,5 @@ def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
         )
         return workspace(stage, tuple(made))
 
-    of_form = parts.form, parts.lost_motion
+    of_form = parts.form, parts.gap_motion
     return gaussian_filter(stage, predict, tuple(updates), memory, tuple(dimensions), *of_form)

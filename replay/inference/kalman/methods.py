@@ -1,4 +1,4 @@
-"""Methods: how the state of any model is estimated, and the filters among them.
+"""Defines what a method is, and the Kalman filters among them: `ekf`, `iekf`, `ukf`, `lrkf`, `analytic`.
 
 Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing but the model's functions;
 `ukf` and `lrkf:SAMPLING` sample them; `analytic` takes the exact moments where the model knows them.
@@ -23,7 +23,7 @@ from replay.inference.kalman.square_root import FACTORED
 from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
-    Note,
+    InnovationRecord,
     Steps,
     Workspace,
     gaussian_filter,
@@ -32,26 +32,27 @@ from replay.inference.kalman.update import (
     kalman_update,
     linear_innovation,
     linear_sensor,
-    note_numbers,
-    noting,
     reading,
     sensor_derivative,
+    write_numbers,
+    writing_innovation,
 )
 from replay.inference.linear_algebra.gaussian import (
+    downdate,
+    drop_missing,
+    inflate,
+    inflation,
     kalman_step,
-    keep_measured,
-    reduce_covariance,
     whiten,
-    widen,
-    widening,
     wrap,
 )
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.corrections import correcting, relinearising, sloping
-from replay.inference.model.model import Model, trial_state
+from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import trial_parameters
 from replay.inference.model.stage import Stage, traced_sensor
+from replay.inference.model.validation import trial_state
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
 
@@ -60,7 +61,7 @@ SETTLED = 1e-12  # of the iterated update: the largest component of the last ste
 
 
 class MethodParameters(Parameters):
-    """Options of every method.
+    """Defines the options of every method.
 
     `every_s` asks for estimates at this interval too, besides those at the sensors' stamps. `mode` is
     the motion to use of a model that has several. `estimate` names parameters that become part of the
@@ -94,14 +95,14 @@ class RegressionParameters(MethodParameters):
 
 
 class SquareRootParameters(UnscentedParameters):
-    """The filter whose covariances are carried as factors, ekf or ukf."""
+    """`filter` is the one whose covariances are carried as factors, ekf or ukf."""
 
     filter: Literal["ekf", "ukf"] = "ekf"
 
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """One way to estimate the state of any model.
+    """Describes one way to estimate the state of any model.
 
     Attributes:
         summary: what it is, in one line.
@@ -133,7 +134,7 @@ def _iterated(stage: Stage) -> Steps:
 
 
 def iterated_update(stage: Stage, number: int) -> Function:
-    """The update linearised anew at every iterate, until it settles: Gauss-Newton on the posterior.
+    """Make the update that linearises at every iterate until it settles: Gauss-Newton on the posterior.
 
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
     gate is tested at the prediction, and so is how much the measurement counts; innovation and
@@ -141,19 +142,19 @@ def iterated_update(stage: Stage, number: int) -> Function:
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
-    read_state, read_about = tuple_of(n), reading(sensor).about
+    read_state, read_reference = tuple_of(n), reading(sensor).reference
     linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    tell, correct = noting(stage, number), correcting(model.kinds, model.correct)
+    write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
     step_to, chain = relinearising(model)
 
     def relinearise(
         mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
     ) -> None:
-        """The innovation by the Jacobian at mean (+) step, as one about the mean."""
+        """Form the innovation by the Jacobian at mean (+) step, as one about the mean."""
         innovation, step, rows = work.innovations[number], work.step, work.rows
         step_to(mean, work)
-        linearise(read_state(work.state), read_about(data), parameters, work)
+        linearise(read_state(work.state), read_reference(data), parameters, work)
         chain(rows[:m], work)
         compare(covariance, data, parameters, work)
         for i in range(m):
@@ -166,9 +167,9 @@ def iterated_update(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         present = 0
         for i in range(m):
@@ -181,17 +182,17 @@ def iterated_update(stage: Stage, number: int) -> Function:
             step[row] = 0.0
         for iteration in range(ITERATIONS):
             relinearise(mean, covariance, data, parameters, work)
-            tell(innovation, note)
-            size = keep_measured(innovation)
+            write_innovation(innovation, record)
+            size = drop_missing(innovation)
             squared, determinant = whiten(innovation, size)
             if np.isnan(squared):
                 return NOT_POSITIVE_DEFINITE
             if iteration == 0:
-                factor = widening(squared, size, parameters)
+                factor = inflation(squared, size, parameters)
             if size == 0 or (iteration == 0 and not squared <= gate[size]):
-                note_numbers(note, squared, determinant, size, False, 1.0)
+                write_numbers(record, squared, determinant, size, False, 1.0)
                 return ALL_WELL
-            widen(innovation, size, factor)
+            inflate(innovation, size, factor)
             for row in range(t):
                 work.turned[row] = step[row]
             kalman_step(innovation, size, step)
@@ -200,9 +201,9 @@ def iterated_update(stage: Stage, number: int) -> Function:
                 change = max(change, abs(step[row] - work.turned[row]))
             if change < SETTLED:
                 break
-        reduce_covariance(covariance, innovation.cross_covariance, size)
+        downdate(covariance, innovation.cross_covariance, size)
         correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, True, factor)
+        write_numbers(record, squared, determinant, size, True, factor)
         return ALL_WELL
 
     return update
@@ -225,7 +226,7 @@ def _analytic(stage: Stage) -> Steps:
 
 
 def no_steps(stage: Stage) -> Steps:
-    """For a method whose steps are those of one that `Method.made_for` makes for its parameters."""
+    """Refuse to make steps: for a method that `Method.made_for` makes for its parameters."""
     raise AssertionError("the method was not made for its parameters")
 
 
@@ -245,7 +246,7 @@ def _exact_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         state = read_state(mean)
@@ -259,16 +260,21 @@ def _exact_motion(stage: Stage) -> Function:
 def _exact_sensor(stage: Stage, number: int) -> Function:
 
     sensor = stage.sensors[number]
-    moments, read_about = sensor.moments, reading(sensor).about
+    moments, read_reference = sensor.moments, reading(sensor).reference
     assert moments is not None
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
         difference, spread, cross = work.innovations[number]
         predicted = work.predicted
-        moments(mean, covariance, read_about(data), parameters, predicted, spread, cross)
+        moments(mean, covariance, read_reference(data), parameters, predicted, spread, cross)
         for i in range(m):
             difference[i] = wrap(data[i] - predicted[i], angular[i])
         return True
@@ -277,19 +283,19 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
 
 
 def _lacks_slopes(model: Model) -> str:
-    """A sensor whose linearised components depend on one another at every state, in noise and all.
+    """Name a sensor whose linearised components depend on one another at every state, in noise and all.
 
     As those of a point and its square do: the innovation covariance is then singular.
     """
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if sensor.noises and sensor.jacobian is None:
-            m, about = len(sensor.measured), (0.7,) * sensor.about_size
+            m, reference = len(sensor.measured), (0.7,) * sensor.reference_size
             rows, gain = np.zeros((m, model.tangent)), np.zeros((m, sensor.noises))
             work = SimpleNamespace(predicted=np.empty(m), rows=rows, noise_gain=gain)
             try:
                 own = traced_sensor(model, sensor, number_fields(model.parameters))
-                sensor_derivative(model, own)(trial_state(model.kinds), about, parameters, work)
+                sensor_derivative(model, own)(trial_state(model.kinds), reference, parameters, work)
             except Exception:  # is said when the model is bound, see `model.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
@@ -344,7 +350,7 @@ _SQUARE_ROOTS = {
 
 
 def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
-    """The name and the variant of a filter for a method to rest on, such as "lrkf:s2kf-50".
+    """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that rests on it.
 
     Raises BadInput where there is no such filter; `use` says what for.
     """
@@ -358,7 +364,7 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
 
 @lru_cache(maxsize=64)
 def filter_with(name: str, variant: str) -> Method:
-    """A filter whose variant is set, as in `lrkf:s2kf-50`."""
+    """Set the variant of a filter, as in `lrkf:s2kf-50`."""
     chosen = FILTERS[name]
     if chosen.made_for is not None:
         given = {str(chosen.variant): variant} if variant else {}

@@ -1,4 +1,4 @@
-"""The prediction: a Gaussian through a model's motion, by its derivative, and the motion's noise."""
+"""Predicts a Gaussian through a model's motion by its Jacobian, and adds the motion's noise."""
 
 from typing import Any
 
@@ -6,20 +6,24 @@ from replay.engine.arrays import Floats, Function
 from replay.inference.kalman.steps import Workspace
 from replay.inference.linear_algebra.gaussian import add_through
 from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
-from replay.inference.linear_algebra.sparse import adding_through, moving_covariance, pattern_of
+from replay.inference.linear_algebra.sparse import adding_through, pattern_of, propagating_covariance
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.model import Model, Motion
 from replay.inference.model.stage import Stage
 
 
 def linear_motion(stage: Stage) -> Function:
-    """Prediction by the derivative at the mean, which is exact where the motion is linear."""
+    """Make the prediction by the Jacobian at the mean, which is exact where the motion is linear.
+
+    Returns `predict(mean, covariance, control, duration_s, parameters, sample_index, work)`: in place,
+    the mean (n,) becomes f(x, u) and the covariance (t, t) F P F' + Q.
+    """
     model, motion = stage.model, stage.motion
     n, read_control = model.size, tuple_of(model.controls)
     read_state, fill = tuple_of(n), filling(n)
     linearise = motion_derivative(model, motion, by_state=True)
     known = known_entries(linearise, "transition")
-    move_covariance = moving_covariance(pattern_of(known, model.tangent))
+    move_covariance = propagating_covariance(pattern_of(known, model.tangent))
     add_noise = motion_noise(model, motion)
 
     def predict(
@@ -28,7 +32,7 @@ def linear_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         state = read_state(mean)
@@ -42,10 +46,16 @@ def linear_motion(stage: Stage) -> Function:
 
 
 def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Function:
-    """`linearise(state, control, duration_s, parameters, work)`: the moved state and what is wanted.
+    """Make the function that moves a state and takes the derivatives that are wanted.
 
-    It fills `work.state`, `transition` where the derivative by the state is wanted, `gain` where the
-    control is noisy, and `noise_gain` where noise enters other than by addition.
+    Args:
+        model: the model, for the kinds of its state and control.
+        motion: the motion whose `move` is differentiated.
+        by_state: whether F, the derivative by the state, is wanted.
+
+    Returns `linearise(state, control, duration_s, parameters, work)`. It fills `work.state` (n,),
+    `transition` (t, t) where F is wanted, `gain` (t, controls) where the control is noisy, and
+    `noise_gain` (t, noises) where noise enters other than by addition.
     """
     if motion.jacobians is not None:
         move, jacobians, fill = motion.move, motion.jacobians, filling(model.size)
@@ -65,9 +75,14 @@ def motion_derivative(model: Model, motion: Motion, *, by_state: bool) -> Functi
 
 
 def motion_noise(model: Model, motion: Motion) -> Function:
-    """`add(state, covariance, duration_s, parameters, work)`: the noise of a motion, whatever its kind.
+    """Make the function that adds the noise of a motion, whatever its kind, to a covariance.
 
-    What enters by the control, or other than by addition, does so through the workspace's derivatives.
+    Args:
+        model: the model, for the sizes of its tangent space and control.
+        motion: the motion whose noise it is.
+
+    Returns `add(state, covariance, duration_s, parameters, work)`, for a covariance (t, t). What enters
+    by the control, or other than by addition, does so through the workspace's derivatives.
     """
     pieces: list[Function] = []
     if motion.control_noise is not None:

@@ -1,4 +1,4 @@
-"""Statistical linear regression: a Gaussian through a function at weighted samples of it.
+"""Passes a Gaussian through a function by statistical linear regression at weighted samples.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, (19)-(24);
 (24) prints y_{k,i} where the noise sample is meant. On manifolds samples are the mean plus tangent
@@ -17,10 +17,10 @@ from replay.inference.kalman.steps import Workspace
 from replay.inference.kalman.update import reading, sensor_noise
 from replay.inference.linear_algebra.gaussian import cholesky, wrap
 from replay.inference.linear_algebra.manifold import (
-    differencing,
+    boxminus,
+    boxplus,
     is_flat,
     recentring,
-    retraction,
     tangent_size,
 )
 from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
@@ -34,7 +34,7 @@ MEANS = 30  # at most so many steps to an intrinsic mean
 
 @varying(0, points=1, weights=1)
 class SampleMemory(NamedTuple):
-    """Samples of N(0, I), and what a regression at them works in; N = t + noises.
+    """Holds samples of N(0, I), and the arrays of a regression at them; N = t + noises.
 
     Attributes:
         points, weights, first, stride: see `replay.sampling.sets.SampleSets`.
@@ -61,7 +61,7 @@ class SampleMemory(NamedTuple):
 def sample_memory(
     sets: SampleSets, kinds: Sequence[str], noises: int, outputs: Sequence[str]
 ) -> SampleMemory:
-    """Memory for the regression of a function of a state and its noise."""
+    """Make memory for the regression of a function of a state and its noise."""
     _, count, dimension = sets.points.shape
     values = tangent_size(outputs)
     return SampleMemory(
@@ -79,17 +79,18 @@ def sample_memory(
 def sampling(
     function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
 ) -> Function:
-    """The values of `function(state, noise, arguments)` at samples.
+    """Make the evaluation of `function(state, noise, arguments)` at weighted samples.
 
-    Returns `sample(mean, arguments, variances, use, memory)`, whose leading block of `memory.factor` is
-    the state's factor. It takes the samples of use number `use`, and returns their weights (L,). It
-    fills `memory.offsets`, `memory.centre` with the intrinsic mean of the values, and `memory.values`,
-    which are away from there by them less `memory.shift`. `variances` is a tuple of those of the noise.
+    Returns `sample(mean, arguments, variances, sample_index, memory)`, before which the leading block of
+    `memory.factor` is the state's factor. It takes the set of samples number `sample_index`, and returns
+    their weights (L,). It fills `memory.offsets`, `memory.centre` with the intrinsic mean of the values,
+    and `memory.values`, which are away from there by them less `memory.shift`. `variances` is a tuple of
+    those of the noise.
     """
     t, components = tangent_size(kinds), len(kinds)
     size = t + noises
     read_state, read_noise = tuple_of(components), tuple_of(noises, t)
-    add, subtract = retraction(kinds), differencing(outputs)
+    add, subtract = boxplus(kinds), boxminus(outputs)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
     lower, offset = lower_of(size), offset_of(size)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
@@ -116,10 +117,10 @@ def sampling(
         mean: Floats,
         arguments: tuple[Any, ...],
         variances: tuple[float, ...],
-        use: int,
+        sample_index: int,
         memory: SampleMemory,
     ) -> Floats:
-        chosen = (use - memory.first) * memory.stride
+        chosen = (sample_index - memory.first) * memory.stride
         fill_noise(memory.noise, variances)
         for k in range(noises):
             memory.factor[t + k, t + k] = np.sqrt(memory.noise[k])
@@ -133,11 +134,11 @@ def sampling(
 def regression(
     function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
 ) -> Function:
-    """The regression of `function(state, noise, arguments)` at samples; see `sampling`.
+    """Make the regression of `function(state, noise, arguments)` at weighted samples; see `sampling`.
 
-    Returns `regress(mean, covariance, arguments, variances, spread, cross, use, memory)`. It fills
-    `spread` (v, v) with the covariance of the values and `cross` (t, v) with that with the state; False
-    where the state's covariance is not positive definite. `spread` may be that covariance itself.
+    Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
+    fills `spread` (v, v) with the covariance of the values and `cross` (t, v) with that with the state;
+    False where the state's covariance is not positive definite. `spread` may be that covariance itself.
     """
     t, v = tangent_size(kinds), tangent_size(outputs)
     sample, moments = sampling(function, kinds, noises, outputs), moments_of(t, v)
@@ -149,12 +150,12 @@ def regression(
         variances: tuple[float, ...],
         spread: Floats,
         cross: Floats,
-        use: int,
+        sample_index: int,
         memory: SampleMemory,
     ) -> bool:
         if not cholesky(memory.factor, covariance, t):
             return False
-        weights = sample(mean, arguments, variances, use, memory)
+        weights = sample(mean, arguments, variances, sample_index, memory)
         moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
         return True
 
@@ -163,13 +164,13 @@ def regression(
 
 @lru_cache(maxsize=64)
 def settling(kinds: tuple[str, ...]) -> Function:
-    """`settle(weights, values, centre, shift)`: moves a centre to the intrinsic mean of values.
+    """Make `settle(weights, values, centre, shift)`: it moves a centre to the intrinsic mean of values.
 
     The values (L, v) are tangent vectors from the centre, and those from the mean less `shift` (v,)
     afterwards.
     """
     v, straight = tangent_size(kinds), set(kinds) <= {"linear"}
-    add, recentre, weighted_mean = retraction(kinds), recentring(kinds), weighted_mean_of(v)
+    add, recentre, weighted_mean = boxplus(kinds), recentring(kinds), weighted_mean_of(v)
 
     def settle(weights: Floats, values: Floats, centre: Floats, shift: Floats) -> None:
         for _ in range(MEANS):
@@ -187,12 +188,12 @@ def settling(kinds: tuple[str, ...]) -> Function:
 
 
 def no_variances(*_: Any) -> tuple[float, ...]:
-    """Of no noise."""
+    """List the variances of no noise."""
     return ()
 
 
 def sampled_motion(stage: Stage, number: int) -> Function:
-    """Prediction by regression at the samples `work.samples[number]`.
+    """Make the prediction by regression at the samples `work.samples[number]`.
 
     Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
     """
@@ -211,14 +212,14 @@ def sampled_motion(stage: Stage, number: int) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         memory, state, driven = work.samples[number], read_state(mean), read_control(control)
         arguments = (driven, duration_s, parameters)
         variances = variances_of(state, duration_s, parameters)
         cross = work.product.T
-        if not regress(mean, covariance, arguments, variances, covariance, cross, use, memory):
+        if not regress(mean, covariance, arguments, variances, covariance, cross, sample_index, memory):
             return False
         linearise(state, driven, duration_s, parameters, work)
         add_noise(state, covariance, duration_s, parameters, work)
@@ -229,7 +230,7 @@ def sampled_motion(stage: Stage, number: int) -> Function:
 
 
 def moved_with_noise(motion: Motion) -> Function:
-    """`function(state, noise, arguments)`: the motion, for `sampling`."""
+    """Make `function(state, noise, arguments)` of a motion, for `sampling`."""
     move = motion.move
     if motion.noises:
 
@@ -245,23 +246,28 @@ def moved_with_noise(motion: Motion) -> Function:
 
 
 def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
-    """`innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
+    """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)
-    read_about, m = reading(sensor).about, len(kinds)
+    read_reference, m = reading(sensor).reference, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
     entering = sensor.noise if sensor.noises else None
     variances_of = entering or no_variances
     add_noise = nothing if sensor.noises else sensor_noise(sensor)
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
         memory = work.samples[samples]
         difference, spread, cross = work.innovations[number]
-        arguments, variances = (read_about(data), parameters), variances_of(parameters)
-        if not regress(mean, covariance, arguments, variances, spread, cross, use, memory):
+        arguments, variances = (read_reference(data), parameters), variances_of(parameters)
+        if not regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory):
             return False
         for i in range(m):
             difference[i] = wrap(data[i] - memory.centre[i], angular[i])
@@ -272,7 +278,7 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
 
 
 def measured_with_noise(sensor: Sensor) -> Function:
-    """`function(state, noise, arguments)`: what a sensor measures, for `sampling`."""
+    """Make `function(state, noise, arguments)` of what a sensor measures, for `sampling`."""
     measure = sensor.measure
     if sensor.noises:
 

@@ -1,4 +1,4 @@
-"""Square-root forms of the extended and the unscented filter: they carry factors of covariances.
+"""Makes the parts of square-root filters, extended and unscented: they carry factors of covariances.
 
 Of the columns X of the state's factor, or its weighted samples, of Y, what a function makes of them, and
 of a factor N of its noise, one factorisation makes a prediction or an update:
@@ -23,24 +23,36 @@ from replay.inference.kalman.regression import (
     no_variances,
     sampling,
 )
-from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE, NOTHING_MEASURED, Note, Workspace
-from replay.inference.kalman.update import note_numbers, noting, reading, sensor_derivative, sensor_noise
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Workspace,
+)
+from replay.inference.kalman.update import (
+    reading,
+    sensor_derivative,
+    sensor_noise,
+    write_numbers,
+    writing_innovation,
+)
 from replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
-from replay.inference.linear_algebra.gaussian import whiten_by, widening, wrap
+from replay.inference.linear_algebra.gaussian import inflation, whiten_by, wrap
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.corrections import correcting, sloping
 from replay.inference.model.stage import Stage
 
+Into = tuple[Floats, Floats]  # rows, and the weights of their columns
+
 
 def _linear(linearise: Function, slopes: str) -> Function:
-    """`spread(state, factor, given, use, work, rows, weights)`: Y and X of a factor, by a derivative.
+    """Make `spread(state, factor, given, index, work, into)`: it fills in Y and X of a factor.
 
-    `linearise(state, *given, work)` fills the workspace with it, under the name `slopes`.
+    By the derivative that `linearise(state, *given, work)` puts into the workspace's `slopes`.
     """
 
-    def spread(
-        state: Any, factor: Floats, given: Any, use: int, work: Workspace, rows: Floats, weights: Floats
-    ) -> None:
+    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+        rows, weights = into
         t, m = len(factor), len(rows) - len(factor)
         linearise(state, *given, work)
         for k in range(t):
@@ -57,15 +69,14 @@ def _linear(linearise: Function, slopes: str) -> Function:
 def _sampled(
     sample: Function, variances_of: Function, mean_of: str, size: int, samples: int
 ) -> Function:
-    """The same of samples, whose mean goes into the workspace, under the name `mean_of`."""
+    """Make the same of samples, whose mean goes into the workspace's `mean_of`."""
     fill = filling(size)
 
-    def spread(
-        state: Any, factor: Floats, given: Any, use: int, work: Workspace, rows: Floats, weights: Floats
-    ) -> None:
-        memory, t, m = work.samples[samples], len(factor), len(rows) - len(factor)
+    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+        (rows, weights), memory = into, work.samples[samples]
+        t, m = len(factor), len(rows) - len(factor)
         memory.factor[:t, :t] = factor
-        drawn = sample(state, given, variances_of(state, given), use, memory)
+        drawn = sample(state, given, variances_of(state, given), index, memory)
         fill(getattr(work, mean_of), memory.centre)
         for k in range(len(memory.offsets)):
             weights[k] = drawn[k]
@@ -86,7 +97,7 @@ def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> b
 
 
 def _predicting(stage: Stage, spread: Function, add_noise: Function, samples: int = -1) -> Function:
-    """The prediction by what `spread` makes of the factor, or of these samples."""
+    """Make the prediction by what `spread` makes of the factor, or of these samples."""
     t, read_control = stage.model.tangent, tuple_of(stage.model.controls)
     read_state, fill = tuple_of(stage.model.size), filling(stage.model.size)
 
@@ -96,14 +107,14 @@ def _predicting(stage: Stage, spread: Function, add_noise: Function, samples: in
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         count = len(work.samples[samples].offsets) if samples >= 0 else t
         rows, weights = np.zeros((2 * t, count + t)), np.zeros(count + t)
         noise, found = np.zeros((t, t)), np.zeros((2 * t, 2 * t))
         state, given = read_state(mean), (read_control(control), duration_s, parameters)
-        spread(state, factor, given, use, work, rows, weights)
+        spread(state, factor, given, sample_index, work, (rows, weights))
         fill(mean, work.state)
         add_noise(state, noise, duration_s, parameters, work)
         if not _factorise(rows, weights, noise, found):
@@ -120,10 +131,10 @@ def _linear_motion(stage: Stage) -> Function:
     return _predicting(stage, _linear(linearise, "transition"), motion_noise(stage.model, stage.motion))
 
 
-def _lost_motion(stage: Stage) -> Function:
-    lost, add, t = stage.motion.lost, adding_noise(stage.model.tangent), stage.model.tangent
+def _gap_motion(stage: Stage) -> Function:
+    gap_noise, add, t = stage.motion.gap_noise, adding_noise(stage.model.tangent), stage.model.tangent
     fill = filling(stage.model.size)
-    assert lost is not None
+    assert gap_noise is not None
 
     def stand(state: Any, control: Any, duration_s: float, parameters: Any, work: Workspace) -> None:
         fill(work.state, state)
@@ -132,7 +143,7 @@ def _lost_motion(stage: Stage) -> Function:
                 work.transition[row, column] = 1.0 if row == column else 0.0
 
     def add_noise(state: Any, noise: Floats, duration_s: float, parameters: Any, work: Any) -> None:
-        add(noise, lost(state, duration_s, parameters))
+        add(noise, gap_noise(state, duration_s, parameters))
 
     return _predicting(stage, _linear(stand, "transition"), add_noise)
 
@@ -149,9 +160,9 @@ def _sampled_motion(stage: Stage, samples: int) -> Function:
     sample = sampling(moved_with_noise(motion), model.kinds, motion.noises, model.kinds)
     spread_samples = _sampled(sample, variances_of, "state", model.size, samples)
 
-    def spread(state: Any, factor: Floats, given: Any, use: int, work: Workspace, *into: Floats) -> None:
+    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
         linearise(state, *given, work)
-        spread_samples(state, factor, given, use, work, *into)
+        spread_samples(state, factor, given, index, work, into)
 
     add_noise = nothing if motion.noises else motion_noise(model, motion)
     return _predicting(stage, spread, add_noise, samples)
@@ -160,15 +171,18 @@ def _sampled_motion(stage: Stage, samples: int) -> Function:
 def _updating(
     stage: Stage, number: int, spread: Function, add_noise: Function, samples: int = -1
 ) -> Function:
-    """The update by sensor `number`; see `replay.inference.kalman.update.kalman_update`.
+    """Make the update by sensor `number`; see `replay.inference.kalman.update.kalman_update`.
 
     A component that is missing counts as one of a noise of its own, which is as predicted.
     """
     model, sensor = stage.model, stage.sensors[number]
-    t, m, read_about = model.tangent, len(sensor.measured), reading(sensor).about
+    t, m, read_reference = model.tangent, len(sensor.measured), reading(sensor).reference
     read_state, to_covariance = tuple_of(model.size), FACTORS.to_covariance
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
-    tell, find_slope = noting(stage, number), sloping(model.kinds, model.correct, FACTORS)
+    write_innovation, find_slope = (
+        writing_innovation(stage, number),
+        sloping(model.kinds, model.correct, FACTORS),
+    )
     correct = correcting(model.kinds, model.correct, form=FACTORS)
 
     def update(
@@ -177,9 +191,9 @@ def _updating(
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         count = len(work.samples[samples].offsets) if samples >= 0 else t
         rows, weights = np.zeros((m + t, count + m)), np.zeros(count + m)
@@ -190,7 +204,8 @@ def _updating(
             present += not np.isnan(data[i])
         if present == 0:
             return NOTHING_MEASURED
-        spread(read_state(mean), factor, (read_about(data), parameters), use, work, rows, weights)
+        state, given = read_state(mean), (read_reference(data), parameters)
+        spread(state, factor, given, sample_index, work, (rows, weights))
         add_noise(noise, data, parameters, work)
         for i in range(m):
             difference[i] = wrap(data[i] - work.predicted[i], angular[i])
@@ -203,14 +218,14 @@ def _updating(
             return NOT_POSITIVE_DEFINITE
         own_spread[:, :] = found[:m, :m]
         to_covariance(own_spread)
-        tell(innovation, note)
+        write_innovation(innovation, record)
         for i in range(m):
             if not found[i, i] > 0.0:
                 return NOT_POSITIVE_DEFINITE
             if np.isnan(difference[i]):
                 difference[i] = 0.0
         squared, determinant = whiten_by(found, difference, m)
-        accepted, wider = size > 0 and squared <= gate[size], widening(squared, size, parameters)
+        accepted, wider = size > 0 and squared <= gate[size], inflation(squared, size, parameters)
         if accepted:
             for row in range(t):
                 work.step[row] = 0.0
@@ -221,7 +236,7 @@ def _updating(
             orthogonalise(found[m:], weights[: m + t], factor)
             find_slope(mean, factor, work.slope)
             correct(mean, factor, work)
-        note_numbers(note, squared, determinant, size, accepted, wider)
+        write_numbers(record, squared, determinant, size, accepted, wider)
         return ALL_WELL
 
     return update
@@ -246,4 +261,4 @@ def _sampled_update(stage: Stage, number: int, samples: int) -> Function:
     return _updating(stage, number, spread, nothing if noises else sensor_noise(sensor), samples)
 
 
-FACTORED = Parts(FACTORS, _linear_motion, _sampled_motion, _linear_update, _sampled_update, _lost_motion)
+FACTORED = Parts(FACTORS, _linear_motion, _sampled_motion, _linear_update, _sampled_update, _gap_motion)

@@ -1,4 +1,4 @@
-"""The steps of a recursive Gaussian filter, made for one model: what a method puts together.
+"""Defines the steps of a recursive filter, which methods make for one model, and their memory.
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
 `linear_sensor`), by samples (`replay.inference.kalman.regression`), or by moments that the model knows.
@@ -33,7 +33,7 @@ NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Gaussian(NamedTuple):
-    """What is believed of the states, first axis = run: means (runs, n), covariances (runs, t, t).
+    """Holds a Gaussian of every run, first axis = run: means (runs, n), covariances (runs, t, t).
 
     What stands for the covariances is up to the filter, see `Steps.form`.
     """
@@ -43,18 +43,19 @@ class Gaussian(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """A recursive filter of one model, as the recursion takes it.
+    """Holds the steps of a recursive filter of one model, as the recursion calls them.
 
     Attributes:
         memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
-        predict: (run, belief, control, duration_s, parameters, use, memory) -> whether all is well;
-            moves the belief in place. `use` numbers the sets of randomised samples.
-        updates: for every sensor, (run, belief, data, parameters, gate, use, memory, note) -> a failure,
-            ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
+        predict: (run, belief, control, duration_s, parameters, sample_index, memory) -> whether all is
+            well; moves the belief in place. `sample_index` numbers the sets of randomised samples.
+        updates: for every sensor, (run, belief, data, parameters, gate, sample_index, memory, record) ->
+            a failure, ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
-        resumes: whether it goes on after a gap of the control: `predict` then takes NaN for a control.
+        resumes_after_gap: whether it goes on after a gap of the control: `predict` then takes NaN for a
+            control.
         form: what stands for the covariances in beliefs; the estimates have the covariances themselves.
     """
 
@@ -63,12 +64,12 @@ class Steps(NamedTuple):
     updates: tuple[Function, ...]
     estimate: Function
     sampled: tuple[int, ...] = ()
-    resumes: bool = False
+    resumes_after_gap: bool = False
     form: Form = COVARIANCES
 
 
-class Note(NamedTuple):
-    """What an update tells of itself: one row of the results.
+class InnovationRecord(NamedTuple):
+    """Holds the innovation of one update: one row of the results.
 
     Attributes:
         difference, covariance: (slots,), (slots, slots) the innovation; a sensor fills its own slots.
@@ -81,13 +82,13 @@ class Note(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """What the steps of one core work in.
+    """Holds the arrays that the steps of one core work in.
 
     Attributes:
         state: (n,), the moved state.
         transition: (t, t).
-        product, rest: (t, t), after a prediction the covariance of the moved state with the one before,
-            and nothing; of a filter of factors, what `factors` needs to retrace it.
+        product: (t, t), after a prediction the covariance of the moved state with the one before.
+        rest: (t, t), what `factors` needs besides to retrace a prediction.
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
@@ -115,7 +116,12 @@ class Workspace(NamedTuple):
 
 
 def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
-    """A workspace for a model with the sensors at hand."""
+    """Make the workspace of a model with the sensors at hand.
+
+    Args:
+        stage: the model, with n components of the state, t of the tangent space, m of a sensor at most.
+        samples: the memories of `regression`, motion first, one for each of `Steps.sampled`.
+    """
     model, t = stage.model, stage.model.tangent
     m = max((len(sensor.measured) for sensor in stage.sensors), default=0)
     noises = max([stage.motion.noises, *(sensor.noises for sensor in stage.sensors)])
@@ -146,23 +152,38 @@ def gaussian_filter(
     memory: Callable[[tuple[Any, ...]], Any] | None = None,
     sampled: tuple[int, ...] = (),
     form: Form = COVARIANCES,
-    lost_motion: Callable[[Stage], Function] | None = None,
+    gap_motion: Callable[[Stage], Function] | None = None,
 ) -> Steps:
-    """The steps of a filter whose belief is one Gaussian.
+    """Make the steps of a filter whose belief is one Gaussian.
 
-    `predict(mean, covariance, control, duration_s, parameters, use, work)` and the updates alike take
-    one run's mean and covariance, in this form; so does what `lost_motion` makes, where the control has
-    a gap.
+    Args:
+        stage: the model as a method takes it.
+        predict: `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` moves
+            one run's mean (n,) and covariance (t, t) in place; returns whether all is well.
+        updates: for every sensor, `update(mean, covariance, data, parameters, gate, sample_index, work,
+            record)`; see `kalman_update`.
+        memory: (sets) -> the workspace; `workspace(stage)` unless given.
+        sampled: see `Steps.sampled`.
+        form: what stands for the covariance.
+        gap_motion: (stage) -> the prediction in a gap of the control; `keeping` unless given.
+
+    Returns the steps, which pass over gaps of the control where the motion has a `gap_noise`.
     """
-    lost, to_covariance = stage.motion.lost, form.to_covariance
-    if lost is not None:
-        predict = _predicting_lost((lost_motion or keeping)(stage), predict)
+    has_gaps, to_covariance = stage.motion.gap_noise is not None, form.to_covariance
+    if has_gaps:
+        predict = _predicting_gap((gap_motion or keeping)(stage), predict)
 
     def predict_run(
-        run: int, belief: Gaussian, control: Any, duration_s: float, parameters: Any, use: int, work: Any
+        run: int,
+        belief: Gaussian,
+        control: Any,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        work: Any,
     ) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return predict(mean, covariance, control, duration_s, parameters, use, work)
+        return predict(mean, covariance, control, duration_s, parameters, sample_index, work)
 
     def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
@@ -175,13 +196,13 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
-        resumes=lost is not None,
+        resumes_after_gap=has_gaps,
         form=form,
     )
 
 
-def _predicting_lost(predict_lost: Function, predict_driven: Function) -> Function:
-    """The prediction of one kind where the control is NaN, else of the other."""
+def _predicting_gap(predict_gap: Function, predict_driven: Function) -> Function:
+    """Make the prediction of one kind where the control is NaN, else of the other."""
 
     def predict(
         mean: Floats,
@@ -189,20 +210,20 @@ def _predicting_lost(predict_lost: Function, predict_driven: Function) -> Functi
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         if np.isnan(control[0]):
-            return predict_lost(mean, covariance, control, duration_s, parameters, use, work)
-        return predict_driven(mean, covariance, control, duration_s, parameters, use, work)
+            return predict_gap(mean, covariance, control, duration_s, parameters, sample_index, work)
+        return predict_driven(mean, covariance, control, duration_s, parameters, sample_index, work)
 
     return predict
 
 
 def keeping(stage: Stage) -> Function:
-    """The prediction in a gap of the control: it keeps the mean and adds to the covariance."""
-    model, lost = stage.model, stage.motion.lost
-    assert lost is not None
+    """Make the prediction in a gap of the control: it keeps the mean and adds the gap noise."""
+    model, gap_noise = stage.model, stage.motion.gap_noise
+    assert gap_noise is not None
     read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
 
     def keep(
@@ -211,13 +232,13 @@ def keeping(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         work: Workspace,
     ) -> bool:
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
-        add(covariance, lost(read_state(mean), duration_s, parameters))
+        add(covariance, gap_noise(read_state(mean), duration_s, parameters))
         return True
 
     return keep
@@ -230,11 +251,11 @@ def _of_run(update: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Any,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return update(mean, covariance, data, parameters, gate, use, work, note)
+        return update(mean, covariance, data, parameters, gate, sample_index, work, record)
 
     return update_run

@@ -1,4 +1,4 @@
-"""The update: a Gaussian through a model's sensor by its derivative, the innovation, the Kalman gain."""
+"""Updates a Gaussian by a sensor: linearises it, forms the innovation, applies the Kalman gain."""
 
 from typing import Any, NamedTuple
 
@@ -7,17 +7,22 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE, NOTHING_MEASURED, Note, Workspace
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Workspace,
+)
 from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     Innovation,
     add_through,
+    downdate,
+    drop_missing,
+    inflate,
+    inflation,
     kalman_step,
-    keep_measured,
-    reduce_covariance,
     whiten,
-    widen,
-    widening,
     wrap,
 )
 from replay.inference.linear_algebra.linearization import Input, derivative
@@ -28,23 +33,25 @@ from replay.inference.model.stage import Stage
 
 
 class Reading(NamedTuple):
-    """How a sensor's message stands in an event's data: measured, what it is about, its own noise."""
+    """Says how a sensor's message stands in an event's data: measurement, reference, its own noise."""
 
     width: int
     measured: Function
-    about: Function
+    reference: Function
     noise: Function
 
 
 def reading(sensor: Sensor) -> Reading:
-    """Where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
-    m, about = len(sensor.measured), sensor.about_size
+    """Find where the numbers of a sensor's message stand; the noise is the rows of a lower triangle."""
+    m, reference = len(sensor.measured), sensor.reference_size
     triangle = m * (m + 1) // 2 if sensor.covariance else 0
-    return Reading(m + about + triangle, tuple_of(m), tuple_of(about, m), tuple_of(triangle, m + about))
+    return Reading(
+        m + reference + triangle, tuple_of(m), tuple_of(reference, m), tuple_of(triangle, m + reference)
+    )
 
 
 def sensor_noise(sensor: Sensor) -> Function:
-    """`add(spread, data, parameters, work)`: the measurement noise onto a covariance (m, m)."""
+    """Make `add(spread, data, parameters, work)`: it adds the measurement noise R to S (m, m)."""
     m = len(sensor.measured)
     if sensor.covariance:
         read, add_message = reading(sensor).noise, adding_noise(m)
@@ -72,13 +79,13 @@ def sensor_noise(sensor: Sensor) -> Function:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> Function:
-    """`linearise(state, about, parameters, work)`: fills `predicted`, `rows` and `noise_gain`."""
+    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`."""
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
 
-        def by_hand(state: Any, about: Any, parameters: Any, work: Any) -> None:
-            jacobian(state, about, parameters, work.rows)
-            fill(work.predicted, measure(state, about, parameters))
+        def by_hand(state: Any, reference: Any, parameters: Any, work: Any) -> None:
+            jacobian(state, reference, parameters, work.rows)
+            fill(work.predicted, measure(state, reference, parameters))
 
         return by_hand
     inputs = [Input("state", model.kinds, "rows")]
@@ -89,16 +96,25 @@ def sensor_derivative(model: Model, sensor: Sensor) -> Function:
 
 
 def linear_sensor(stage: Stage, number: int) -> Function:
-    """`innovate(mean, covariance, data, parameters, use, work)` by the derivative at the mean."""
+    """Make the innovation by the derivative at the mean.
+
+    Returns `innovate(mean, covariance, data, parameters, sample_index, work)`, which fills that of the
+    sensor in `work.innovations`.
+    """
     sensor = stage.sensors[number]
     read_state, read = tuple_of(stage.model.size), reading(sensor)
-    read_about = read.about
+    read_reference = read.reference
     linearise, compare = sensor_derivative(stage.model, sensor), linear_innovation(sensor, number)
 
     def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
     ) -> bool:
-        linearise(read_state(mean), read_about(data), parameters, work)
+        linearise(read_state(mean), read_reference(data), parameters, work)
         compare(covariance, data, parameters, work)
         return True
 
@@ -106,9 +122,14 @@ def linear_sensor(stage: Stage, number: int) -> Function:
 
 
 def linear_innovation(sensor: Sensor, number: int) -> Function:
-    """`compare(covariance, data, parameters, work)`: the innovation of a linearised measurement.
+    """Make the function that forms the innovation of a linearised measurement.
 
-    From the workspace's `predicted` and `rows`, v = y - h, C = P H' and S = H C + R.
+    Args:
+        sensor: the sensor, with m measured components.
+        number: its number, which says where its innovation stands in the workspace.
+
+    Returns `compare(covariance, data, parameters, work)`: from the workspace's `predicted` h (m,) and
+    `rows` H (m, t), it fills v = y - h, C = P H' and S = H C + R.
     """
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
     add_noise = sensor_noise(sensor)
@@ -134,11 +155,16 @@ def linear_innovation(sensor: Sensor, number: int) -> Function:
 
 
 def whitening(sensor: Sensor, number: int) -> Function:
-    """`whiten_residual(data, parameters, work)`: a linearised measurement in units of its noise.
+    """Make the function that expresses a linearised measurement in units of its noise.
 
-    From the workspace's `predicted` and `rows`, with R = L L': the innovation's difference becomes
-    L^-1 (y - h), its cross-covariance H' L^-T. Returns how many components were measured, and the square
-    of the residual, NaN where R is not positive definite.
+    Args:
+        sensor: the sensor, with m measured components.
+        number: its number, which says where its innovation stands in the workspace.
+
+    Returns `whiten_residual(data, parameters, work)`. From the workspace's `predicted` and `rows`, with
+    R = L L', the innovation's difference becomes L^-1 (y - h), its cross-covariance H' L^-T. It returns
+    how many components were measured, and the square of the residual, NaN where R is not positive
+    definite.
     """
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
     add_noise = sensor_noise(sensor)
@@ -153,7 +179,7 @@ def whitening(sensor: Sensor, number: int) -> Function:
             for j in range(m):
                 noise[i, j] = 0.0
         add_noise(noise, data, parameters, work)
-        size = keep_measured(innovation)
+        size = drop_missing(innovation)
         squared, _ = whiten(innovation, size)
         kalman_step(innovation, size, work.step)
         return size, squared
@@ -161,43 +187,56 @@ def whitening(sensor: Sensor, number: int) -> Function:
     return whiten_residual
 
 
-def slots_of(sensors: tuple[Sensor, ...]) -> dict[str, str]:
-    """All components that these sensors measure, by name with their kinds: those of the innovations."""
-    slots: dict[str, str] = {}
+def innovation_components(sensors: tuple[Sensor, ...]) -> dict[str, str]:
+    """List all components that these sensors measure, by name with kinds: those of the innovations."""
+    components: dict[str, str] = {}
     for sensor in sensors:
         for name, kind in sensor.measured.items():
-            if slots.setdefault(name, kind) != kind:
+            if components.setdefault(name, kind) != kind:
                 raise BadInput(
-                    f"sensor {sensor.topic}: {name} is {kind} here and {slots[name]} elsewhere"
+                    f"sensor {sensor.topic}: {name} is {kind} here and {components[name]} elsewhere"
                 )
-    return slots
+    return components
 
 
-def noting(stage: Stage, number: int) -> Function:
-    """`tell(innovation, note)`: the innovation of sensor `number` into the slots of the results."""
-    slots = list(slots_of(stage.sensors))
-    places = tuple(slots.index(name) for name in stage.sensors[number].measured)
+def writing_innovation(stage: Stage, number: int) -> Function:
+    """Make `write_innovation(innovation, record)`: sensor `number`'s, at its components' places."""
+    components = list(innovation_components(stage.sensors))
+    places = tuple(components.index(name) for name in stage.sensors[number].measured)
 
-    def tell(innovation: Innovation, note: Note) -> None:
+    def write_innovation(innovation: Innovation, record: InnovationRecord) -> None:
         for i in range(len(places)):
-            note.difference[places[i]] = innovation.difference[i]
+            record.difference[places[i]] = innovation.difference[i]
             for j in range(len(places)):
                 missing = np.isnan(innovation.difference[i] + innovation.difference[j])
                 entry = np.nan if missing else innovation.covariance[i, j]
-                note.covariance[places[i], places[j]] = entry
+                record.covariance[places[i], places[j]] = entry
 
-    return tell
+    return write_innovation
 
 
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
-    """The Kalman update by sensor `number`, after `innovate` has filled its innovation.
+    """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. `gate` (m + 1,) bounds the NIS by the number of components. What the gate lets
-    in may still count less, see `gaussian.widening`.
+    is where none is left. What the gate lets in may still count less, see `gaussian.inflation`.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        innovate: `innovate(mean, covariance, data, parameters, sample_index, work)` fills the innovation
+            v (m,), S (m, m), C (t, m) of the sensor; returns whether the covariance was one.
+
+    Returns `update(mean, covariance, data, parameters, gate, sample_index, work, record)`, in place, for
+    a mean (n,), a covariance (t, t) and bounds of the NIS `gate` (m + 1,) by the number of components.
+    It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
     """
-    model, m, tell = stage.model, len(stage.sensors[number].measured), noting(stage, number)
+    model, m, write_innovation = (
+        stage.model,
+        len(stage.sensors[number].measured),
+        writing_innovation(stage, number),
+    )
     find_slope = sloping(model.kinds, model.correct)
     correct = correcting(model.kinds, model.correct)
 
@@ -207,9 +246,9 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         present = 0
         for i in range(m):
@@ -217,35 +256,40 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         if present == 0:
             return NOTHING_MEASURED
         innovation = work.innovations[number]
-        if not innovate(mean, covariance, data, parameters, use, work):
+        if not innovate(mean, covariance, data, parameters, sample_index, work):
             return NOT_POSITIVE_DEFINITE
-        tell(innovation, note)
-        size = keep_measured(innovation)
+        write_innovation(innovation, record)
+        size = drop_missing(innovation)
         squared, determinant = whiten(innovation, size)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
-        factor = widening(squared, size, parameters)
+        factor = inflation(squared, size, parameters)
         if accepted:
-            widen(innovation, size, factor)
+            inflate(innovation, size, factor)
             kalman_step(innovation, size, work.step)
-            reduce_covariance(covariance, innovation.cross_covariance, size)
+            downdate(covariance, innovation.cross_covariance, size)
             find_slope(mean, covariance, work.slope)
             correct(mean, covariance, work)
-        note_numbers(note, squared, determinant, size, accepted, factor)
+        write_numbers(record, squared, determinant, size, accepted, factor)
         return ALL_WELL
 
     return update
 
 
-def note_numbers(
-    note: Note, squared: float, determinant: float, size: int, accepted: bool, factor: float
+def write_numbers(
+    record: InnovationRecord,
+    squared: float,
+    determinant: float,
+    size: int,
+    accepted: bool,
+    factor: float,
 ) -> None:
-    """Note the NIS, the log-likelihood (zero where the gate is shut) and whether it is.
+    """Write the NIS, the log-likelihood (zero where the gate is shut) and whether it is open.
 
     The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
     """
-    note.numbers[0] = squared
+    record.numbers[0] = squared
     likelihood = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + np.log(factor)))
-    note.numbers[1] = likelihood if accepted else 0.0
-    note.numbers[2] = 1.0 if accepted else 0.0
+    record.numbers[1] = likelihood if accepted else 0.0
+    record.numbers[2] = 1.0 if accepted else 0.0

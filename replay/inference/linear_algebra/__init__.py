@@ -1,4 +1,4 @@
-"""Linear algebra of small matrices in place, and states on their manifold.
+"""Computes with small matrices in place, and with states on their manifold.
 
 Begin with `gaussian`.
 """

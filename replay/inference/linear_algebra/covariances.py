@@ -1,4 +1,4 @@
-"""How a filter carries the covariance of its belief: the contract between methods.
+"""Says what a filter can carry for a covariance: the contract of beliefs between methods.
 
 A belief is a mean (n,) and a matrix (t, t) that stands for its covariance P: P itself (`COVARIANCES`),
 or its lower Cholesky factor (`replay.inference.linear_algebra.factors.FACTORS`). A filter's own steps
@@ -8,18 +8,18 @@ predict and update it; all others, such as an IMM or a smoother, know no more of
 from typing import Any, NamedTuple
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import moved_covariance, solve_semidefinite
+from replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
 
 
 class Form(NamedTuple):
-    """What can be done with a matrix (t, t) that stands for a covariance P; all in place.
+    """Holds what can be done with a matrix (t, t) that stands for a covariance P; all in place.
 
     Attributes:
         start: (covariances (..., t, t)) -> the matrices that stand for them.
         to_covariance: (matrix) makes P of it.
         times: (matrix, vector, product) fills the product (t,) with P v.
-        move: (matrix, transition, product): P becomes F P F'; the product (t, t) is to work in.
-        turn: (turning, vector, matrix): the same by a rotation's Jacobian, see `manifold.resetting`.
+        propagate: (matrix, transition, product): P becomes F P F'; the product (t, t) is to work in.
+        turn: (turning, vector, matrix): the same by `manifold.by_right_jacobian`, which is `turning`.
         mix: (weights, away, shift, carried, matrix) fills it with the mixture's of matrices (M, t, t)
             whose means are `away` (M, t), and the mixture's `shift` (t,).
         retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. Of the
@@ -30,7 +30,7 @@ class Form(NamedTuple):
     start: Function
     to_covariance: Function
     times: Function
-    move: Function
+    propagate: Function
     turn: Function
     mix: Function
     retrace: Function
@@ -78,4 +78,4 @@ def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, factor: F
     return True
 
 
-COVARIANCES = Form(_as_it_is, _as_it_is, _times, moved_covariance, _turn, _mix, _retrace)
+COVARIANCES = Form(_as_it_is, _as_it_is, _times, propagate_covariance, _turn, _mix, _retrace)

@@ -1,4 +1,4 @@
-"""Lower factors S in place of covariances P = S S', by weighted Gram-Schmidt.
+"""Carries lower factors S in place of covariances P = S S', by weighted Gram-Schmidt.
 
 Thornton, JPL Technical Memorandum 33-798, 1976; Bierman, Factorization Methods for Discrete Sequential
 Estimation, 1977, VI.4.
@@ -113,7 +113,7 @@ def _times(factor: Floats, vector: Any, product: Floats) -> None:
             product[row] += factor[row, k] * entry
 
 
-def _move(factor: Floats, transition: Floats, product: Floats) -> None:
+def _propagate(factor: Floats, transition: Floats, product: Floats) -> None:
     multiply(transition, factor, product)
     retriangulate(product, factor)
 
@@ -154,4 +154,4 @@ def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, _: Floats
     return True
 
 
-FACTORS = Form(_start, _to_covariance, _times, _move, _turn, _mix, _retrace)
+FACTORS = Form(_start, _to_covariance, _times, _propagate, _turn, _mix, _retrace)

@@ -1,4 +1,4 @@
-"""The algebra of recursive Gaussian filters: scalar loops over small arrays, in place.
+"""Computes with Gaussians in place: Cholesky factors, innovations, the Kalman gain, covariances.
 
 Means lie in the state's own space, covariances in its tangent space and are symmetric by construction.
 Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
@@ -15,7 +15,7 @@ LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 
 class Innovation(NamedTuple):
-    """How a measurement differs from its prediction.
+    """Holds how a measurement differs from its prediction.
 
     Attributes:
         difference: v (m,), NaN where the measurement has no such component.
@@ -29,16 +29,21 @@ class Innovation(NamedTuple):
 
 
 def no_innovation(states: int, components: int) -> Innovation:
-    """Memory for an innovation."""
+    """Make memory for an innovation of m components of a state with t tangent components."""
     return Innovation(
         np.empty(components), np.empty((components, components)), np.empty((states, components))
     )
 
 
 def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
-    """Fill the lower factor of the leading block; False where it is not positive definite (or NaN).
+    """Fill the lower Cholesky factor L of the leading block of a matrix, A = L L'.
 
-    Both arguments may be the same array.
+    Args:
+        factor: (n, n) filled; may be the matrix itself.
+        matrix: A (n, n), symmetric in its first `size` rows and columns.
+        size: of the leading block.
+
+    Returns False where the block is not positive definite (or NaN).
     """
     for column in range(size):
         for row in range(column, size):
@@ -55,9 +60,9 @@ def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 
 
 def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
-    """The same of a positive semidefinite matrix: what is below a pivot of about zero is zero.
+    """Fill the lower factor of a positive semidefinite block: below a pivot of about zero it is zero.
 
-    False where it is none (or NaN).
+    Args as for `cholesky`. Returns False where the block is indefinite (or NaN).
     """
     for column in range(size):
         smallest = 1e-15 * size * matrix[column, column]
@@ -102,13 +107,13 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
 
 
 def wrap(difference: float, is_angle: bool) -> float:
-    """The difference, in [-pi, pi) where it is one of angles."""
+    """Wrap a difference of angles to [-pi, pi); any other stays as it is."""
     if is_angle and not abs(difference) < np.pi:
         return wrap_angle(difference)
     return difference
 
 
-def keep_measured(innovation: Innovation) -> int:
+def drop_missing(innovation: Innovation) -> int:
     """Move the components that were measured to the front; returns how many there are."""
     difference, covariance, cross_covariance = innovation
     size = 0
@@ -151,13 +156,12 @@ def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, flo
     return squared, 2.0 * np.log(determinant)
 
 
-def widening(squared: float, size: int, parameters: Any) -> float:
-    """How many times larger the covariance of an innovation counts, of a NIS and so many components.
+def inflation(squared: float, size: int, parameters: Any) -> float:
+    """Compute how many times larger the covariance of an innovation counts, from its NIS and size.
 
     To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
-    a Kalman update still. 1 where no option of `replay.inference.model.model.ModelParameters` is given:
-    those
-    are NaN then. The largest of those given holds:
+    a Kalman update still. 1 where no option of `replay.inference.model.parameters.ModelParameters` is
+    given: those are NaN then. The largest of those given holds:
 
     - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
     - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,
@@ -181,8 +185,8 @@ def widening(squared: float, size: int, parameters: Any) -> float:
     return factor
 
 
-def widen(innovation: Innovation, size: int, factor: float) -> None:
-    """Make the covariance of a whitened innovation so many times larger."""
+def inflate(innovation: Innovation, size: int, factor: float) -> None:
+    """Multiply the covariance of a whitened innovation of `size` components by a factor, in place."""
     root = np.sqrt(factor)
     for i in range(size):
         innovation.difference[i] /= root
@@ -191,7 +195,7 @@ def widen(innovation: Innovation, size: int, factor: float) -> None:
 
 
 def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
-    """Fill `step` with K v of a whitened innovation; the cross-covariance C becomes W = C L^-T.
+    """Fill `step` (t,) with K v of a whitened innovation; its cross-covariance C becomes W = C L^-T.
 
     So K v = W L^-1 v, and K S K' = W W'.
     """
@@ -206,8 +210,8 @@ def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
             step[row] += cross[row, i] * difference[i]
 
 
-def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
-    """P becomes P - W W', with W as `kalman_step` leaves it."""
+def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
+    """Downdate P (t, t) to P - W W', with the first columns of W (t, m) as `kalman_step` leaves it."""
     for row in range(len(covariance)):
         for column in range(row + 1):
             entry = covariance[row, column]
@@ -219,7 +223,7 @@ def reduce_covariance(covariance: Floats, weighted: Floats, size: int) -> None:
 def scalar_update(
     mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
 ) -> None:
-    """The Kalman update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
+    """Update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
     share = difference / variance
     for row in range(len(cross)):
         mean[row] += cross[row] * share
@@ -230,7 +234,7 @@ def scalar_update(
 
 
 def multiply(left: Floats, right: Floats, product: Floats) -> None:
-    """Fill `product` with that of two square matrices."""
+    """Fill `product` (n, n) with that of two square matrices."""
     for row in range(len(product)):
         for column in range(len(product)):
             entry = 0.0
@@ -240,15 +244,15 @@ def multiply(left: Floats, right: Floats, product: Floats) -> None:
 
 
 def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
-    """Make F A of A, by way of `product`."""
+    """Multiply A (n, n) by F from the left in place, by way of `product`."""
     multiply(left, matrix, product)
     for row in range(len(matrix)):
         for column in range(len(matrix)):
             matrix[row, column] = product[row, column]
 
 
-def moved_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
-    """P becomes F P F', by way of `product`."""
+def propagate_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
+    """Propagate P (t, t) to F P F' in place, by way of `product`, which becomes F P."""
     size = len(covariance)
     multiply(transition, covariance, product)
     for row in range(size):
@@ -259,14 +263,14 @@ def moved_covariance(covariance: Floats, transition: Floats, product: Floats) ->
             covariance[row, column] = covariance[column, row] = entry
 
 
-def coast(
+def predict_constant_velocity(
     mean: Floats,
     covariance: Floats,
     duration_s: float,
     layout: tuple[int, int],
     noise: tuple[float, float, float],
 ) -> None:
-    """Move positions at constant velocity for a while, in place.
+    """Predict positions and velocities at constant velocity, in place.
 
     Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
     a variance of the position, a covariance of both, and a variance of the velocity.
@@ -288,7 +292,7 @@ def coast(
 
 
 def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
-    """P becomes P + G diag(variances) G', for a gain G whose columns go with the variances."""
+    """Add G diag(variances) G' to P (t, t), for a gain G (t, k) and variances (k,) of its columns."""
     for row in range(len(covariance)):
         for column in range(row + 1):
             entry = covariance[row, column]

@@ -1,4 +1,4 @@
-"""The derivatives of a model's functions, between the tangent spaces of what they take and return.
+"""Takes derivatives of a model's functions between the tangent spaces of their arguments and results.
 
 A function is traced (`replay.tracing`), and the exact derivatives of its graph are what a kernel fills
 into the arrays of its workspace.
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from replay.engine.arrays import Function
 from replay.engine.vectors.tangent import WIDTHS
-from replay.inference.linear_algebra.manifold import tangent_size, things
+from replay.inference.linear_algebra.manifold import manifold_blocks, tangent_size
 from replay.inference.linear_algebra.tuples import range_of
 from replay.tracing.functions import Derivative, TracedFunction
 from replay.tracing.graph import Node
@@ -26,7 +26,7 @@ _PRODUCT = (
 
 
 class Input(NamedTuple):
-    """An argument of a function to differentiate: its name, its kinds, and where its Jacobian goes.
+    """Describes an argument to differentiate by: its name, its kinds, and where its Jacobian goes.
 
     `into` is the name of an array of the workspace, empty where the derivative is not wanted. An
     argument that is `zero` is not handed in: it is noise, of mean zero.
@@ -41,7 +41,7 @@ class Input(NamedTuple):
 def derivative(
     function: Function, inputs: Sequence[Input], outputs: Sequence[str], values: str = ""
 ) -> Function:
-    """The values and exact Jacobians of a component-first function, by its graph.
+    """Make a function that takes values and exact Jacobians of a component-first function by its graph.
 
     Args:
         function: takes the inputs, tuples, and then others; returns a tuple. It is traced.
@@ -109,7 +109,7 @@ def derivative(
 
 
 def known_entries(linearise: Function, into: str) -> dict[tuple[int, int], float | None] | None:
-    """The entries of a Jacobian that may differ from zero, by row and column, and what is known of them.
+    """List the entries of a Jacobian that may differ from zero, by row and column, with known values.
 
     None where nothing is known, as of one written by hand.
     """
@@ -122,11 +122,11 @@ def known_entries(linearise: Function, into: str) -> dict[tuple[int, int], float
 def _seeded(
     trace: Trace, argument: int, kinds: Sequence[str], first: int
 ) -> dict[Node, dict[int, Node]]:
-    """How the components of an argument change with its tangent space, whose variables begin at one."""
+    """Seed an argument: how its components change with its tangent space; its variables begin at one."""
     graph = trace.graph
     x = [graph.input((argument, index)) for index in range(len(kinds))]
     one, found = graph.constant(1.0), {}
-    for kind, c, t, _ in things(kinds):
+    for kind, c, t, _ in manifold_blocks(kinds):
         at = first + t
         if kind in ("linear", "angle"):
             found[x[c]] = {at: one}
@@ -150,10 +150,10 @@ def _in_tangent_space(
     slopes: Sequence[Mapping[int, Node]],
     variable: int,
 ) -> Iterator[tuple[int, Node]]:
-    """The slopes of what a function returns by one variable, by the row of the tangent space."""
+    """Express the slopes of what a function returns by one variable in the tangent space, by row."""
     zero = trace.graph.constant(0.0)
     y = [trace.number(node) for node in returned]
-    for kind, c, t, _ in things(kinds):
+    for kind, c, t, _ in manifold_blocks(kinds):
         by = [slopes[c + index].get(variable, zero) for index in range(WIDTHS[kind])]
         d = [trace.number(node) for node in by]
         if kind in ("linear", "angle"):

@@ -1,4 +1,4 @@
-"""States on their manifold, and the tangent space in which steps and covariances are.
+"""Moves and compares states on their manifold: boxplus, boxminus, and the right Jacobian.
 
 Kinds and tangent space as in `replay.engine.vectors.tangent`: a quaternion q (Hamilton, w x y z) plus a
 rotation vector d is q exp(d/2), an axis (a unit complex number) plus an angle is the product with exp(i
@@ -19,12 +19,12 @@ Quaternion = tuple[float, float, float, float]
 
 
 def tangent_size(kinds: Sequence[str]) -> int:
-    """How many components the tangent space of these components has."""
-    return sum(width for _, _, _, width in things(kinds))
+    """Count the components of the tangent space of these components."""
+    return sum(width for _, _, _, width in manifold_blocks(kinds))
 
 
-def things(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
-    """Every number, angle, axis and quaternion: kind, first component and tangent one, tangent size."""
+def manifold_blocks(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
+    """List every number, angle, axis and quaternion: kind, first component and tangent one, size."""
     found, component, tangent = [], 0, 0
     while component < len(kinds):
         kind = kinds[component]
@@ -35,14 +35,14 @@ def things(kinds: Sequence[str]) -> list[tuple[str, int, int, int]]:
 
 
 def is_flat(kinds: Sequence[str]) -> bool:
-    """Whether the tangent space is the space itself, but for the wrapping of angles."""
+    """Tell whether the tangent space is the space itself, but for the wrapping of angles."""
     return set(kinds) <= {"linear", "angle"}
 
 
 @lru_cache(maxsize=64)
-def retraction(kinds: tuple[str, ...]) -> Function:
-    """`add(x, d)`: moves the state x (n,) by a tangent vector d (t,), in place."""
-    parts = tuple(things(kinds))
+def boxplus(kinds: tuple[str, ...]) -> Function:
+    """Make `add(x, d)`: it moves the state x (n,) by a tangent vector d (t,), in place: x boxplus d."""
+    parts = tuple(manifold_blocks(kinds))
 
     def add(x: Floats, d: Floats) -> None:
         for kind, c, t, _ in parts:
@@ -61,9 +61,9 @@ def retraction(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def differencing(kinds: tuple[str, ...]) -> Function:
-    """`subtract(a, b, d, k)`: row k of d (..., t) becomes the tangent vector from b to a, both (n,)."""
-    parts = tuple(things(kinds))
+def boxminus(kinds: tuple[str, ...]) -> Function:
+    """Make `subtract(a, b, d, k)`: row k of d (..., t) becomes a boxminus b, of states (n,)."""
+    parts = tuple(manifold_blocks(kinds))
 
     def subtract(a: Floats, b: Floats, d: Floats, k: int) -> None:
         for kind, c, t, _ in parts:
@@ -86,14 +86,14 @@ def differencing(kinds: tuple[str, ...]) -> Function:
 
 
 @lru_cache(maxsize=64)
-def resetting(kinds: tuple[str, ...], *, back: bool = False) -> Function:
-    """`reset(d, rows)`: multiplies the rows (t, m) of every rotation by its right Jacobian at d (t,).
+def by_right_jacobian(kinds: tuple[str, ...], *, back: bool = False) -> Function:
+    """Make `reset(d, rows)`: it multiplies every rotation's rows (t, m) by its right Jacobian at d (t,).
 
     Applied from both sides, it carries a covariance from the old mean to the one moved by d: Jr P Jr'.
     With `back` it multiplies by the inverse instead, which carries a covariance the other way.
     """
-    factors_of = inverse_right_jacobian if back else right_jacobian
-    turns = tuple(t for kind, _, t, _ in things(kinds) if kind == "quaternion")
+    factors_of = inverse_right_jacobian_factors if back else right_jacobian_factors
+    turns = tuple(t for kind, _, t, _ in manifold_blocks(kinds) if kind == "quaternion")
 
     def reset(d: Floats, rows: Floats) -> None:
         for t in turns:
@@ -109,8 +109,8 @@ def resetting(kinds: tuple[str, ...], *, back: bool = False) -> Function:
     return reset
 
 
-def right_jacobian(squared: float) -> tuple[float, float]:
-    """The factors f, g of Jr(d) = I - f [d]x + g [d]x^2, of t^2 = |d|^2.
+def right_jacobian_factors(squared: float) -> tuple[float, float]:
+    """Compute the factors f, g of Jr(d) = I - f [d]x + g [d]x^2, from t^2 = |d|^2.
 
     They are (1 - cos t)/t^2 and (t - sin t)/t^3. Markley 2003; Mueller 2017.
     """
@@ -123,8 +123,8 @@ def right_jacobian(squared: float) -> tuple[float, float]:
     return 0.5 * half * half, second
 
 
-def inverse_right_jacobian(squared: float) -> tuple[float, float]:
-    """The factors of its inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
+def inverse_right_jacobian_factors(squared: float) -> tuple[float, float]:
+    """Compute the factors of its inverse I + [d]x/2 + (1 - t/2 cot t/2)/t^2 [d]x^2; Sola, (144)."""
     angle = np.sqrt(squared)
     if angle < 0.05:
         second = (1.0 + squared / 60.0 * (1.0 + squared / 42.0)) / 12.0
@@ -135,12 +135,12 @@ def inverse_right_jacobian(squared: float) -> tuple[float, float]:
 
 @lru_cache(maxsize=64)
 def recentring(kinds: tuple[str, ...]) -> Function:
-    """`recentre(values, shift)`: tangent vectors (L, t) from a centre become those from centre + shift.
+    """Make `recentre(values, shift)`: tangent vectors (L, t) from a centre become those from its shift.
 
     Returns whether the weighted sum of the values may still differ from zero: an angle was wrapped, or a
     rotation is not yet settled.
     """
-    parts = tuple(things(kinds))
+    parts = tuple(manifold_blocks(kinds))
 
     def recentre(values: Floats, shift: Floats) -> bool:
         again = False
@@ -177,7 +177,7 @@ def recentring(kinds: tuple[str, ...]) -> Function:
 
 
 def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Hamilton's product of two quaternions."""
+    """Multiply two quaternions: Hamilton's product."""
     return (
         p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
         p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
@@ -187,19 +187,19 @@ def product(p: Quaternion, q: Quaternion) -> Quaternion:
 
 
 def conjugate(q: Quaternion) -> Quaternion:
-    """The inverse of a unit quaternion."""
+    """Invert a unit quaternion."""
     return q[0], -q[1], -q[2], -q[3]
 
 
 def from_vector(x: float, y: float, z: float) -> Quaternion:
-    """The unit quaternion of a rotation vector."""
+    """Make the unit quaternion of a rotation vector."""
     half = 0.5 * np.sqrt(x * x + y * y + z * z)
     scale = 0.5 * np.sinc(half / np.pi)
     return np.cos(half), scale * x, scale * y, scale * z
 
 
 def to_vector(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """The shortest rotation vector of a unit quaternion, which is that of its negative too."""
+    """Make the shortest rotation vector of a unit quaternion, which is that of its negative too."""
     sign = -1.0 if w < 0.0 else 1.0
     length = np.sqrt(x * x + y * y + z * z)
     angle = np.arctan2(length, sign * w)

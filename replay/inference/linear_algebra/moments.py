@@ -1,4 +1,4 @@
-"""Weighted samples: the points that a factor of a covariance makes of them, their means and covariances.
+"""Forms weighted samples from a covariance's factor, and their means and covariances.
 
 All sums stay in registers: arrays might overlap, for all that a compiler knows. A kernel reads the whole
 of a tuple that changes wherever its name stands, so that such a tuple is gone through, not indexed.
@@ -14,7 +14,7 @@ Numbers = tuple[float, ...]
 
 @lru_cache(maxsize=64)
 def lower_of(size: int) -> Function:
-    """`read(factor)`: the rows of a lower triangle as one tuple."""
+    """Make `read(factor)`: it reads the rows of a lower triangle as one tuple."""
     places = tuple((row, column) for row in range(size) for column in range(row + 1))
 
     def read(factor: Floats) -> Numbers:
@@ -25,7 +25,7 @@ def lower_of(size: int) -> Function:
 
 @lru_cache(maxsize=64)
 def offset_of(size: int) -> Function:
-    """`offset(lower, points, index)`: a triangle, as `lower_of` reads it, times one row of points."""
+    """Make `offset(lower, points, index)`: a triangle, as `lower_of` reads it, times a row of points."""
     firsts = tuple(row * (row + 1) // 2 for row in range(size))
 
     def offset(lower: Numbers, points: Floats, index: int) -> Numbers:
@@ -39,7 +39,7 @@ def offset_of(size: int) -> Function:
 
 @lru_cache(maxsize=64)
 def moments_of(states: int, values: int) -> Function:
-    """`moments(weights, offsets, found, shift, spread, cross)`: weighted covariances, in one loop.
+    """Make `moments(weights, offsets, found, shift, spread, cross)`: weighted covariances, in one loop.
 
     Of the values `found` (L, v) less `shift` (v,) with themselves, and with the offsets (L, >= t).
     """
@@ -69,7 +69,7 @@ def moments_of(states: int, values: int) -> Function:
 
 @lru_cache(maxsize=64)
 def weighted_mean_of(values: int) -> Function:
-    """`fill(weights, found, mean)`: the weighted sums (v,) of values (L, v)."""
+    """Make `fill(weights, found, mean)`: it fills the weighted sums (v,) of values (L, v)."""
 
     def fill(weights: Floats, found: Floats, mean: Floats) -> None:
         sums = (0.0,) * values

@@ -1,4 +1,4 @@
-"""Linear algebra of a few components, for estimators of one's own: scalar loops that work in place.
+"""Offers linear algebra of a few components to estimators of one's own: scalar loops, in place.
 
 They are called from a compiled `follow` (see `replay.engine.api.functions.recursive`) and make no
 arrays: what they work in is made there once, before the loop over the messages. Covariances stay
@@ -20,11 +20,11 @@ from replay.engine.arrays import Floats
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     cholesky,
+    downdate,
+    drop_missing,
     kalman_step,
-    keep_measured,
-    moved_covariance,
     no_innovation,
-    reduce_covariance,
+    propagate_covariance,
     whiten,
 )
 
@@ -32,19 +32,19 @@ __all__ = ["UpdateMemory", "cholesky", "predict", "solve", "update", "update_mem
 
 
 class UpdateMemory(NamedTuple):
-    """What `update` works in; afterwards the innovation is used up."""
+    """Holds what `update` works in; afterwards the innovation is used up."""
 
     innovation: Innovation
     step: Floats
 
 
 def update_memory(states: int, components: int) -> UpdateMemory:
-    """Memory for updates of so many states by up to so many measured components."""
+    """Make memory for updates of so many states by up to so many measured components."""
     return UpdateMemory(no_innovation(states, components), np.empty(states))
 
 
 def solve(matrix: Floats, right: Floats, size: int) -> bool:
-    """Make x of b in place, A x = b, by Cholesky's factor of the leading block, which overwrites A.
+    """Solve A x = b in place, by Cholesky's factor of the leading block, which overwrites A.
 
     Args:
         matrix: A (n, n), symmetric positive definite in its first `size` rows and columns.
@@ -69,7 +69,7 @@ def solve(matrix: Floats, right: Floats, size: int) -> bool:
 def predict(
     mean: Floats, covariance: Floats, transition: Floats, noise: Floats, product: Floats
 ) -> None:
-    """Make F x of x, and F P F' + Q of P, in place.
+    """Predict in place: x becomes F x, and P becomes F P F' + Q.
 
     Args:
         mean: x (n,).
@@ -86,7 +86,7 @@ def predict(
         product[0, row] = entry
     for row in range(size):
         mean[row] = product[0, row]
-    moved_covariance(covariance, transition, product)
+    propagate_covariance(covariance, transition, product)
     for row in range(size):
         for column in range(size):
             covariance[row, column] += noise[row, column]
@@ -101,7 +101,7 @@ def update(
     memory: UpdateMemory,
     gate: float = float("inf"),
 ) -> float:
-    """The Kalman update in place: x + K v and P - K S K' with S = H P H' + R and K = P H' S^-1.
+    """Update in place: x + K v and P - K S K', with S = H P H' + R and K = P H' S^-1.
 
     Args:
         mean: x (n,).
@@ -128,12 +128,12 @@ def update(
             for k in range(len(mean)):
                 entry += rows[i, k] * innovation.cross_covariance[k, j]
             innovation.covariance[i, j] = innovation.covariance[j, i] = entry
-    size = keep_measured(innovation)
+    size = drop_missing(innovation)
     squared = whiten(innovation, size)[0]
     if not squared <= gate:
         return squared
     kalman_step(innovation, size, step)
     for row in range(len(mean)):
         mean[row] += step[row]
-    reduce_covariance(covariance, innovation.cross_covariance, size)
+    downdate(covariance, innovation.cross_covariance, size)
     return squared

@@ -1,4 +1,4 @@
-"""Covariances through matrices of which it is known where they are zero or one.
+"""Propagates covariances through matrices whose zeros and ones are known in advance.
 
 A `Pattern` has for each row of a matrix its entries that may differ from zero: the column, and the entry
 itself where it is known. What is left out are products with zero: sums keep their order.
@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import add_through, moved_covariance
+from replay.inference.linear_algebra.gaussian import add_through, propagate_covariance
 
 Pattern = tuple[tuple[tuple[int, float | None], ...], ...]
 
 
 def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) -> Pattern | None:
-    """The pattern of a matrix of so many rows, from its entries by place (None where one varies)."""
+    """Make the pattern of a matrix of so many rows from its entries by place (None where one varies)."""
     if known is None:
         return None
     return tuple(
@@ -23,10 +23,10 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
     )
 
 
-def moving_covariance(pattern: Pattern | None) -> Function:
-    """`move(covariance, transition, product)`: P becomes F P F', by way of the product F P."""
+def propagating_covariance(pattern: Pattern | None) -> Function:
+    """Make `move(covariance, transition, product)`: P (t, t) becomes F P F'; `product` becomes F P."""
     if pattern is None:
-        return moved_covariance
+        return propagate_covariance
     rows = tuple(enumerate(pattern))
 
     def move(covariance: Floats, transition: Floats, product: Floats) -> None:
@@ -50,7 +50,7 @@ def moving_covariance(pattern: Pattern | None) -> Function:
 
 
 def adding_through(pattern: Pattern | None) -> Function:
-    """`add(covariance, gain, variances)`: P becomes P + G diag(variances) G'."""
+    """Make `add(covariance, gain, variances)`: P becomes P + G diag(variances) G'."""
     if pattern is None:
         return add_through
     columns: list[dict[int, Any]] = [dict(entries) for entries in pattern]

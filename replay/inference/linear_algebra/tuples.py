@@ -1,4 +1,4 @@
-"""Between the tuples that a model's functions take and return, and the arrays that kernels work in.
+"""Converts between the tuples of a model's functions and the arrays that kernels work in.
 
 A kernel has no index into a tuple that it does not know while it is compiled: what goes through one is a
 loop over something known, which is written out (`range_of`).
@@ -12,13 +12,13 @@ from replay.engine.arrays import Floats, Function
 
 
 def range_of(start: int, end: int | None = None) -> tuple[int, ...]:
-    """The numbers of `range`, for a loop that is written out."""
+    """Return the numbers of `range` as a tuple, for a loop that is written out."""
     return tuple(range(start) if end is None else range(start, end))
 
 
 @lru_cache(maxsize=256)
 def tuple_of(size: int, start: int = 0) -> Function:
-    """`read(array)`: `size` entries of an array from `start` on, as a tuple."""
+    """Make `read(array)`: it reads `size` entries of an array from `start` on, as a tuple."""
 
     def read(array: Floats) -> tuple[Any, ...]:
         return tuple(array[start + index] for index in range(size))
@@ -28,7 +28,7 @@ def tuple_of(size: int, start: int = 0) -> Function:
 
 @lru_cache(maxsize=256)
 def filling(size: int) -> Function:
-    """`fill(array, values)`: the first entries of a tuple into an array."""
+    """Make `fill(array, values)`: it fills the first entries of a tuple into an array."""
 
     def fill(array: Floats, values: Sequence[float]) -> None:
         for index in range_of(size):
@@ -38,7 +38,7 @@ def filling(size: int) -> Function:
 
 
 def total(numbers: Sequence[float]) -> float:
-    """The sum of a tuple of numbers, from the first on; how `sum` rounds depends on Python's version."""
+    """Sum a tuple of numbers, from the first on; how `sum` rounds depends on Python's version."""
     found = numbers[0]
     for number in numbers[1:]:
         found = found + number
@@ -47,7 +47,7 @@ def total(numbers: Sequence[float]) -> float:
 
 @lru_cache(maxsize=64)
 def adding_noise(size: int, block: int = 0) -> Function:
-    """`add(covariance, noise)`: adds variances, or the rows of a lower triangle, given as a tuple.
+    """Make `add(covariance, noise)`: it adds variances, or rows of a lower triangle, given as a tuple.
 
     The triangle is that of the first `block` components, behind which are variances of the others; of
     all components unless it is given.

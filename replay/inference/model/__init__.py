@@ -1,4 +1,4 @@
-"""What a model is, what it needs of a log, and what may be added to its state.
+"""Defines what a model is, how a log serves it, and what may be added to its state.
 
 Begin with `model`.
 """

@@ -1,4 +1,4 @@
-"""Parameters as part of the state: a sensor's bias, a scale factor, a time offset that is estimated too.
+"""Augments a state by parameters of its model: a sensor's bias, a scale factor, a time offset.
 
 A transformation of models: the state gets a component for each, which the model's functions read in
 place of the parameter; so derivatives, samples and smoothers have it without knowing of it. Its prior
@@ -20,8 +20,13 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import gaussian_stream
 from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import Walk, kept, spread, with_walk_parameters
-from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.gauss_markov import (
+    GaussMarkov,
+    added_variance,
+    remaining_share,
+    with_gauss_markov_parameters,
+)
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import number_fields, settings_type
 from replay.inference.model.point_errors import (
     Errors,
@@ -33,6 +38,7 @@ from replay.inference.model.point_errors import (
 )
 from replay.inference.model.settings import TracedParameters
 from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 Start = Callable[[Mapping[str, Ragged]], Any]
@@ -43,7 +49,7 @@ class Added(NamedTuple):
 
     parameters: Names
     errors: Errors
-    walks: tuple[Walk, ...]
+    processes: tuple[GaussMarkov, ...]
 
     @property
     def names(self) -> Names:
@@ -54,10 +60,10 @@ class Added(NamedTuple):
 def estimated(label: str, model: Model, parameters: Any) -> Added:
     """What is to be estimated beside the state, as the settings say.
 
-    Raises BadInput where what the model lists as `estimable` is none of its parameters, it does not list
-    one that is asked for, one stands twice, or has no sigma.
+    Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
+    list one that is asked for, one stands twice, or has no sigma.
     """
-    check_estimable(f"estimator {label}", model)
+    check_augmentable(f"estimator {label}", model)
     asked = parameters.estimate or []
     options = {
         "estimate_sigma": parameters.estimate_sigma or {},
@@ -67,13 +73,13 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
     for option, given in options.items():
         for name in given.keys() - set(asked):
             raise BadInput(f"estimator {label}: {option}.{name}: `estimate` lacks {name}; add it there")
-    named: dict[str, Walk] = {}
-    errors: dict[PointError, Walk] = {}
+    named: dict[str, GaussMarkov] = {}
+    errors: dict[PointError, GaussMarkov] = {}
     for asks in asked:
         where = f"estimator {label}: estimate = {asks}"
         own = point_errors(where, model, asks)
-        if not own and asks not in model.estimable:
-            known = choices(asks, model.estimable)
+        if not own and asks not in model.augmentable:
+            known = choices(asks, model.augmentable)
             raise BadInput(f"{where}: is not a parameter that can be estimated with this model; {known}")
         if asks in named or not errors.keys().isdisjoint(own):
             raise BadInput(f"{where}: is named twice; name it once")
@@ -83,34 +89,36 @@ def estimated(label: str, model: Model, parameters: Any) -> Added:
                 f"{where}: its uncertainty at the start is missing; give its standard deviation, "
                 f"estimate_sigma.{asks}=..."
             )
-        if time_s is not None and model.estimable.get(asks) == "angle":
+        if time_s is not None and model.augmentable.get(asks) == "angle":
             raise BadInput(
                 f"{where}: is an angle, which cannot return to a mean; give "
                 f"estimate_drift.{asks} in place of estimate_time_s.{asks}"
             )
-        walk = Walk(sigma, drift or 0.0, time_s or np.inf)
+        process = GaussMarkov(sigma, drift or 0.0, time_s or np.inf)
         if own:
-            errors |= dict.fromkeys(own, walk)
+            errors |= dict.fromkeys(own, process)
         else:
-            named[asks] = walk
+            named[asks] = process
     return Added(tuple(named), tuple(errors), (*named.values(), *errors.values()))
 
 
-def check_estimable(where: str, model: Model) -> None:
-    """Raise BadInput where `estimable` is no mapping from parameters of the model to linear or angle."""
-    if not isinstance(model.estimable, Mapping):
+def check_augmentable(where: str, model: Model) -> None:
+    """Raise BadInput where `augmentable` does not map parameters of the model to linear or angle."""
+    if not isinstance(model.augmentable, Mapping):
         raise BadInput(
-            f"{where}: estimable is a {type(model.estimable).__name__}; it is a mapping from parameter "
-            'to kind, such as {"length_m": "linear"}'
+            f"{where}: augmentable is a {type(model.augmentable).__name__}; it is a mapping from "
+            'parameter to kind, such as {"length_m": "linear"}'
         )
     known = number_fields(model.parameters)
-    for name, kind in model.estimable.items():
+    for name, kind in model.augmentable.items():
         if name not in known:
             raise BadInput(
-                f"{where}: estimable: '{name}' is no parameter of the model; {choices(name, known)}"
+                f"{where}: augmentable: '{name}' is no parameter of the model; {choices(name, known)}"
             )
         if kind not in ("linear", "angle"):
-            raise BadInput(f"{where}: estimable: {name} is of kind '{kind}'; known are linear and angle")
+            raise BadInput(
+                f"{where}: augmentable: {name} is of kind '{kind}'; known are linear and angle"
+            )
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
@@ -140,9 +148,9 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
     return stage
 
 
-def with_walks(settings: Floats, added: Added) -> Floats:
+def with_gauss_markov(settings: Floats, added: Added) -> Floats:
     """Numbers of motion and sensors with those that an augmented model has beside them."""
-    numbers = np.ravel(added.walks)
+    numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
 
@@ -164,11 +172,11 @@ def begin(
                 f"estimator {label}: estimate = {name}: its value at the start is missing; give "
                 f"{name}=..."
             )
-    variances = np.array([walk.sigma**2 for walk in added.walks])
+    variances = np.array([process.sigma**2 for process in added.processes])
 
     def extended(prior: Ragged) -> Ragged:
         time_ns, mean, covariance = gaussians(prior)
-        runs, t, k = len(mean), covariance.shape[1], len(added.walks)
+        runs, t, k = len(mean), covariance.shape[1], len(added.processes)
         wider = np.zeros((runs, t + k, t + k))
         wider[:, :t, :t] = covariance
         wider[:, range(t, t + k), range(t, t + k)] = variances
@@ -176,7 +184,11 @@ def begin(
         return Ragged(gaussian_stream(topic, time_ns, longer, wider, {}), prior.offsets)
 
     def begun(start: Start) -> Start:
-        return (lambda whole: start({**whole, topic: extended(whole[topic])})) if added.walks else start
+        return (
+            (lambda static: start({**static, topic: extended(static[topic])}))
+            if added.processes
+            else start
+        )
 
     return begun
 
@@ -188,13 +200,13 @@ def _augmented(model: Model, names: Names) -> Model:
     }
     return replace(
         model,
-        state={**model.state, **{name: model.estimable[name] for name in names}},
-        parameters=with_walk_parameters(model.parameters, names),
+        state={**model.state, **{name: model.augmentable[name] for name in names}},
+        parameters=with_gauss_markov_parameters(model.parameters, names),
         sensors=tuple(_augmented_sensor(model, sensor, names) for sensor in model.sensors),
         motion=_augmented_motion(model, model.motion, names),
         modes=modes,
         correct=correcting_more(model, len(names)),
-        estimable={},
+        augmentable={},
     )
 
 
@@ -210,7 +222,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
     motion.move(state, (0.0,) * model.controls, *entering, 1.0, parameters)
     reads_none = not parameters.read & set(names)
     move_own = _reading(model, names, motion.move)
-    angular = tuple(model.estimable[name] == "angle" for name in names)
+    angular = tuple(model.augmentable[name] == "angle" for name in names)
 
     def move(state: Any, control: Any, *others: Any) -> Any:
         *entering, duration_s, parameters = others
@@ -219,7 +231,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         for index, name in enumerate(names):
             stay = state[n + index]
             if not angular[index]:  # an angle has no mean to come back to
-                share = kept(name, duration_s, parameters)
+                share = remaining_share(name, duration_s, parameters)
                 stay = share * stay + (1.0 - share) * getattr(parameters, name)
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
@@ -231,7 +243,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
             found = list(own(state, duration_s, parameters))
             for index, name in enumerate(names):
                 found += [0.0] * (t + index) if is_triangle else []
-                found.append(spread(name, duration_s, parameters))
+                found.append(added_variance(name, duration_s, parameters))
             return tuple(found)
 
         return noise
@@ -240,7 +252,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         motion,
         move=move,
         noise=with_spreads(given, is_triangle=is_triangle),
-        lost=motion.lost and with_spreads(motion.lost),
+        gap_noise=motion.gap_noise and with_spreads(motion.gap_noise),
         noises=noises + len(names) if noises else 0,
         linear=motion.linear and reads_none,
         jacobians=None,
@@ -251,8 +263,8 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
 @lru_cache(maxsize=256)
 def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    parameters, about = _traced(model), (1.0,) * sensor.about_size
-    sensor.measure(trial_state(model.kinds), *entering, about, parameters)
+    parameters, reference = _traced(model), (1.0,) * sensor.reference_size
+    sensor.measure(trial_state(model.kinds), *entering, reference, parameters)
     return replace(
         sensor,
         measure=_reading(model, names, sensor.measure),

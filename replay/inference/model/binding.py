@@ -1,4 +1,4 @@
-"""Where a log has what a model needs: its topics, by the names that the model has for them.
+"""Finds the topics of a log that serve a model, by the model's names for them.
 
 One binding for all models: the topics of a model are looked for under every prefix that has its prior,
 as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is left out.
@@ -29,7 +29,7 @@ class Found(NamedTuple):
         control: what drives the motion.
         sensors: those that the log has.
         has_prior: whether the log does; else see `replay.inference.run.initialization`.
-        instead: topics that take the place of some components of the control.
+        fallbacks: topics that take the place of some components of the control.
         origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
     """
 
@@ -39,7 +39,7 @@ class Found(NamedTuple):
     control: Topic | None
     sensors: tuple[tuple[Sensor, Topic], ...]
     has_prior: bool = True
-    instead: tuple[tuple[Control, Topic], ...] = ()
+    fallbacks: tuple[tuple[Control, Topic], ...] = ()
     origin: Floats | None = None
 
     @property
@@ -50,7 +50,7 @@ class Found(NamedTuple):
 
 def roles_of(model: Model) -> list[str]:
     """The topics that a model asks for, by the names that it has for them."""
-    control = [model.control, *model.control.instead] if model.control else []
+    control = [model.control, *model.control.fallbacks] if model.control else []
     maps = [each.topic for sensor in model.all_sensors for each in sensor.maps]
     sensors = [sensor.topic for sensor in model.all_sensors]
     drives = [each.topic for each in control]
@@ -119,13 +119,13 @@ def _found(model: Model, here: UnderPrefix) -> Found | None:
     if prior is None:
         name = schemas.GAUSSIAN_ESTIMATE.full_name
         prior = Topic(here.place(model.prior), name, "protobuf", (), named(model.state), 0)
-    instead = tuple(
+    fallbacks = tuple(
         (each, topic)
-        for each in (model.control.instead if model.control else ())
+        for each in (model.control.fallbacks if model.control else ())
         if (topic := here.topic(each.topic, each.schema)) is not None
     )
     truth = here.place(model.truth)
-    return Found(here.prefix, prior, truth, control, sensors, has_prior, instead)
+    return Found(here.prefix, prior, truth, control, sensors, has_prior, fallbacks)
 
 
 def _suffices(

@@ -1,4 +1,4 @@
-"""Whether a model is what it says of itself: for the tests of who writes one.
+"""Checks that a model is what it declares, by trying its functions: for the tests of its author.
 
 `check_model` tries a model's functions at random states: derivatives, what is declared linear or an
 angle, numbers of components, variances. What it finds is one sentence with the function's file and line.
@@ -17,14 +17,12 @@ from recorders.parameters import build
 from replay.engine.arrays import Floats, Function
 from replay.engine.vectors.tangent import WIDTHS, tangent_components
 from replay.inference.linear_algebra.linearization import Input, derivative
-from replay.inference.linear_algebra.manifold import differencing, retraction, tangent_size, things
+from replay.inference.linear_algebra.manifold import boxminus, boxplus, manifold_blocks, tangent_size
 from replay.inference.linear_algebra.tuples import adding_noise
-from replay.inference.model.augmentation import check_estimable
-from replay.inference.model.model import (
-    Correction,
-    Model,
-    Motion,
-    Sensor,
+from replay.inference.model.augmentation import check_augmentable
+from replay.inference.model.model import Correction, Model, Motion, Sensor
+from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.model.validation import (
     check_correction,
     check_motion,
     check_sensor,
@@ -32,7 +30,6 @@ from replay.inference.model.model import (
     check_switching,
     switching_of,
 )
-from replay.inference.model.parameters import number_fields, settings_type
 from replay.tracing.functions import arguments_like, place_of, traced
 
 STATES, PATHS, STEPS = 20, 60, 200
@@ -95,7 +92,7 @@ def check_model(
     motions = {"motion": model.motion, **(model.modes or {})}
     try:
         check_state("check_model", model)
-        check_estimable("check_model", model)
+        check_augmentable("check_model", model)
         check_correction("check_model", model)
         for motion in motions.values():
             check_motion("check_model", model, motion, numbers)
@@ -144,16 +141,16 @@ def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:
 
 
 def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Generator) -> _Call:
-    about = tuple(rng.normal(size=sensor.about_size))
+    reference = tuple(rng.normal(size=sensor.reference_size))
     inputs = {"noise": (sensor.noises, True)} if sensor.noises else {}
-    rest = (about, numbers)
+    rest = (reference, numbers)
     return _Call(place_of(sensor.measure), sensor.measure, model.state, sensor.measured, inputs, rest)
 
 
 def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
     """Random states (n, components): numbers of order one, angles of all turns, unit vectors."""
     columns = []
-    for kind, *_ in things(kinds):
+    for kind, *_ in manifold_blocks(kinds):
         drawn = rng.normal(size=(STATES, WIDTHS[kind]))
         if kind == "angle":
             drawn = rng.uniform(-np.pi, np.pi, (STATES, 1))
@@ -165,7 +162,7 @@ def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
 
 def _difference(end: Floats, start: Floats, kinds: tuple[str, ...]) -> Floats:
     found = np.empty((1, tangent_size(kinds)))
-    differencing(kinds)(tuple(end), tuple(start), found, 0)
+    boxminus(kinds)(tuple(end), tuple(start), found, 0)
     return found[0]
 
 
@@ -190,7 +187,7 @@ def _check_derivatives(
     arguments = [state, *others]
     for index, (name, size) in enumerate(sizes.items()):
         for column in range(size):
-            add = retraction(kinds if index == 0 else ("linear",) * size)
+            add = boxplus(kinds if index == 0 else ("linear",) * size)
             ends = []
             for sign in (1.0, -1.0):
                 moved = [each.copy() for each in arguments]
@@ -278,7 +275,7 @@ def _check_linear(call: _Call, is_linear: bool, by_state: list[Floats]) -> None:
 def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
     """An angle a turn further, and the negative of a unit vector, are the same state."""
     names, outputs = list(call.state), tuple(call.outputs.values())
-    for kind, first, *_ in things(tuple(call.state.values())):
+    for kind, first, *_ in manifold_blocks(tuple(call.state.values())):
         if kind == "linear":
             continue
         for state in states:
@@ -297,7 +294,7 @@ def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
 
 
 def _check_length(call: _Call, value: Floats) -> None:
-    for kind, first, *_ in things(tuple(call.outputs.values())):
+    for kind, first, *_ in manifold_blocks(tuple(call.outputs.values())):
         vector = value[first : first + WIDTHS[kind]]
         if kind in ("axis", "quaternion") and not abs(np.linalg.norm(vector) - 1.0) < 1e-9:
             raise AssertionError(
@@ -309,11 +306,11 @@ def _check_length(call: _Call, value: Floats) -> None:
 def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
     """A component declared linear that jumps by a turn along a path of states is an angle."""
     kinds = tuple(call.state.values())
-    add, scales = retraction(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
+    add, scales = boxplus(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
     linear = [index for index, kind in enumerate(call.outputs.values()) if kind == "linear"]
     for path in range(PATHS if linear else 0):
         others, direction = call.others(rng), np.empty(tangent_size(kinds))
-        for kind, _, t, width in things(kinds):
+        for kind, _, t, width in manifold_blocks(kinds):
             direction[t : t + width] = scales[kind] * rng.normal(size=width)
         values = np.empty((STEPS + 1, len(call.outputs)))
         for step in range(STEPS + 1):

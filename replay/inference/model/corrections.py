@@ -1,6 +1,6 @@
-"""How an update moves a state by a step of its tangent space, and what becomes of the covariance.
+"""Moves a state and its covariance by a step of the tangent space, after an update or a smoother's step.
 
-Components move by themselves (`manifold.retraction`), unless a model says how they bend together
+Components move by themselves (`manifold.boxplus`), unless a model says how they bend together
 (`model.Correction`). Either way the covariance is carried from the tangent space of the old mean to that
 of the new one by the derivative of the moved state by the step, and the other way by that of the step by
 the state to which it leads.
@@ -10,13 +10,13 @@ from typing import Any
 
 from replay.engine.arrays import Floats, Function
 from replay.inference.linear_algebra.covariances import COVARIANCES, Form
-from replay.inference.linear_algebra.gaussian import moved_covariance
+from replay.inference.linear_algebra.gaussian import propagate_covariance
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.manifold import (
-    differencing,
+    boxminus,
+    boxplus,
+    by_right_jacobian,
     is_flat,
-    resetting,
-    retraction,
     tangent_size,
 )
 from replay.inference.linear_algebra.tuples import filling, tuple_of
@@ -61,15 +61,15 @@ def correcting(
     """
     if correct is not None:
         step_together = _stepping(kinds, correct.back if back else correct.move)
-        fill, move_covariance = filling(len(kinds)), form.move
+        fill, propagate = filling(len(kinds)), form.propagate
 
         def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
             step_together(mean, work)
             fill(mean, work.state)
-            move_covariance(covariance, work.transition, work.product)
+            propagate(covariance, work.transition, work.product)
 
         return move_together
-    add, reset, turn = retraction(kinds), resetting(kinds), form.turn
+    add, reset, turn = boxplus(kinds), by_right_jacobian(kinds), form.turn
     if is_flat(kinds):
 
         def move(mean: Floats, covariance: Floats, work: Any) -> None:
@@ -106,10 +106,10 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
             linearise(read_state(origin), read_state(mean), read_slope(work.slope), work)
             for row in range(t):
                 work.change[0, row] = work.step[row]
-            moved_covariance(covariance, work.transition, work.product)
+            propagate_covariance(covariance, work.transition, work.product)
 
         return compare_together
-    subtract, reset_back = differencing(kinds), resetting(kinds, back=True)
+    subtract, reset_back = boxminus(kinds), by_right_jacobian(kinds, back=True)
     if is_flat(kinds):
 
         def compare(origin: Floats, mean: Floats, covariance: Floats, work: Any) -> None:
@@ -145,8 +145,8 @@ def relinearising(model: Model) -> tuple[Function, Function]:
                     rows[i, column] = work.turned[column]
 
         return _stepping(model.kinds, model.correct.move), chain_together
-    fill, add, flat = filling(model.size), retraction(model.kinds), is_flat(model.kinds)
-    turn = resetting(model.kinds)
+    fill, add, flat = filling(model.size), boxplus(model.kinds), is_flat(model.kinds)
+    turn = by_right_jacobian(model.kinds)
 
     def step_to(mean: Floats, work: Any) -> None:
         fill(work.state, mean)

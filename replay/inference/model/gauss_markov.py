@@ -1,4 +1,4 @@
-"""How what is added to a state moves: a random walk, or one that comes back to its mean.
+"""Models how an added component moves: a random walk, or a first-order Gauss-Markov process.
 
 The latter is a first-order Gauss-Markov process: Gelb, Applied Optimal Estimation, 1974, section 3.6.
 """
@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import NonNegativeFloat, create_model
 
-from replay.inference.model.model import ModelParameters
+from replay.inference.model.parameters import ModelParameters
 
 
-class Walk(NamedTuple):
-    """What is known of a component.
+class GaussMarkov(NamedTuple):
+    """Describes a first-order Gauss-Markov process, or a random walk.
 
     Attributes:
         sigma: its standard deviation at first.
@@ -26,23 +26,23 @@ class Walk(NamedTuple):
     time_s: float
 
 
-def with_walk_parameters(
+def with_gauss_markov_parameters(
     parameters: type[ModelParameters], names: Sequence[str]
 ) -> type[ModelParameters]:
-    """Parameters of a model with those of the walks of these components."""
-    walks: dict[str, Any] = {
-        f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in Walk._fields
+    """Add to a model's parameters those of the processes of these components."""
+    processes: dict[str, Any] = {
+        f"{part}_{name}": (NonNegativeFloat, 1.0) for name in names for part in GaussMarkov._fields
     }
-    return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **walks)
+    return create_model(f"{parameters.__name__}Augmented", __base__=parameters, **processes)
 
 
-def kept(name: str, duration_s: Any, parameters: Any) -> Any:
-    """The share of a component's distance from its mean that is left after a step."""
+def remaining_share(name: str, duration_s: Any, parameters: Any) -> Any:
+    """Compute the share of a component's distance from its mean that is left after a step."""
     return np.exp(-duration_s / getattr(parameters, f"time_s_{name}"))
 
 
-def spread(name: str, duration_s: Any, parameters: Any) -> Any:
-    """The variance that a step adds to it."""
+def added_variance(name: str, duration_s: Any, parameters: Any) -> Any:
+    """Compute the variance that a step adds to a component."""
     walked = getattr(parameters, f"drift_{name}") ** 2 * duration_s
-    lost = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
-    return walked + lost * getattr(parameters, f"sigma_{name}") ** 2
+    returned = 1.0 - np.exp(-2.0 * duration_s / getattr(parameters, f"time_s_{name}"))
+    return walked + returned * getattr(parameters, f"sigma_{name}") ** 2

@@ -1,4 +1,4 @@
-"""What a model is: how a state moves and what sensors say of it, nothing of how it is estimated.
+"""Defines a model: how a state moves, and what sensors measure of it.
 
 A model is written once, as plain component-first functions: they take tuples of components and return
 tuples, and run on arrays as well. Every method (see `replay.inference.kalman.methods`) estimates the
@@ -8,48 +8,22 @@ state of every model that gives what the method needs.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from pydantic import Field, PositiveFloat
-
-from recorders.errors import BadInput
 from recorders.log import Schema, Stream, schemas
-from recorders.parameters import Parameters
 from replay.engine.arrays import Floats, Function
+from replay.engine.renamed import renamed
 from replay.engine.vectors.components import Components
-from replay.engine.vectors.tangent import are_kinds
 from replay.inference.linear_algebra.manifold import tangent_size
-from replay.tracing.functions import place_of
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.start import Start
 
 FIX, POSITION = "fix", ("x_m", "y_m", "z_m")
 
 
-class ModelParameters(Parameters):
-    """Options of every model.
-
-    A parameter that is none is what the channels of the log state: the sensor's own first, then those
-    of control, prior and the other sensors.
-    """
-
-    gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
-    gate_reopens_s: PositiveFloat | None = None
-    """The gate is open for a sensor whose last accepted measurement is older, so that a filter that has
-    drifted, as in an outage, accepts what brings it back."""
-    inflate_nis: PositiveFloat | None = None
-    """An innovation with a greater NIS counts with a larger covariance, which gives it this NIS."""
-    student_freedom: PositiveFloat | None = None
-    """Innovations count as if they had Student's distribution with so many degrees of freedom."""
-    switch_nis: PositiveFloat | None = None
-    """Above this NIS a measurement counts less and less, as in dynamic covariance scaling."""
-    sigma_fix_m: PositiveFloat | None = None
-    """Standard deviation, in m, of each component of a fix that does not state its covariance."""
-
-
 @dataclass(frozen=True, eq=False)
 class Map:
-    """What measurements are about, by number: the fixed points of a topic of the log.
+    """Describes a map: fixed points of a topic, to which measurements refer by number.
 
     Attributes:
         topic: the map's.
@@ -70,13 +44,14 @@ class Map:
 
     @property
     def size(self) -> int:
-        """How many components a point has."""
+        """Count the components of a point."""
         return len(self.components)
 
 
+@renamed(instead="fallbacks")
 @dataclass(frozen=True, eq=False)
 class Control:
-    """What drives the motion.
+    """Describes what drives the motion.
 
     Attributes:
         topic: its name, under the prefix of what is estimated.
@@ -87,10 +62,10 @@ class Control:
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
         gap: the parameter that says how long, in s, an interpolated control may be silent: what is
-            estimated ends there, or is unknown until it speaks again, see `Motion.lost`.
+            estimated ends there, or is unknown until it speaks again, see `Motion.gap_noise`.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
-        instead: other topics that the components of these names are taken from where the log has them,
+        fallbacks: other topics that the components of these names are taken from where the log has them,
             such as a gyro's turn rate in place of the wheels'.
     """
 
@@ -103,12 +78,13 @@ class Control:
     gap: str = ""
     delay: str = ""
     estimates: bool = False
-    instead: tuple["Control", ...] = ()
+    fallbacks: tuple["Control", ...] = ()
 
 
+@renamed(lost="gap_noise")
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """How the state moves.
+    """Describes how the state moves.
 
     Attributes:
         move: (state, control, duration_s, parameters) -> state. Where `noises` says how many numbers of
@@ -119,9 +95,9 @@ class Motion:
             all of them for zero.
         control_noise: (duration_s, parameters) -> the variances of the control's error over the
             duration; it enters the state through the derivative by the control.
-        lost: (state, duration_s, parameters) -> the variances in the tangent space that are added where
-            the control was silent for longer than its `gap`. The state stays, so that they cover what it
-            may have moved meanwhile; there are no estimates between.
+        gap_noise: (state, duration_s, parameters) -> the variances in the tangent space that are added
+            where the control was silent for longer than its `gap`. The state stays, so that they cover
+            what it may have moved meanwhile; there are no estimates between.
         linear: whether `move` is linear in the state: sampling methods then need no samples.
         jacobians: (state, control, duration_s, parameters, by_state, by_control) fills both; only where
             they are written by hand, the graph of `move` gives them else.
@@ -134,20 +110,20 @@ class Motion:
     noises: int = 0
     noise_block: int = 0
     control_noise: Function | None = None
-    lost: Function | None = None
+    gap_noise: Function | None = None
     linear: bool = False
     jacobians: Function | None = None
     moments: Function | None = None
 
     def triangle(self, tangent: int) -> int:
-        """How many numbers `noise` returns where it is no variances alone."""
+        """Count the numbers that `noise` returns where these are a lower triangle."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
 
 @dataclass(frozen=True, eq=False)
 class Switching:
-    """How a thing changes from mode to mode: a Markov chain in continuous time.
+    """Describes how a target changes from mode to mode: a Markov chain in continuous time.
 
     Attributes:
         rates: (parameters) -> how often per second it changes from the first mode to each of the others,
@@ -159,17 +135,18 @@ class Switching:
     initial: Function | None = None
 
 
+@renamed(about="reference")
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """What a sensor measures of the state.
+    """Describes what a sensor measures of the state.
 
     Attributes:
         topic: its name, under the prefix of what is estimated; a slash in front makes it everybody's.
         schema: of its messages. A GeodeticFix serves for a PositionFix, through the log's origin.
         measured: the components by name, with their kinds ("linear" or "angle").
-        measure: (state, about, parameters) -> what it measures; `about` is the point of the map, or
-            empty. With `noises`, (state, noise, about, parameters). A component that says nothing of
-            this state, or has no derivative there, is NaN: as if the message lacked it.
+        measure: (state, reference, parameters) -> what it measures; `reference` is the point of the map,
+            or empty. With `noises`, (state, noise, reference, parameters). A component that says nothing
+            of this state, or has no derivative there, is NaN: as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
             with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
             has neither is passed over, and counted.
@@ -177,21 +154,22 @@ class Sensor:
             every component is a field of its own.
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
-        about: what the message is about: a point of a map, or one of each of several maps.
+        reference: what the message is about: a point of a map, or one of each of several maps.
         fields: numbers that a message states beside what it measures, such as the pose of a sensor that
-            moves: fields of the schema, and how many components each has. `about` has them behind the
+            moves: fields of the schema, and how many components each has. `reference` has them behind
+                the
             points and the control.
-        is_numbered: whether `about` ends with the numbers of these points.
+        is_numbered: whether `reference` ends with the numbers of these points.
         control: the model's, which has to be interpolated, where what is measured depends on it:
-            `about` then ends with its numbers at the stamp.
+            `reference` then ends with its numbers at the stamp.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
             message: a pseudo-measurement.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
-        linear, jacobian, moments: as for `Motion`: jacobian(state, about, parameters, by_state);
-            moments(mean, covariance, about, parameters, predicted, spread, cross) fills the mean of the
-            measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
-        log_likelihood: (state, measured, about, parameters) -> log p(measured | state), for methods that
-            can use it.
+        linear, jacobian, moments: as for `Motion`: jacobian(state, reference, parameters, by_state);
+            moments(mean, covariance, reference, parameters, predicted, spread, cross) fills the mean of
+            the measurement (m,), its covariance (m, m), noise included, and that with the state (t, m).
+        log_likelihood: (state, measured, reference, parameters) -> log p(measured | state), for methods
+            that can use it.
     """
 
     topic: str
@@ -202,7 +180,7 @@ class Sensor:
     noises: int = 0
     vector: str = ""
     covariance: str | Callable[[Stream], Floats] = ""
-    about: Map | tuple[Map, ...] | None = None
+    reference: Map | tuple[Map, ...] | None = None
     fields: Mapping[str, int] = field(default_factory=dict)
     is_numbered: bool = False
     control: Control | None = None
@@ -215,17 +193,23 @@ class Sensor:
 
     @property
     def maps(self) -> tuple[Map, ...]:
-        """The maps of the points that a message is about."""
-        return self.about if isinstance(self.about, tuple) else (self.about,) if self.about else ()
+        """List the maps of the points that a message refers to."""
+        return (
+            self.reference
+            if isinstance(self.reference, tuple)
+            else (self.reference,)
+            if self.reference
+            else ()
+        )
 
     @property
     def control_start(self) -> int:
-        """How many numbers of `about` come before those of the control: the points' components."""
+        """Count the numbers of `reference` before those of the control: the points' components."""
         return sum(each.size for each in self.maps)
 
     @property
-    def about_size(self) -> int:
-        """How many numbers `measure` gets as `about`: points, control, fields, the points' numbers."""
+    def reference_size(self) -> int:
+        """Count the numbers of `reference`: points, control, fields, the points' numbers."""
         controls = len(self.control.components) if self.control else 0
         numbers = len(self.maps) if self.is_numbered else 0
         return self.control_start + controls + sum(self.fields.values()) + numbers
@@ -233,9 +217,9 @@ class Sensor:
 
 @lru_cache(maxsize=64)
 def fix_sensor(places: tuple[int, ...]) -> Sensor:
-    """The sensor of position fixes, of a state that has x, y and perhaps z in these places."""
+    """Make the sensor of position fixes, of a state that has x, y and perhaps z in these places."""
 
-    def position(state: Any, about: Any, parameters: Any) -> Any:
+    def position(state: Any, reference: Any, parameters: Any) -> Any:
         return tuple(state[place] for place in places)
 
     def fix_noise(parameters: Any) -> Any:
@@ -254,48 +238,8 @@ def fix_sensor(places: tuple[int, ...]) -> Sensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """What is assumed of a log that has no prior: it was not made for the model.
-
-    It begins at the first message that measures components of the state by their names, a fix or a pose
-    with its covariance. What that does not measure is zero, and as uncertain as is said here. With no
-    sensor at all the thing begins at zero, which is where its frame is. Sensors that do not measure the
-    state itself need a prior.
-
-    Attributes:
-        sigmas: standard deviations of the state's components, linear ones and angles.
-        parameters: numbers that no channel of such a log states.
-        align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state, or
-            None where these do not tell it yet. The path (k, n) is where the control alone leads from
-            zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
-            The state is that at the last of them, and begins just after it: they are used up. For a
-            state of which a position tells too little.
-        find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
-            the model's names for their topics, and the maps; for a state that is found from several
-            messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
-        suspect: (streams, parameters) -> sentences: what looks wrong in these messages where the log has
-            a prior. It is only said.
-    """
-
-    sigmas: Mapping[str, float]
-    parameters: Mapping[str, float] = field(default_factory=dict)
-    align: Callable[..., tuple[Floats, Floats] | None] | None = None
-    find: "Callable[[Mapping[str, Stream], Any], Started] | None" = None
-    suspect: Callable[[Mapping[str, Stream], Any], list[str]] | None = None
-
-
-class Started(NamedTuple):
-    """The start of a run: its stamp, mean (n,), covariance (t, t), and how it was found, in words."""
-
-    time_ns: int
-    mean: Floats
-    covariance: Floats
-    how: str
-
-
-@dataclass(frozen=True, eq=False)
 class Correction:
-    """How a state is corrected where one direction of its error, such as a heading, bends all others.
+    """Describes how a state is corrected where one direction of its error, a heading's, bends others.
 
     A belief that is wide in that direction is no ellipsoid: given how far the state is off along it, the
     mean of the rest moves on a curve. `slope` (t,) is the tangent there, P d / d' P d with the
@@ -315,9 +259,10 @@ class Correction:
     back: Function
 
 
+@renamed(estimable="augmentable")
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A model of one kind of thing; a log may hold several of them, each under its own prefix.
+    """Describes a model of one kind of target; a log may hold several, each under its own prefix.
 
     Attributes:
         summary: what it is, in one line.
@@ -337,7 +282,7 @@ class Model:
         takes_fixes: whether position fixes are sensors of it.
         correct: how an update moves the state where not every component moves by itself.
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
-        estimable: the parameters that may become part of the state, linear or angles, see
+        augmentable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
 
     A thing on a line, whose range from the origin is measured:
@@ -349,7 +294,7 @@ class Model:
     ...     return state[0] + duration_s * state[1], state[1]
     >>> def move_noise(state, duration_s, parameters):
     ...     return 0.0, 0.01 * duration_s
-    >>> def measure(state, about, parameters):
+    >>> def measure(state, reference, parameters):
     ...     return (np.abs(state[0]),)
     >>> def measure_noise(parameters):
     ...     return (parameters.sigma_m**2,)
@@ -382,7 +327,7 @@ class Model:
     output: str = "state"
     system: str = ""
     needs_sensor: bool = True
-    estimable: Components = field(default_factory=dict)
+    augmentable: Components = field(default_factory=dict)
     start: Start | None = None
     correct: Correction | None = None
     takes_fixes: bool = True
@@ -390,7 +335,7 @@ class Model:
 
     @property
     def all_sensors(self) -> tuple[Sensor, ...]:
-        """The sensors, and that of position fixes unless the model has one of its own."""
+        """List the sensors, with that of position fixes unless the model has one of its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
         has_position = names[:2] == list(POSITION[:2])
         has_own = any(sensor.topic == FIX for sensor in self.sensors)
@@ -401,153 +346,25 @@ class Model:
 
     @property
     def finds_start(self) -> bool:
-        """Whether the model finds where to start itself, see `Start.find`."""
+        """Tell whether the model finds its own start, see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """The kinds of the state's components."""
+        """List the kinds of the state's components."""
         return tuple(self.state.values())
 
     @property
     def size(self) -> int:
-        """How many components the state has."""
+        """Count the components of the state."""
         return len(self.state)
 
     @property
     def tangent(self) -> int:
-        """How many its tangent space has: an orientation has four components and three."""
+        """Count those of its tangent space: an orientation has four components and three."""
         return tangent_size(self.kinds)
 
     @property
     def controls(self) -> int:
-        """How many components the control has."""
+        """Count the components of the control."""
         return len(self.control.components) if self.control else 0
-
-
-def check_state(where: str, model: Model) -> None:
-    """Raise BadInput where a state's kinds are none."""
-    if not are_kinds(model.kinds):
-        raise BadInput(
-            f"{where}: a state of kinds {', '.join(model.kinds)}; give linear, angle, axis (two "
-            "side by side) or quaternion (four side by side)"
-        )
-
-
-def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> None:
-    """Call a motion's functions once, uncompiled.
-
-    `parameters` has a number for every parameter. Raises BadInput where a function fails, or
-    returns what the model denies.
-    """
-    state, control = trial_state(model.kinds), (0.0,) * model.controls
-    sizes = (model.tangent, motion.triangle(model.tangent))
-    entering = ((0.0,) * motion.noises,) if motion.noises else ()
-    _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
-    if motion.noises and (motion.noise is None or motion.control_noise is not None):
-        raise BadInput(
-            f"{where}: noise that is not additive needs its variances, `noise`, and takes that of the "
-            "control with it; leave out `control_noise`"
-        )
-    if motion.noise is not None:
-        wanted = (motion.noises,) if motion.noises else sizes
-        _check(where, motion.noise, (state, 1.0, parameters), wanted)
-    if motion.lost is not None:
-        _check(where, motion.lost, (state, 1.0, parameters), (model.tangent,))
-    if motion.control_noise is not None:
-        _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
-
-
-def check_correction(where: str, model: Model) -> None:
-    """Call the functions of how a model is corrected once, uncompiled; see `check_motion`."""
-    if model.correct is not None:
-        state, error = trial_state(model.kinds), (0.0,) * model.tangent
-        _check(where, model.correct.along, (state,), (model.tangent,))
-        for moved in (model.correct.move, model.correct.back):
-            _check(where, moved, (state, error, error), (model.size,))
-        _check(where, model.correct.step, (state, state, error), (model.tangent,))
-
-
-def check_switching(where: str, model: Model, parameters: Any) -> None:
-    """Call the functions of a model's switching once, uncompiled; see `check_motion`."""
-    assert model.modes
-    assert model.switching
-    modes, switching = len(model.modes), model.switching
-    _check(where, switching.rates, (parameters,), (modes * (modes - 1),))
-    if switching.initial is not None:
-        _check(where, switching.initial, (parameters,), (modes,))
-
-
-def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Floats]:
-    """The rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
-
-    Raises BadInput where a rate is negative, or the probabilities are none.
-    """
-    assert model.modes
-    assert model.switching
-    names, switching = list(model.modes), model.switching
-    rates = np.array(switching.rates(parameters), float)
-    changes = [(begin, end) for begin in names for end in names if begin != end]
-    for (begin, end), rate in zip(changes, rates.tolist(), strict=True):
-        if not 0.0 <= rate < np.inf:
-            raise BadInput(
-                f"{where}: the rate from mode {begin} to {end} is {rate:g} per second; give zero or more"
-            )
-    initial = np.full(len(names), 1.0 / len(names))
-    if switching.initial is not None:
-        initial = np.array(switching.initial(parameters), float)
-    if not (np.all(initial >= 0.0) and abs(initial.sum() - 1.0) < 1e-9):
-        told = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
-        raise BadInput(
-            f"{where}: the initial probabilities of the modes are {told}; give numbers of zero or more "
-            "whose sum is one"
-        )
-    return rates, initial
-
-
-def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:
-    """Call a sensor's functions once, uncompiled; see `check_motion`."""
-    where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
-    unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
-    if unknown:
-        raise BadInput(f"{where}: measures a component of kind {unknown[0]}; give linear or angle")
-    state, about = trial_state(model.kinds), (1.0,) * sensor.about_size
-    entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
-    _check(where, sensor.measure, (state, *entering, about, parameters), (size,))
-    if sensor.noise is None and (sensor.noises or not sensor.covariance):
-        raise BadInput(f"{where}: states no noise; give `noise`, or `covariance`, the field that has it")
-    if isinstance(sensor.covariance, str) and sensor.covariance and not sensor.vector:
-        raise BadInput(
-            f"{where}: the covariance {sensor.covariance} needs the field that it is of; give `vector`"
-        )
-    if callable(sensor.covariance) and sensor.read is None:
-        raise BadInput(
-            f"{where}: reads covariances of fields that it does not read; give `read` as well"
-        )
-    if sensor.noise is not None and not sensor.covariance:
-        wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
-        _check(where, sensor.noise, (parameters,), wanted)
-
-
-def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
-    """A state at which to try functions: numbers that differ, unit vectors."""
-    found: list[float] = []
-    while len(found) < len(kinds):
-        kind = kinds[len(found)]
-        number = 0.1 * (1 + len(found))
-        found += {"axis": [0.6, 0.8], "quaternion": [0.1, 0.5, -0.5, 0.7]}.get(kind, [number])
-    return tuple(found)
-
-
-def _check(where: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
-    what = f"{where}: {place_of(function)}"
-    with np.errstate(all="ignore"):
-        try:
-            found = function(*arguments)
-        except Exception as error:
-            raise BadInput(f"{what} raised {type(error).__name__}: {error}") from error
-    wanted = " or ".join(str(size) for size in dict.fromkeys(sizes))
-    if not isinstance(found, tuple):
-        raise BadInput(f"{what} returns a {type(found).__name__}; return a tuple of {wanted} components")
-    if len(found) not in sizes:
-        raise BadInput(f"{what} returns {len(found)} components; {wanted} are needed")

@@ -1,15 +1,17 @@
-"""The numbers among a model's parameters, as its functions get them."""
+"""Defines the options of every model, and the numbers that its functions read."""
 
 from collections import namedtuple
 from functools import cache, lru_cache
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, PositiveFloat
 
 from recorders.parameters import Parameters
 
 
 @cache
 def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
-    """The parameters that model functions may read: all that are numbers."""
+    """List the parameters that model functions may read: all that are numbers."""
     schema = parameters.model_json_schema()["properties"]
     numeric = ("number", "integer", "boolean", "null")
     return tuple(
@@ -21,5 +23,27 @@ def number_fields(parameters: type[Parameters]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def settings_type(names: tuple[str, ...]) -> type[Any]:
-    """The NamedTuple that model functions get as their parameters."""
+    """Make the NamedTuple that model functions get as their parameters."""
     return namedtuple("Settings", names)
+
+
+class ModelParameters(Parameters):
+    """Defines the options of every model.
+
+    A parameter that is none is what the channels of the log state: the sensor's own first, then those
+    of control, prior and the other sensors.
+    """
+
+    gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
+    gate_reopens_s: PositiveFloat | None = None
+    """The gate is open for a sensor whose last accepted measurement is older, so that a filter that has
+    drifted, as in an outage, accepts what brings it back."""
+    inflate_nis: PositiveFloat | None = None
+    """An innovation with a greater NIS counts with a larger covariance, which gives it this NIS."""
+    student_freedom: PositiveFloat | None = None
+    """Innovations count as if they had Student's distribution with so many degrees of freedom."""
+    switch_nis: PositiveFloat | None = None
+    """Above this NIS a measurement counts less and less, as in dynamic covariance scaling."""
+    sigma_fix_m: PositiveFloat | None = None
+    """Standard deviation, in m, of each component of a fix that does not state its covariance."""

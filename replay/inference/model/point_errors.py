@@ -1,4 +1,4 @@
-"""Errors that last, of what is measured about each point of a map, as part of the state.
+"""Augments a state by lasting errors of what is measured about each point of a map.
 
 Measurement noise that is not white: ranges to one anchor, or between an anchor and a tag, err alike for
 seconds. A transformation of models: the state gets a component for each point or pair of points, which
@@ -16,9 +16,14 @@ from typing import Any, NamedTuple
 
 from recorders.errors import BadInput
 from replay.inference.model.corrections import correcting_more
-from replay.inference.model.gauss_markov import kept, spread, with_walk_parameters
-from replay.inference.model.model import Model, Motion, Sensor, trial_state
+from replay.inference.model.gauss_markov import (
+    added_variance,
+    remaining_share,
+    with_gauss_markov_parameters,
+)
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.settings import trial_parameters
+from replay.inference.model.validation import trial_state
 
 Names = tuple[str, ...]
 
@@ -67,7 +72,7 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
     return replace(
         model,
         state={**model.state, **{each.name: kinds[each.measured] for each in errors}},
-        parameters=with_walk_parameters(model.parameters, _names(errors)),
+        parameters=with_gauss_markov_parameters(model.parameters, _names(errors)),
         sensors=tuple(sensor_with_errors(model, sensor, errors) for sensor in model.sensors),
         motion=motion_with_errors(model, model.motion, errors),
         correct=correcting_more(model, len(errors)),
@@ -89,13 +94,13 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
         own = (each[:noises] for each in entering)
         moved = list(inner(state[:n], control, *own, duration_s, parameters))
         for index, name in enumerate(names):
-            stay = kept(name, duration_s, parameters) * state[n + index]
+            stay = remaining_share(name, duration_s, parameters) * state[n + index]
             moved.append(stay + entering[0][noises + index] if noises else stay)
         return tuple(moved)
 
     def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
         found = noise_of(state[:n], duration_s, parameters) if noise_of else (0.0,) * t
-        return (*found, *(spread(name, duration_s, parameters) for name in names))
+        return (*found, *(added_variance(name, duration_s, parameters) for name in names))
 
     return replace(
         motion,
@@ -116,13 +121,13 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
         for index, each in enumerate(errors)
         if each.measured in sensor.measured
     ]
-    n, size, inner = model.size, sensor.about_size, sensor.measure
+    n, size, inner = model.size, sensor.reference_size, sensor.measure
 
     def measure(state: Any, *others: Any) -> Any:
-        *entering, about, parameters = others
-        seen = list(inner(state[:n], *entering, about[:size], parameters))
+        *entering, reference, parameters = others
+        seen = list(inner(state[:n], *entering, reference[:size], parameters))
         for place, row, numbers in own:
-            seen[row] = seen[row] + _same(about[size:], numbers) * state[place]
+            seen[row] = seen[row] + _same(reference[size:], numbers) * state[place]
         return tuple(seen)
 
     return replace(
@@ -135,11 +140,11 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
     )
 
 
-def _same(about: Any, numbers: Sequence[int]) -> Any:
+def _same(reference: Any, numbers: Sequence[int]) -> Any:
     """1 where a message is about these points, 0 where not."""
     found: Any = 1.0
     for index, number in enumerate(numbers):
-        found = found * (about[index] == number)
+        found = found * (reference[index] == number)
     return found
 
 

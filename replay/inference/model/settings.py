@@ -1,4 +1,4 @@
-"""The numbers that a model's functions read: given as parameters, or stated by a log's channels."""
+"""Collects the numbers that a model's functions read: from parameters, or from a log's channels."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -11,10 +11,10 @@ from recorders.log import Topic
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.channels import stated
 from replay.inference.model.binding import Found
-from replay.inference.model.model import (
-    Model,
-    ModelParameters,
-    Sensor,
+from replay.inference.model.model import Model, Sensor
+from replay.inference.model.parameters import ModelParameters, number_fields, settings_type
+from replay.inference.model.stage import Stage
+from replay.inference.model.validation import (
     check_correction,
     check_motion,
     check_sensor,
@@ -22,13 +22,11 @@ from replay.inference.model.model import (
     check_switching,
     switching_of,
 )
-from replay.inference.model.parameters import number_fields, settings_type
-from replay.inference.model.stage import Stage
 
 
 @lru_cache(maxsize=64)
 def reading_settings(names: tuple[str, ...]) -> Function:
-    """`read(settings, row)`: a row of numbers as the NamedTuple."""
+    """Make `read(settings, row)`: it reads a row of numbers as the NamedTuple."""
     kind = settings_type(names)
 
     def read(settings: Floats, row: int) -> Any:
@@ -38,13 +36,13 @@ def reading_settings(names: tuple[str, ...]) -> Function:
 
 
 def trial_parameters(model: Model) -> Any:
-    """Parameters to try functions with: every number is one."""
+    """Make parameters to try functions with: every number is one."""
     names = number_fields(model.parameters)
     return settings_type(names)(*(1.0,) * len(names))
 
 
 class TracedParameters:
-    """Parameters to try a model's functions with: `read` is which they read; one where unset."""
+    """Records which parameters a model's functions read: `read`; a parameter that is unset is one."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
@@ -60,7 +58,7 @@ class TracedParameters:
 
 
 def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> Floats:
-    """The numbers (1 + sensors, fields) that motion and sensors get: given, or as channels state them.
+    """Collect the numbers (1 + sensors, fields) of motion and sensors: given, or as channels state them.
 
     What is not given is looked for in the channels of the control, the prior and the sensors; a sensor
     looks in its own first. Raises BadInput where none states a number that is used, or one that the
@@ -107,14 +105,14 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
 
 
 def _stating(found: Found) -> list[Topic]:
-    """The topics whose channels state numbers, in the order in which they are asked."""
+    """List the topics whose channels state numbers, in the order in which they are asked."""
     control = [] if found.control is None else [found.control]
-    instead, sensors = ([topic for _, topic in each] for each in (found.instead, found.sensors))
-    return [*instead, *control, found.prior, *sensors]
+    fallbacks, sensors = ([topic for _, topic in each] for each in (found.fallbacks, found.sensors))
+    return [*fallbacks, *control, found.prior, *sensors]
 
 
 def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """The parameters that are used, and assumed since a log without a prior does not state them."""
+    """List the parameters that are assumed, since a log without a prior does not state them."""
     start = stage.model.start
     if found.has_prior or start is None:
         return {}
@@ -131,7 +129,7 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
 
 @lru_cache(maxsize=64)
 def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tuple[set[str], ...]:
-    """The parameters that motion and sensors read; BadInput where the model is not what it says."""
+    """Find the parameters that motion and sensors read; BadInput where the model is not as declared."""
     model, values = stage.model, dict(given)
     check_state(where, model)
     check_correction(where, model)
@@ -146,7 +144,7 @@ def _needed(where: str, stage: Stage, given: tuple[tuple[str, Any], ...]) -> tup
 
 
 def complaint_of(model: Model, sensor: Sensor, topic: str) -> str:
-    """Why a message was not used, and what would help; "" where no covariance can be missing."""
+    """Explain why a message was not used, and what would help; "" where no covariance can be missing."""
     if not sensor.covariance:
         return ""
     parameters = TracedParameters(dict.fromkeys(number_fields(model.parameters)))

@@ -1,4 +1,4 @@
-"""A model as a method takes it: its functions traced, with the motion and the sensors that are used."""
+"""Prepares a model for a method: traces the functions of its motion and of the sensors at hand."""
 
 import sys
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motio
         move=(n, controls, *entering, None, names),
         noise=(n, None, names),
         control_noise=(None, names),
-        lost=(n, None, names),
+        gap_noise=(n, None, names),
         jacobians=(n, *driven, Shape((t, t)), Shape((t, controls))),
         moments=(Shape((n,)), Shape((t, t)), *driven),
     )
@@ -79,16 +79,16 @@ def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motio
 
 def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Sensor:
     """A sensor whose functions are traced."""
-    n, t, m, about = model.size, model.tangent, len(sensor.measured), sensor.about_size
+    n, t, m, reference = model.size, model.tangent, len(sensor.measured), sensor.reference_size
     entering = (sensor.noises,) if sensor.noises else ()
     filled = (Shape((m,)), Shape((m, m)), Shape((t, m)))
     return _with_traced(
         sensor,
-        measure=(n, *entering, about, names),
+        measure=(n, *entering, reference, names),
         noise=(names,),
-        jacobian=(n, about, names, Shape((m, t))),
-        moments=(Shape((n,)), Shape((t, t)), about, names, *filled),
-        log_likelihood=(n, m, about, names),
+        jacobian=(n, reference, names, Shape((m, t))),
+        moments=(Shape((n,)), Shape((t, t)), reference, names, *filled),
+        log_likelihood=(n, m, reference, names),
     )
 
 

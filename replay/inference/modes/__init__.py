@@ -1,4 +1,4 @@
-"""Several filters side by side: interacting multiple models, and Gaussian sums.
+"""Runs several filters side by side: interacting multiple models, and Gaussian sums.
 
 Begin with `imm`.
 """

@@ -1,6 +1,6 @@
-"""A bank of filters: many narrow Gaussians from a prior that is too wide in an angle for one of them.
+"""Filters a Gaussian sum (`bank`): narrow Gaussians from a prior too wide in an angle for one of them.
 
-The prior is cut across the widest direction of its angles, such as an unknown heading, into Gaussians
+The prior is split across the widest direction of its angles, such as an unknown heading, into Gaussians
 side by side. Each is filtered by itself; every message weighs them by its likelihood, and what is told
 is their mixture. A member that is next to impossible ends, and where those that are left agree they
 become one, so that in the end the bank costs what its filter costs.
@@ -19,7 +19,7 @@ from pydantic import Field, field_validator
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.results import ALL_WELL
-from replay.engine.vectors.tangent import TANGENT_WIDTHS, things
+from replay.engine.vectors.tangent import TANGENT_WIDTHS, manifold_blocks
 from replay.inference.kalman.methods import (
     FILTERS,
     Method,
@@ -29,25 +29,26 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Gaussian, Note, Steps
-from replay.inference.kalman.update import slots_of
+from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
+from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
-from replay.inference.linear_algebra.manifold import retraction
+from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
-from replay.inference.modes.imm import Mixing, Mixtures, likeliest_of, mixing, weighed_update
-from replay.inference.run.filtering import State
+from replay.inference.modes.mixing import likeliest_of, mixing
+from replay.inference.modes.mixture import MixtureFilter, Mixtures, mixture_update
+from replay.inference.run.filtering import FilterState
 
 IMPOSSIBLE = 1e-6  # a member ends whose probability is so small a part of the likeliest one's
 ALIKE = 1e-9  # variances so near to one another are equal, whatever rounding says
 AGREED = 0.1  # members become one where their means are on average so near, as a squared distance
 
 
-class BankParameters(UnscentedParameters, RegressionParameters):
+class GaussianSumParameters(UnscentedParameters, RegressionParameters):
     """The filter of every member, and the number of members for a whole turn.
 
     Members lie side by side, and the standard deviation of each is half their distance, so that their
-    sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not cut.
+    sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not split.
     The number is odd: of an even one, each member has another opposite, and whether that is half a turn
     to the left or to the right, and so the mean of all, rounding would say.
     """
@@ -63,7 +64,7 @@ class BankParameters(UnscentedParameters, RegressionParameters):
         return members
 
 
-class Belief(NamedTuple):
+class GaussianSumBelief(NamedTuple):
     """What is believed of the states, first axis = run: those of M Gaussians that are left, in front.
 
     Attributes:
@@ -81,46 +82,46 @@ class Belief(NamedTuple):
     left: Integers
 
 
-class Memory(NamedTuple):
-    """What the steps of one core work in; see `imm.Memory`, and `factor` (t, t)."""
+class GaussianSumMemory(NamedTuple):
+    """What the steps of one core work in; see `imm.GaussianSumMemory`, and `factor` (t, t)."""
 
     filters: tuple[Any]
     centre: Floats
     away: Floats
     carried: Floats
     shift: Floats
-    notes: Note
+    records: InnovationRecord
     open_gate: Floats
     factor: Floats
 
 
-def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
-    """The steps of a bank of so many of these filters."""
+def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
+    """Make the steps of a Gaussian sum of so many of these filters."""
     n, t = stage.model.size, stage.model.tangent
-    slots = len(slots_of(stage.sensors))
+    innovation_size = len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    gather, mix = mixing(stage.model.kinds, inner.form)
+    to_common_tangent, mix = mixing(stage.model.kinds, inner.form)
     to_covariance = inner.form.to_covariance
     predict_member = inner.predict
 
     def predict(
         run: int,
-        belief: Belief,
+        belief: GaussianSumBelief,
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
-        memory: Memory,
+        sample_index: int,
+        memory: GaussianSumMemory,
     ) -> bool:
         gaussians, well = Gaussian(belief.mean[run], belief.covariance[run]), True
         for each in range(belief.left[run]):
             predicted = predict_member(
-                each, gaussians, control, duration_s, parameters, use, memory.filters[0]
+                each, gaussians, control, duration_s, parameters, sample_index, memory.filters[0]
             )
             well = predicted and well
         return well
 
-    def keep_possible(run: int, belief: Belief) -> None:
+    def keep_possible(run: int, belief: GaussianSumBelief) -> None:
         """End what is next to impossible: the others move to the front."""
         mean, covariance = belief.mean[run], belief.covariance[run]
         probability, log_probability = belief.probability[run], belief.log_probability[run]
@@ -140,12 +141,12 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
             log_probability[each] -= np.log(total)
         belief.left[run] = kept
 
-    def merge_agreeing(run: int, belief: Belief, memory: Memory) -> None:
+    def merge_agreeing(run: int, belief: GaussianSumBelief, memory: GaussianSumMemory) -> None:
         """Make one Gaussian of all, where their means differ by next to nothing of what is unknown."""
         count = belief.left[run]
         mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
         probability = belief.probability[run, :count]
-        gather(mean, covariance, probability, memory)
+        to_common_tangent(mean, covariance, probability, memory)
         likeliest, factor = likeliest_of(probability), memory.factor
         copy_gaussian(memory.centre, memory.carried[likeliest], memory.centre, factor)
         to_covariance(factor)
@@ -168,51 +169,57 @@ def bank_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     def of_run(update: Function) -> Function:
         def update_run(
             run: int,
-            belief: Belief,
+            belief: GaussianSumBelief,
             data: Floats,
             parameters: Any,
             gate: Floats,
-            use: int,
-            memory: Memory,
-            note: Note,
+            sample_index: int,
+            memory: GaussianSumMemory,
+            record: InnovationRecord,
         ) -> int:
             count = belief.left[run]
             weights = belief.probability[run, :count], belief.log_probability[run, :count]
             gaussians = Gaussian(belief.mean[run, :count], belief.covariance[run, :count])
-            told = update(gaussians, weights, data, parameters, gate, use, memory, note)
-            if told == ALL_WELL and count > 1:
+            outcome = update(gaussians, weights, data, parameters, gate, sample_index, memory, record)
+            if outcome == ALL_WELL and count > 1:
                 keep_possible(run, belief)
                 merge_agreeing(run, belief, memory)
-            return told
+            return outcome
 
         return update_run
 
-    def estimate(run: int, belief: Belief, mixtures: Mixtures, row: int, memory: Memory) -> None:
+    def estimate(
+        run: int, belief: GaussianSumBelief, mixtures: Mixtures, row: int, memory: GaussianSumMemory
+    ) -> None:
         count = belief.left[run]
         probability = belief.probability[run, :count]
         for each in range(members):
             mixtures.probability[row, each] = 0.0
         for each in range(count):
             mixtures.probability[row, belief.member[run, each]] = probability[each]
-        gather(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)
+        to_common_tangent(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
         to_covariance(mixtures.covariance[row])
 
-    def memory(sets: tuple[Any, ...]) -> Memory:
-        notes = np.empty((members, slots)), np.empty((members, slots, slots)), np.empty((members, 3))
-        return Memory(
+    def memory(sets: tuple[Any, ...]) -> GaussianSumMemory:
+        records = (
+            np.empty((members, innovation_size)),
+            np.empty((members, innovation_size, innovation_size)),
+            np.empty((members, 3)),
+        )
+        return GaussianSumMemory(
             (inner.memory(sets),),
             centre=np.empty(n),
             away=np.empty((members, t)),
             carried=np.empty((members, t, t)),
             shift=np.empty(t),
-            notes=Note(*notes),
+            records=InnovationRecord(*records),
             open_gate=np.full(most + 1, np.inf),
             factor=np.empty((t, t)),
         )
 
     updates = (
-        of_run(weighed_update(stage, number, update)) for number, update in enumerate(inner.updates)
+        of_run(mixture_update(stage, number, update)) for number, update in enumerate(inner.updates)
     )
     return inner._replace(memory=memory, predict=predict, updates=tuple(updates), estimate=estimate)
 
@@ -223,7 +230,7 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
     Where it is as wide in several, these are the first thing's, and nearest to the first of its axes.
     """
     direction, variance, begin = np.zeros(len(covariance)), -1.0, 0
-    for kind, _ in things(kinds):
+    for kind, _ in manifold_blocks(kinds):
         end = begin + TANGENT_WIDTHS[kind]
         if kind != "linear":
             variances, axes = np.linalg.eigh(covariance[begin:end, begin:end])
@@ -237,7 +244,7 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
     return direction, variance
 
 
-def cut(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) -> tuple[Floats, ...]:
+def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) -> tuple[Floats, ...]:
     """A Gaussian as a row of narrower ones, across its widest turn.
 
     Returns:
@@ -253,13 +260,13 @@ def cut(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) 
         return weights, means, covariance
     weights = np.exp(-0.5 * offsets**2 / (variance - own))
     weights[weights < IMPOSSIBLE] = 0.0
-    gain, add = covariance @ direction / variance, retraction(kinds)
+    gain, add = covariance @ direction / variance, boxplus(kinds)
     for each in np.flatnonzero(weights):
         add(means[each], offsets[each] * gain)
     return weights / weights.sum(), means, covariance - (variance - own) * np.outer(gain, gain)
 
 
-class Banked(Mixing):
+class GaussianSumFilter(MixtureFilter):
     """A bank of filters; the probabilities of its members are on the topic `modes`."""
 
     @property
@@ -268,12 +275,12 @@ class Banked(Mixing):
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
-        """The state at every run's prior, which is cut; see `Filter.start`."""
-        state, members = super().start(whole), self.parameters.members
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
+        """The state at every run's prior, which is split; see `Filter.start`."""
+        state, members = super().start(static), self.parameters.members
         mean, covariance = state.carried.belief
         runs = len(mean)
-        belief = Belief(
+        belief = GaussianSumBelief(
             np.repeat(mean[:, None], members, axis=1),
             np.repeat(covariance[:, None], members, axis=1),
             np.zeros((runs, members)),
@@ -282,9 +289,9 @@ class Banked(Mixing):
             np.ones(runs, np.int64),
         )
         for run in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))).tolist():
-            whole_prior = covariance[run].copy()
-            self.form.to_covariance(whole_prior)
-            weights, means, narrow = cut(self.stage.model.kinds, mean[run], whole_prior, members)
+            prior = covariance[run].copy()
+            self.form.to_covariance(prior)
+            weights, means, narrow = split(self.stage.model.kinds, mean[run], prior, members)
             member = np.flatnonzero(weights)
             count = len(member)
             belief.mean[run, :count], belief.covariance[run] = means[member], self.form.start(narrow)
@@ -301,28 +308,28 @@ def _lacks(model: Model, inner: Method) -> str:
 
 
 @lru_cache(maxsize=64)
-def _banked(name: str, variant: str, members: int) -> Method:
+def _gaussian_sum(name: str, variant: str, members: int) -> Method:
     """The method of so many filters of this name."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:
-        return bank_steps(stage, inner.steps(stage), members)
+        return gaussian_sum_steps(stage, inner.steps(stage), members)
 
     lacks = partial(_lacks, inner=inner)
-    return replace(BANK, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)
+    return replace(GAUSSIAN_SUM, steps=steps, sampling=inner.sampling, lacks=lacks, made_for=None)
 
 
-def _made_for(parameters: BankParameters) -> Method:
+def _made_for(parameters: GaussianSumParameters) -> Method:
     name, variant = named_filter(parameters.filter, "bank", "for the members of a bank")
-    return _banked(name, variant, parameters.members)
+    return _gaussian_sum(name, variant, parameters.members)
 
 
-BANK = Method(
+GAUSSIAN_SUM = Method(
     "bank of filters from a prior cut across its widest angle; the filter follows the name: bank:ekf",
-    BankParameters,
+    GaussianSumParameters,
     no_steps,
     lacks=partial(_lacks, inner=FILTERS["ekf"]),
     variant="filter",
     made_for=_made_for,
-    filtering=Banked,
+    filtering=GaussianSumFilter,
 )

@@ -1,1 +1,1 @@
-"""Particle filters of any model; begin with `particles`."""
+"""Estimates any model's state by particles; begin with `particles`."""

@@ -1,4 +1,4 @@
-"""The particle filter as an estimator, which a run's first measurement seeds, and as a method."""
+"""Runs the particle filter as an estimator, seeded by a run's first measurement, and as a method."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -22,10 +22,11 @@ from replay.inference.kalman.steps import (
 from replay.inference.linear_algebra.gaussian import (
     no_innovation,
 )
-from replay.inference.linear_algebra.manifold import retraction
-from replay.inference.model.model import Model, Sensor, trial_state
+from replay.inference.linear_algebra.manifold import boxplus
+from replay.inference.model.model import Model, Sensor
 from replay.inference.model.settings import trial_parameters
 from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
 from replay.inference.particles.particles import (
     Cloud,
     Clouds,
@@ -35,9 +36,9 @@ from replay.inference.particles.particles import (
     summing_up,
 )
 from replay.inference.particles.update import weighing
-from replay.inference.run.events import joined, of_rows
-from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.run.filtering import Filter, FilterState
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from replay.inference.run.timing import join_events, select_events
 
 MOST_PARTICLES = 1_000_000
 
@@ -103,9 +104,9 @@ _draw_normals = compiled(fill_normals, allocates=False)
 class ParticleFilter(Filter):
     """A filter whose runs begin when their first measurement, which seeds them, is there."""
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+        state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
         runs, n = prior.mean.shape
         t = self.stage.model.tangent
@@ -121,25 +122,25 @@ class ParticleFilter(Filter):
         return state._replace(carried=state.carried._replace(belief=cloud))
 
     @property
-    def cannot_rewind(self) -> str:
-        """See `Filter.cannot_rewind`."""
+    def why_in_sequence(self) -> str:
+        """See `Filter.why_in_sequence`."""
         return "all particles would have to be kept for every message of the window"
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events of the runs in which something was measured; those of the others wait."""
         if state.kept is not None:
-            happenings = joined(state.kept, happenings)
-        sensed = np.flatnonzero(happenings.source >= 0)
-        place = np.searchsorted(sensed, happenings.offsets)
+            events = join_events(state.kept, events)
+        sensed = np.flatnonzero(events.source >= 0)
+        place = np.searchsorted(sensed, events.offsets)
         is_new = (place[1:] > place[:-1]) & (state.carried.belief.counter == 0)
         first = {run: sensed[place[run]] for run in np.flatnonzero(is_new).tolist()}
-        columns = happenings.time_ns, happenings.source, happenings.data
+        columns = events.time_ns, events.source, events.data
         after = self.begun(state, {run: [each[at] for each in columns] for run, at in first.items()})
-        is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(happenings.offsets))
-        waiting = None if is_ready.all() else of_rows(happenings, ~is_ready)
-        ready = happenings if is_ready.all() else of_rows(happenings, is_ready)
+        is_ready = np.repeat(after.carried.belief.counter > 0, np.diff(events.offsets))
+        waiting = None if is_ready.all() else select_events(events, ~is_ready)
+        ready = events if is_ready.all() else select_events(events, is_ready)
         after, made = super().follow(after._replace(kept=waiting), ready)
-        return after, [*made, *self.cautions(happenings.time_ns, first, len(place) - 1)]
+        return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
         """On the topic `started` of runs that begin at these rows: which parameters cannot change."""
@@ -161,7 +162,7 @@ class ParticleFilter(Filter):
         )
         return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for a control or a measurement that did not come; then the prior seeds the run."""
         state, made = self.ended(state)
         if state.kept is None:
@@ -171,7 +172,7 @@ class ParticleFilter(Filter):
         after = self.begun(state, {run: [prior.mean[run], prior.covariance[run]] for run in unseeded})
         return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
 
-    def begun(self, state: State, seeds: Mapping[int, list[Any]]) -> State:
+    def begun(self, state: FilterState, seeds: Mapping[int, list[Any]]) -> FilterState:
         """The state with particles drawn from the priors of some runs, each seeded by its data."""
         if not seeds:
             return state
@@ -188,15 +189,17 @@ class ParticleFilter(Filter):
                 cloud.counter[run] = draw(self.stage.model, cloud, run)
         return state._replace(carried=carried._replace(belief=cloud))
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Estimates, with particles where they are wanted, and innovations to be filled in."""
-        (end, times, mean, covariance), innovations = super().no_results(due, noted, slots)
+        (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
         states = np.empty((rows, particles, self.stage.model.size))
         weight = np.empty((rows, particles))
         return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
 
-    def told(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
+    def output_streams(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
         """The streams of estimates and of the effective number, and where they are wanted particles."""
         model, (rows, particles) = self.stage.model, clouds.weight.shape
         stem = f"/estimates/{self.name}"
@@ -239,7 +242,7 @@ def draw(model: Model, cloud: Cloud, run: int) -> int:
     drawn = numbers[: len(states) * t].reshape(len(states), t)
     states[:] = cloud.prior.mean[run]
     # not by the matrix product, whose round-off depends on the number of cores
-    retraction(model.kinds)(states.T, np.einsum("rk,ik->ri", lower, drawn))
+    boxplus(model.kinds)(states.T, np.einsum("rk,ik->ri", lower, drawn))
     return counter
 
 
@@ -261,13 +264,13 @@ def _lacks_likelihood(model: Model) -> str:
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:
             continue
-        about = (0.7,) * sensor.about_size
+        reference = (0.7,) * sensor.reference_size
         steps = np.linspace(0.3, 0.7, sensor.noises)
         with np.errstate(all="ignore"):
             try:
                 at = [
                     np.array(
-                        sensor.measure(trial_state(model.kinds), tuple(k * steps), about, parameters)
+                        sensor.measure(trial_state(model.kinds), tuple(k * steps), reference, parameters)
                     )
                     for k in range(3)
                 ]

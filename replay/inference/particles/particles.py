@@ -1,4 +1,4 @@
-"""The bootstrap particle filter: many states, each moved with noise of its own and then weighed.
+"""Predicts and resamples the bootstrap particle filter: every particle moves with noise of its own.
 
 Wherever noise enters, by addition, through the control or by the motion itself, it is drawn. What was
 measured weighs the particles by its likelihood; they are resampled before a prediction where few of them
@@ -23,7 +23,7 @@ from replay.inference.linear_algebra.gaussian import (
     Innovation,
     semidefinite_cholesky,
 )
-from replay.inference.linear_algebra.manifold import differencing, retraction
+from replay.inference.linear_algebra.manifold import boxminus, boxplus
 from replay.inference.linear_algebra.moments import lower_of, moments_of, offset_of, weighted_mean_of
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.model import Model
@@ -119,7 +119,7 @@ def moving(stage: Stage, by_control: int) -> Function:
     The first `by_control` draws of a particle are errors of the control.
     """
     model, motion = stage.model, stage.motion
-    read_state, fill, add = tuple_of(model.size), filling(model.size), retraction(model.kinds)
+    read_state, fill, add = tuple_of(model.size), filling(model.size), boxplus(model.kinds)
     drive, move = _driving(stage), _moved(stage, by_control)
     is_additive = motion.noise is not None and not motion.noises
     spread = _additive_noise(stage, by_control) if is_additive else _no_noise
@@ -131,7 +131,7 @@ def moving(stage: Stage, by_control: int) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         memory: ParticleMemory,
     ) -> bool:
         states, offsets, key = cloud.states[run], cloud.offsets[run], cloud.key[run]
@@ -279,7 +279,7 @@ def _additive_noise(stage: Stage, first: int) -> Function:
 def summing_up(model: Model) -> Function:
     """The estimate: intrinsic mean and covariance of the weighted particles, and these where wanted."""
     n, t = model.size, model.tangent
-    subtract, settle, moments = differencing(model.kinds), settling(model.kinds), moments_of(0, t)
+    subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, t)
     weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}
 
     def estimate(run: int, cloud: Cloud, clouds: Clouds, row: int, _: ParticleMemory) -> None:

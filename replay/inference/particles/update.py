@@ -1,4 +1,4 @@
-"""The update of particles: each is weighed by the likelihood of what was measured."""
+"""Updates particles: weighs each by the likelihood of what was measured."""
 
 from typing import Any
 
@@ -10,15 +10,15 @@ from replay.inference.kalman.steps import (
     NOT_EXPLAINED,
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
-    Note,
+    InnovationRecord,
 )
-from replay.inference.kalman.update import note_numbers, noting, reading, sensor_noise
+from replay.inference.kalman.update import reading, sensor_noise, write_numbers, writing_innovation
 from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     cholesky,
-    keep_measured,
+    drop_missing,
+    inflation,
     whiten,
-    widening,
     wrap,
 )
 from replay.inference.linear_algebra.linearization import Input, derivative
@@ -35,7 +35,7 @@ def weighing(stage: Stage, number: int) -> Function:
     and a particle that lacks another one keeps its share of the weight: nothing is said of it.
     """
     sensor = stage.sensors[number]
-    m, tell = len(sensor.measured), noting(stage, number)
+    m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
     compare, likelihood = _comparing(stage, number), _likelihood(stage, number)
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
 
@@ -45,9 +45,9 @@ def weighing(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         memory: ParticleMemory,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         present = 0
         for j in range(m):
@@ -58,20 +58,20 @@ def weighing(stage: Stage, number: int) -> Function:
         compare(cloud.states[run], data, parameters, memory)
         kept = keep_predicted(own)
         innovate(weight, own, kept, angular)
-        tell(own.innovation, note)
-        size = keep_measured(own.innovation)
+        write_innovation(own.innovation, record)
+        size = drop_missing(own.innovation)
         squared, determinant = whiten(own.innovation, size)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
         accepted = size > 0 and squared <= gate[size]
-        note_numbers(note, squared, determinant, size, accepted, 1.0)
+        write_numbers(record, squared, determinant, size, accepted, 1.0)
         if not accepted:
             return ALL_WELL
         factor_kept(own, kept)
         for i in range(len(weight)):
             memory.likelihood[i] = likelihood(cloud.states[run], i, data, parameters, own, kept)
-        note.numbers[1] = reweigh(weight, memory.likelihood)
-        return NOT_EXPLAINED if np.isnan(note.numbers[1]) else ALL_WELL
+        record.numbers[1] = reweigh(weight, memory.likelihood)
+        return NOT_EXPLAINED if np.isnan(record.numbers[1]) else ALL_WELL
 
     return update
 
@@ -81,13 +81,13 @@ def _comparing(stage: Stage, number: int) -> Function:
     model, sensor = stage.model, stage.sensors[number]
     m, measure = len(sensor.measured), sensor.measure
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
-    read_state, read_about, fill = tuple_of(model.size), reading(sensor).about, filling(m)
+    read_state, read_reference, fill = tuple_of(model.size), reading(sensor).reference, filling(m)
     add_noise = sensor_noise(sensor)
 
     def predict_alike(
         states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
     ) -> None:
-        fill(memory.work.predicted, measure(read_state(states[i]), read_about(data), parameters))
+        fill(memory.work.predicted, measure(read_state(states[i]), read_reference(data), parameters))
 
     predict = predict_alike
     if sensor.noises:
@@ -99,7 +99,7 @@ def _comparing(stage: Stage, number: int) -> Function:
         def predict_with_noise(
             states: Floats, i: int, data: Floats, parameters: Any, memory: ParticleMemory
         ) -> None:
-            linearise(read_state(states[i]), read_about(data), parameters, memory.work)
+            linearise(read_state(states[i]), read_reference(data), parameters, memory.work)
             no_covariance(memory.sensors[number].noise[i])
             add_noise(memory.sensors[number].noise[i], data, parameters, memory.work)
 
@@ -210,12 +210,12 @@ def _likelihood(stage: Stage, number: int) -> Function:
     if sensor.log_likelihood is None:
         return gaussian_likelihood
     stated, read_state, read = sensor.log_likelihood, tuple_of(stage.model.size), reading(sensor)
-    read_measured, read_about = read.measured, read.about
+    read_measured, read_reference = read.measured, read.reference
 
     def likelihood(
         states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
     ) -> float:
-        return stated(read_state(states[i]), read_measured(data), read_about(data), parameters)
+        return stated(read_state(states[i]), read_measured(data), read_reference(data), parameters)
 
     return likelihood
 
@@ -223,7 +223,7 @@ def _likelihood(stage: Stage, number: int) -> Function:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
 ) -> float:
-    """See `_likelihood`; the difference becomes L^-1 v. The noise itself widens, see `widening`."""
+    """See `_likelihood`; the difference becomes L^-1 v. The noise itself widens, see `inflation`."""
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):
@@ -232,7 +232,7 @@ def gaussian_likelihood(
             entry -= factor[a, b] * difference[b]
         difference[a] = entry / factor[a, a]
         squared += difference[a] * difference[a]
-    factor = widening(squared, size, parameters)
+    factor = inflation(squared, size, parameters)
     known = own.determinant[number] + size * LOG_TWO_PI
     return -0.5 * (squared / factor + known + size * np.log(factor))
 

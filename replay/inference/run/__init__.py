@@ -1,4 +1,4 @@
-"""One model by one method over the messages of runs: events, the recursion, its start, late messages.
+"""Runs one model by one method over messages: events, the recursion, initialization, late messages.
 
 Begin with `recursion`.
 """

@@ -1,9 +1,8 @@
-"""A log's messages as the recursion takes them: rows of numbers in time order, whatever the model."""
+"""Turns a log's messages into events: rows of numbers in time order, whatever the model."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from recorders.errors import BadInput
 from recorders.log import Stream
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged, last_of_equals, ragged_rows
+from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.geodetic import GEODETIC, in_plane
 from replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
 from replay.inference.kalman.update import reading
@@ -20,20 +19,19 @@ from replay.inference.model.model import Control, Map, Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.recursion import CONTROL, NOTHING, Happenings
-
-EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
+from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
+from replay.inference.run.timing import last_of_stamps, select_events, where_wanted
 
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
+    """Holds the points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
 
     keys: Integers
     places: Floats
 
     def rows(self, run: Integers, number: Integers) -> Integers:
-        """The rows of the points with these numbers in these runs; -1 where there is none."""
+        """Find the rows of the points with these numbers in these runs; -1 where there is none."""
         keys = (run << 32) + number
         if len(self.keys) == 0:
             return np.full(len(keys), -1)
@@ -41,13 +39,13 @@ class Points:
         return np.where(self.keys[rows] == keys, rows, -1)
 
     def at(self, rows: Integers) -> Floats:
-        """The places (m, d) of rows as `rows` gives them; NaN where there is none."""
+        """Look up the places (m, d) of rows as `rows` gives them; NaN where there is none."""
         nowhere = np.full((1, self.places.shape[1]), np.nan)  # what has no row takes the last one
         return np.concatenate([self.places, nowhere])[rows]
 
 
 def points_of(ragged: Ragged, asked: Map) -> Points:
-    """The points of all runs; raises BadInput where they lack a component."""
+    """Collect the points of all runs; raises BadInput where they lack a component."""
     places = read_vectors(ragged.stream, asked.point, asked.components)
     run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
     keys = (run << 32) + ragged[asked.number]
@@ -55,8 +53,8 @@ def points_of(ragged: Ragged, asked: Map) -> Points:
     return Points(keys[order], np.ascontiguousarray(places[order]))
 
 
-class World(NamedTuple):
-    """What messages are read against: the points of every map by its topic, and the plane's origins.
+class Context(NamedTuple):
+    """Holds what messages are read against: every map's points by its topic, and the planes' origins.
 
     The origins (runs, 3) are latitude, longitude and altitude; None where no fix needs them.
     """
@@ -67,7 +65,7 @@ class World(NamedTuple):
 
 @lru_cache(maxsize=64)
 def data_columns(stage: Stage) -> tuple[int, int]:
-    """How many numbers an event has, and the first of the control's among them."""
+    """Count the numbers of an event, and find the first of the control's among them."""
     width, control = (
         max((reading(sensor).width for sensor in stage.sensors), default=0),
         stage.model.control,
@@ -76,105 +74,65 @@ def data_columns(stage: Stage) -> tuple[int, int]:
     return max(width, start + stage.model.controls), start
 
 
-def happenings_of(
-    stage: Stage, found: Found, block: Block, world: World, settings: Floats
-) -> tuple[Happenings, Booleans]:
-    """A block's messages as the recursion takes them, and which of them lack their covariance."""
-    events, control = block.events, stage.model.control
+def filter_events(
+    stage: Stage, found: Found, block: Block, context: Context, settings: Floats
+) -> tuple[FilterEvents, Booleans]:
+    """Turn a block's messages into events of the recursion.
+
+    Args:
+        stage: the model with the sensors at hand.
+        found: its topics.
+        block: the messages of these topics, in all runs.
+        context: maps and origins.
+        settings: (1 + sensors, fields), see `settings_of`.
+
+    Returns the events, and which messages (n,) of the block have no covariance and are left out.
+    """
+    merged, control = block.events, stage.model.control
     width, start = data_columns(stage)
     uses: list[tuple[str, Table]] = []
     if control is not None and found.control is not None:
         columns = {name: start + index for index, name in enumerate(control.components)}
-        replaced = {name for each, _ in found.instead for name in each.components}
+        replaced = {name for each, _ in found.fallbacks for name in each.components}
         own = {name: column for name, column in columns.items() if name not in replaced}
         name = found.control.name
         uses.append((name, _control_table(control, block.streams[name], width, own)))
-        for each, topic in found.instead:
+        for each, topic in found.fallbacks:
             uses.append((topic.name, _control_table(each, block.streams[topic.name], width, columns)))
     for number, (_, topic) in enumerate(found.sensors):
         ragged = block.streams[topic.name]
-        uses.append((topic.name, sensor_table(stage, number, ragged, world, settings)))
+        uses.append((topic.name, sensor_table(stage, number, ragged, context, settings)))
     tables = dict(reversed(uses))  # the first use of every topic
-    data, source, target, lacking = (
-        column[0] if len(column) == 1 else np.concatenate(column)[events.source]
+    data, source, target, without_covariance = (
+        column[0] if len(column) == 1 else np.concatenate(column)[merged.source]
         for column in zip(*(tables[name] for name in block.streams), strict=True)
     )
-    came = np.empty((len(source), 0), np.int64) if block.came is None else block.came
-    happenings = Happenings(events.offsets, events.time_ns, source, data, events.is_last, target, came)
-    again = [_again(happenings, block, name, table) for name, table in uses if table is not tables[name]]
-    if lacking.any():  # as if these had not come
-        chosen = ~lacking
+    arrival = np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival
+    events = FilterEvents(merged.offsets, merged.time_ns, source, data, merged.is_last, target, arrival)
+    again = [_again(events, block, name, table) for name, table in uses if table is not tables[name]]
+    if without_covariance.any():  # as if these had not come
+        chosen = ~without_covariance
         after = np.cumsum(chosen)
         again = [(after[places] - 1, others) for places, others in again]
-        happenings = of_rows(happenings, chosen)
+        events = select_events(events, chosen)
     if again:
-        happenings = _inserted(happenings, again)
-    if lacking.any() or again:
-        happenings = happenings._replace(is_due=last_of_stamps(happenings))
-    return happenings._replace(is_due=_wanted(stage, happenings)), lacking
-
-
-def _wanted(stage: Stage, happenings: Happenings) -> Booleans:
-    """Which of the last events of their stamps want an estimate: not where the control's are all."""
-    control = stage.model.control
-    if control is None or control.estimates or not stage.sensors:
-        return happenings.is_due
-    stamp: Integers = np.cumsum(happenings.is_due) - happenings.is_due
-    sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
-    sensed[stamp[happenings.source != CONTROL]] = True
-    return happenings.is_due & sensed[stamp]
-
-
-def delays_of(stage: Stage, settings: Floats) -> Integers:
-    """How long before their stamps messages were measured, in ns, by an event's source.
-
-    (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
-    """
-    names, control = number_fields(stage.model.parameters), stage.model.control
-    asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
-    asked += [(0, ""), (0, control.delay if control else "")]
-    delays_s = [settings[row, names.index(name)] if name else 0.0 for row, name in asked]
-    return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
-
-
-def as_measured(
-    stage: Stage, happenings: Happenings, delays_ns: Integers, *, is_end: bool
-) -> tuple[Happenings, Happenings]:
-    """Events at the times at which they were measured, in order; and those still to wait.
-
-    What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
-    something older may come.
-    """
-    runs = len(happenings.offsets) - 1
-    run = np.repeat(np.arange(runs), np.diff(happenings.offsets))
-    time_ns = happenings.time_ns - delays_ns[happenings.source]
-    last_ns = np.append(happenings.time_ns, 0)[happenings.offsets[1:] - 1]
-    settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
-    waiting = of_rows(happenings, ~settled)
-    measured = of_rows(happenings._replace(time_ns=time_ns), settled)
-    order = np.lexsort((measured.time_ns, run[settled]))
-    columns: Any = (column[order] for column in measured[1:])
-    measured = Happenings(measured.offsets, *columns)
-    measured = measured._replace(is_due=last_of_stamps(measured))
-    return measured._replace(is_due=_wanted(stage, measured)), waiting
-
-
-def last_of_stamps(happenings: Happenings) -> Booleans:
-    """Whether the next event of the run has another stamp, or was taken at another time."""
-    return last_of_equals(happenings.offsets, happenings.time_ns, *happenings.came.T[:1])
+        events = _inserted(events, again)
+    if without_covariance.any() or again:
+        events = events._replace(wants_estimate=last_of_stamps(events))
+    return events._replace(wants_estimate=where_wanted(stage, events)), without_covariance
 
 
 class Table(NamedTuple):
-    """One topic's messages: data (n, width), source, what they are about, who lacks a covariance."""
+    """Holds one topic's messages: data (n, width), source, reference, and which lack a covariance."""
 
     data: Floats
     source: Integers
     target_id: Integers
-    is_lacking: Booleans
+    lacks_covariance: Booleans
 
 
-def _again(happenings: Happenings, block: Block, name: str, table: Table) -> tuple[Integers, Happenings]:
-    """The messages of a topic as what another sensor measures by them, and their places among all.
+def _again(events: FilterEvents, block: Block, name: str, table: Table) -> tuple[Integers, FilterEvents]:
+    """Turn a topic's messages into what another sensor measures by them, with their places among all.
 
     One of which nothing is measured does not come again.
     """
@@ -182,56 +140,68 @@ def _again(happenings: Happenings, block: Block, name: str, table: Table) -> tup
     begin = sum(len(ragged) for ragged in list(block.streams.values())[:before])
     of_topic = block.events.topic == before
     row = np.where(of_topic, block.events.source - begin, 0)
-    measures = ~np.isnan(table.data).all(axis=1) & ~table.is_lacking
+    measures = ~np.isnan(table.data).all(axis=1) & ~table.lacks_covariance
     chosen = of_topic & measures[row]
     data, source, target, _ = (column[row[chosen]] for column in table)
-    again = of_rows(happenings, chosen)._replace(data=data, source=source, target_id=target)
+    again = select_events(events, chosen)._replace(data=data, source=source, target_id=target)
     return np.flatnonzero(chosen), again
 
 
-def _inserted(happenings: Happenings, again: Sequence[tuple[Integers, Happenings]]) -> Happenings:
-    """Events with others after those at whose places they are."""
+def _inserted(events: FilterEvents, again: Sequence[tuple[Integers, FilterEvents]]) -> FilterEvents:
+    """Insert other events after those at whose places they are."""
     places, others = zip(*again, strict=True)
-    order = np.argsort(np.concatenate([np.arange(len(happenings.time_ns)), *places]), kind="stable")
-    offsets, *columns = zip(happenings, *others, strict=True)
-    return Happenings(sum(offsets), *(np.concatenate(column)[order] for column in columns))
+    order = np.argsort(np.concatenate([np.arange(len(events.time_ns)), *places]), kind="stable")
+    offsets, *columns = zip(events, *others, strict=True)
+    return FilterEvents(sum(offsets), *(np.concatenate(column)[order] for column in columns))
 
 
 def _control_table(control: Control, ragged: Ragged, width: int, columns: Mapping[str, int]) -> Table:
-    """The numbers of a control in the columns of its components; NaN where they come from elsewhere."""
+    """Read a control into the columns of its components; NaN where they come from elsewhere."""
     count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
     read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
-    lacking = np.zeros(count, bool)
+    without_covariance = np.zeros(count, bool)
     if control.interpolated:  # one that is not finite is as if it had not come
-        lacking |= ~np.isfinite(read).all(axis=1)
-    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), lacking)
+        without_covariance |= ~np.isfinite(read).all(axis=1)
+    return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), without_covariance)
 
 
-def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settings: Floats) -> Table:
-    """The messages of sensor `number`: measured, what it is about, its covariance; see `steps.reading`.
+def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
+    """Read the messages of a sensor: measurement, reference and covariance; see `update.reading`.
 
-    A message that lacks its covariance, or of which all is NaN, is as if it had not come.
+    A message without a covariance, or of which all is NaN, counts as none.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        ragged: its messages in all runs.
+        context: maps and origins.
+        settings: (1 + sensors, fields), see `settings_of`.
+
+    Raises BadInput where a field has another width than the model declares.
     """
     sensor, (width, _) = stage.sensors[number], data_columns(stage)
     parameters = reading_settings(number_fields(stage.model.parameters))(settings, number + 1)
     m = len(sensor.measured)
     if ragged.stream.schema.full_name == GEODETIC:
-        assert world.origins is not None
-        ragged = in_plane(ragged, world.origins)
+        assert context.origins is not None
+        ragged = in_plane(ragged, context.origins)
     stream = ragged.stream
     source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
-    lacking = np.zeros(len(stream), bool)
+    without_covariance = np.zeros(len(stream), bool)
     parts = []
     if sensor.covariance:
-        value, spread, lacking = _with_covariance(sensor, ragged)
+        value, spread, without_covariance = _with_covariance(sensor, ragged)
         variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
         if np.isfinite(variances).all():
-            spread[lacking], lacking = np.diag(variances), np.zeros(len(stream), bool)
-        lacking = lacking | np.isnan(value).all(axis=1)
+            spread[without_covariance], without_covariance = (
+                np.diag(variances),
+                np.zeros(len(stream), bool),
+            )
+        without_covariance = without_covariance | np.isnan(value).all(axis=1)
         parts = [value, spread[:, *np.tril_indices(m)]]
     elif sensor.read:
         parts = [_computed(sensor.read, ragged, m)]
@@ -239,31 +209,31 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, world: World, settin
         parts = [read_vectors(stream, sensor.vector, sensor.measured)]
     else:
         parts = [_fields(stream, tuple(sensor.measured))]
-    about: list[Floats] = []
+    reference: list[Floats] = []
     if sensor.maps:
         target = stream[sensor.maps[0].of].astype(np.int64)
         run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
     for each in sensor.maps:
-        places = world.points[each.topic]
+        places = context.points[each.topic]
         rows = places.rows(run, stream[each.of].astype(np.int64))
         source[rows < 0] = NOTHING
-        about.append(places.at(rows))
-    if sensor.control is not None:  # see `with_control`
-        about.append(np.full((len(stream), len(sensor.control.components)), np.nan))
-    about += [_field(stream, name, size) for name, size in sensor.fields.items()]
+        reference.append(places.at(rows))
+    if sensor.control is not None:  # see `fill_control`
+        reference.append(np.full((len(stream), len(sensor.control.components)), np.nan))
+    reference += [_field(stream, name, size) for name, size in sensor.fields.items()]
     if sensor.is_numbered:
-        about.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
-    parts[1:1] = about
-    source[lacking] = NOTHING
+        reference.append(np.stack([stream[each.of].astype(float) for each in sensor.maps], axis=1))
+    parts[1:1] = reference
+    source[without_covariance] = NOTHING
     filled = sum(part.shape[1] for part in parts)
     if filled < width:
         parts.append(np.full((len(stream), width - filled), np.nan))
     data = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
-    return Table(np.ascontiguousarray(data), source, target, lacking)
+    return Table(np.ascontiguousarray(data), source, target, without_covariance)
 
 
 def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
-    """What messages measure, their covariances and which of them lack one."""
+    """Read measurements, their covariances and which of them lack one."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
     assert sensor.read is not None
@@ -278,7 +248,7 @@ def _fields(stream: Stream, names: Sequence[str]) -> Floats:
 
 
 def _field(stream: Stream, name: str, size: int) -> Floats:
-    """A field of numbers or vectors (n, size); raises BadInput where it has another width."""
+    """Read a field of numbers or vectors (n, size); raises BadInput where it has another width."""
     if not len(stream):  # vectors have no width here
         return np.empty((0, size))
     numbers = np.asarray(stream[name], float).reshape(len(stream), -1)
@@ -290,7 +260,7 @@ def _field(stream: Stream, name: str, size: int) -> Floats:
 
 
 def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) -> Floats:
-    """What a model's own function reads of a topic; BadInput where that is not as wide as it says."""
+    """Call a model's own function of a topic; raises BadInput where its array has another shape."""
     if not len(ragged):  # vectors have no width here
         return np.empty((0, components))
     numbers = np.asarray(read(ragged.stream), float)
@@ -300,122 +270,3 @@ def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) ->
             f"{len(ragged)} messages; ({len(ragged)}, {components}) is needed"
         )
     return numbers
-
-
-def times_alone(offsets: Integers, time_ns: Integers, width: int, *, is_due: bool) -> Happenings:
-    """Events that are only times: run r owns offsets[r]:offsets[r + 1]."""
-    count = len(time_ns)
-    nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
-    about, came = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
-    return Happenings(offsets, time_ns, *nothing, np.full(count, is_due), about, came)
-
-
-def joined(first: Happenings, second: Happenings) -> Happenings:
-    """The events of both in time, run by run; at equal stamps those of the first go first."""
-    first, second = _came_alike(first, second), _came_alike(second, first)
-    runs = len(first.offsets) - 1
-    run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
-    order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
-    columns: Any = (
-        np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
-    )
-    return Happenings(first.offsets + second.offsets, *columns)
-
-
-def _came_alike(happenings: Happenings, other: Happenings) -> Happenings:
-    """Events that say when they came if others do: times alone come at their stamps."""
-    if happenings.came.shape[1] >= other.came.shape[1]:
-        return happenings
-    time_ns = happenings.time_ns
-    return happenings._replace(came=np.stack([time_ns, np.full(len(time_ns), -1)], axis=1))
-
-
-def of_rows(happenings: Happenings, chosen: Booleans) -> Happenings:
-    """Some of the events."""
-    columns: Any = (column[chosen] for column in happenings[1:])
-    return Happenings(ragged_rows(chosen, happenings.offsets), *columns)
-
-
-def interpolated(
-    happenings: Happenings, controls: int, gap_ns: float = np.inf
-) -> tuple[Happenings, Happenings]:
-    """Events with the control at their stamps, linear between messages; and those still to wait.
-
-    What comes after a run's last control message waits for the next, with that message before it. From
-    one message that comes more than a gap before the next, up to that, the control is NaN.
-    """
-    data, is_control = happenings.data.copy(), happenings.source == CONTROL
-    ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
-    columns = range(data.shape[1] - controls, data.shape[1])
-    for begin, end in pairwise(happenings.offsets):
-        at = begin + np.flatnonzero(is_control[begin:end])
-        if not len(at):
-            continue
-        inside = slice(begin, at[-1] + 1)
-        times_ns, wanted_ns = (
-            happenings.time_ns[rows] - happenings.time_ns[begin] for rows in (at, inside)
-        )
-        for column in columns:
-            data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
-        for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
-            data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
-        ready[inside], waiting[begin : at[-1]] = True, False
-    again = happenings._replace(is_due=happenings.is_due & ~ready)  # one estimate is enough
-    return of_rows(happenings._replace(data=data), ready), of_rows(again, waiting)
-
-
-def with_control(stage: Stage, happenings: Happenings) -> Happenings:
-    """Events whose control is known, with its numbers where sensors read them."""
-    data = happenings.data.copy()
-    for number, sensor in enumerate(stage.sensors):
-        if sensor.control is not None:
-            rows, controls = happenings.source == number, len(sensor.control.components)
-            begin = len(sensor.measured) + sensor.control_start
-            data[rows, begin : begin + controls] = data[rows, -controls:]
-    return happenings._replace(data=data)
-
-
-def held(happenings: Happenings, initial: Sequence[float], gap_ns: float = np.inf) -> Happenings:
-    """Events that wait for a control message that does not come: the last one holds, for up to a gap.
-
-    `initial` holds in a run in which there was none.
-    """
-    data = happenings.data.copy()
-    for begin, end in pairwise(happenings.offsets):
-        if begin < end:
-            is_control = happenings.source[begin] == CONTROL
-            control = data[begin, -len(initial) :].copy() if is_control else initial
-            data[begin:end, -len(initial) :] = control
-            late = happenings.time_ns[begin:end] - happenings.time_ns[begin] > gap_ns
-            data[begin:end][late & is_control, -len(initial) :] = np.nan
-    return happenings._replace(data=data)
-
-
-def with_ticks(
-    happenings: Happenings, start_ns: Integers, tick: Integers, every_ns: int
-) -> tuple[Happenings, Integers]:
-    """Events, and between them one every so often, at which an estimate is wanted.
-
-    From the prior on, or, where that is more than EARLY such times before the run's first event, from
-    there on.
-    """
-    times, runs, ticks = [], [], tick.copy()
-    for number, (begin, end) in enumerate(pairwise(happenings.offsets)):
-        if begin == end:
-            continue
-        first_ns, last_ns = happenings.time_ns[begin], happenings.time_ns[end - 1]
-        is_old = tick[number] == 0 and first_ns - start_ns[number] > EARLY * every_ns
-        begins_ns = int(first_ns if is_old else start_ns[number])
-        first = max(int(tick[number]), -(-begins_ns // every_ns))
-        stop = max(int(last_ns) // every_ns + 1, first)
-        wanted = np.arange(first, stop) * every_ns
-        own = happenings.time_ns[begin:end][happenings.is_due[begin:end]]
-        wanted = wanted[~np.isin(wanted, own)]
-        ticks[number] = stop
-        times.append(wanted)
-        runs.append(np.full(len(wanted), number))
-    if not times:
-        return happenings, ticks
-    offsets = np.searchsorted(np.concatenate(runs), np.arange(len(happenings.offsets)))
-    width = happenings.data.shape[1]
-    return joined(happenings, times_alone(offsets, np.concatenate(times), width, is_due=True)), ticks

@@ -1,6 +1,6 @@
-"""A filter as a replay runs it: one model by one method, bound to the topics of a log."""
+"""Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
@@ -18,72 +18,69 @@ from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL, failures_of, innovation_stream, state_stream
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
-from replay.inference.kalman.update import slots_of
+from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.covariances import Form
 from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import (
-    World,
-    as_measured,
-    data_columns,
-    delays_of,
-    happenings_of,
-    held,
-    interpolated,
-    joined,
-    of_rows,
-    points_of,
-    times_alone,
-    with_control,
-    with_ticks,
-)
+from replay.inference.run.events import Context, data_columns, filter_events, points_of
 from replay.inference.run.out_of_sequence import issued
 from replay.inference.run.recursion import (
-    Carried,
     Estimates,
-    Happenings,
+    FilterEvents,
     Innovations,
+    RecursionState,
     filled,
     no_results,
     recursion,
 )
+from replay.inference.run.samples import sample_sets, seeded_generators
+from replay.inference.run.timing import (
+    add_output_times,
+    compensate_delays,
+    delays_of,
+    fill_control,
+    hold_control,
+    interpolate_control,
+    join_events,
+    output_times,
+    select_events,
+)
 from replay.sampling.samplers import Sampler
-from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 
 
-class State(NamedTuple):
-    """What a filter carries from block to block.
+class FilterState(NamedTuple):
+    """Holds what a filter carries from block to block.
 
     Attributes:
-        carried: see `recursion.Carried`.
-        world: what messages are read against.
+        carried: see `recursion.RecursionState`.
+        context: what messages are read against.
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
         unsettled: events that wait for others which were measured before them and come later.
         kept: what a smoother keeps for its way back, or a filter for late messages.
-        tick: (runs,) the number of the next extra estimate.
+        next_output: (runs,) the number of the next extra estimate.
     """
 
-    carried: Carried
-    world: World
+    carried: RecursionState
+    context: Context
     generators: tuple[Any, ...]
-    waiting: Happenings | None
-    tick: Integers
-    unsettled: Happenings | None = None
+    waiting: FilterEvents | None
+    next_output: Integers
+    unsettled: FilterEvents | None = None
     kept: Any = None
 
 
 @lru_cache(maxsize=64)
 def _steps(stage: Stage, method: Method) -> Steps:
-    """The steps that the loop over the runs is made of."""
+    """Make the steps of the loop over the runs."""
     return method.steps(stage)
 
 
 @lru_cache(maxsize=64)
 def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
-    """The loop over the runs, and its steps."""
+    """Make the loop over the runs, compiled when first called, and its steps."""
     steps = _steps(stage, method)
     names = number_fields(stage.model.parameters)
     loop = recursion(stage, steps, reading_settings(names))
@@ -92,7 +89,7 @@ def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
 
 
 def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
-    """Of every sampled function; raises BadInput where the sampling is none of its dimension."""
+    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size."""
     if method.sampling is None:
         return ()
     sampling = method.sampling(parameters)
@@ -101,7 +98,7 @@ def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler,
 
 @dataclass(frozen=True)
 class Filter:
-    """One bound filter: `start`, `run` and `finish` of `replay.engine.replaying.estimator.Recursive`.
+    """Runs one bound filter: `start`, `run` and `finish` of an `estimator.Recursive`.
 
     Attributes:
         name: what its output topics begin with, after `/estimates/`.
@@ -119,72 +116,79 @@ class Filter:
     settings: Floats
     samplers: tuple[Sampler, ...]
 
-    def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
-        """The topics of a log that it starts from: the prior, where there is one, and the maps."""
+    def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:  # noqa: ARG002
+        """List the topics of a log that it starts from: the prior, where there is one, and the maps."""
         maps = (each.topic for sensor in self.stage.sensors for each in sensor.maps)
         prior = (self.found.prior.name,) if self.found.has_prior else ()
         return tuple(dict.fromkeys((*prior, *maps)))
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
-        """The state at every run's prior; a run whose prior cannot be used takes no part."""
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
+        """Make the state at every run's prior; a run whose prior cannot be used takes no part."""
         model = self.stage.model
-        time_ns, mean, covariance = gaussians(whole[self.found.prior.name])
+        time_ns, mean, covariance = gaussians(static[self.found.prior.name])
         control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
         accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
         belief = Gaussian(mean, self.form.start(covariance))
-        carried = Carried(belief, control, time_ns, accepted_ns, started)
+        carried = RecursionState(belief, control, time_ns, accepted_ns, started)
         maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
-        points = {topic: points_of(whole[topic], asked) for topic, asked in maps.items()}
+        points = {topic: points_of(static[topic], asked) for topic, asked in maps.items()}
         waiting = None
         if model.control is not None and model.control.interpolated:  # what drives from there on
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
-            waiting = times_alone(runs, time_ns.copy(), width, is_due=False)
-        world = World(points, self.origins(whole, len(mean)))
-        return State(carried, world, (), waiting, np.zeros(len(mean), np.int64))
+            waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
+        context = Context(points, self.origins(static, len(mean)))
+        return FilterState(carried, context, (), waiting, np.zeros(len(mean), np.int64))
 
-    def origins(self, whole: Mapping[str, Ragged], runs: int) -> Floats | None:
-        """The origins of the planes (runs, 3), see `World`: as stated, else the first fixes."""
+    @property
+    def form(self) -> Form:
+        """What stands for covariances in what it carries."""
+        return _steps(self.stage, self.method).form
+
+    def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
+        """Find the origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
-        return next((origins_of(whole[topic.name]) for topic in self.found.geodetic), None)
+        return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
 
-    def run(self, state: State, block: Block) -> tuple[State, list[Ragged]]:
+    def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
-        happenings, lacking = happenings_of(self.stage, self.found, block, state.world, self.settings)
-        passed_over = self.passed_over(block, lacking)
-        after, made = self.through(state, happenings, is_end=False)
+        events, without_covariance = filter_events(
+            self.stage, self.found, block, state.context, self.settings
+        )
+        passed_over = self.passed_over(block, without_covariance)
+        after, made = self.through(state, events, is_end=False)
         return after, [*made, *passed_over]
 
     def through(
-        self, state: State, happenings: Happenings, *, is_end: bool
-    ) -> tuple[State, list[Ragged]]:
+        self, state: FilterState, events: FilterEvents, *, is_end: bool
+    ) -> tuple[FilterState, list[Ragged]]:
         """Filter the events that need not wait for others."""
-        tick, waiting, unsettled = state.tick, None, None
+        next_output, waiting, unsettled = state.next_output, None, None
         if self.delays_ns.any():
             if state.unsettled is not None:
-                happenings = joined(state.unsettled, happenings)
+                events = join_events(state.unsettled, events)
             delays = self.delays_ns
-            happenings, unsettled = as_measured(self.stage, happenings, delays, is_end=is_end)
+            events, unsettled = compensate_delays(self.stage, events, delays, is_end=is_end)
         if self.parameters.every_s is not None:
             every_ns = round(self.parameters.every_s * 1e9)
-            happenings, tick = with_ticks(happenings, state.carried.time_ns, tick, every_ns)
+            events, next_output = add_output_times(events, state.carried.time_ns, next_output, every_ns)
         if state.waiting is not None:
-            happenings = joined(state.waiting, happenings)
+            events = join_events(state.waiting, events)
         control = self.stage.model.control
         if control is not None and control.interpolated:
-            happenings, waiting = interpolated(happenings, len(control.components), self.gap_ns)
-            happenings = with_control(self.stage, happenings)
-        state = state._replace(waiting=waiting, tick=tick, unsettled=unsettled)
-        state, made = self.follow(state, happenings)
-        return state, [*made, *self.not_driven(happenings)]
+            events, waiting = interpolate_control(events, len(control.components), self.gap_ns)
+            events = fill_control(self.stage, events)
+        state = state._replace(waiting=waiting, next_output=next_output, unsettled=unsettled)
+        state, made = self.follow(state, events)
+        return state, [*made, *self.not_driven(events)]
 
-    def not_driven(self, happenings: Happenings) -> list[Ragged]:
-        """What was not used since it was measured in a gap of the control, where that may have some."""
+    def not_driven(self, events: FilterEvents) -> list[Ragged]:
+        """List measurements that were skipped in a gap of the control, where that may have some."""
         control = self.stage.model.control
-        if control is None or not control.gap or not _steps(self.stage, self.method).resumes:
+        if control is None or not control.gap or not _steps(self.stage, self.method).resumes_after_gap:
             return []
-        lost = (happenings.source >= 0) & np.isnan(happenings.data[:, -1])
+        in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
         reasons = [
             f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
             f"{control.gap}"
@@ -193,14 +197,14 @@ class Filter:
         stream = reason_stream(
             f"/estimates/{self.name}/skipped",
             schemas.SKIPPED,
-            happenings.time_ns[lost],
-            happenings.source[lost],
+            events.time_ns[in_gap],
+            events.source[in_gap],
             reasons,
         )
-        return [Ragged(stream, ragged_rows(lost, happenings.offsets))]
+        return [Ragged(stream, ragged_rows(in_gap, events.offsets))]
 
-    def passed_over(self, block: Block, lacking: Booleans) -> list[Ragged]:
-        """What was not used since it lacks a covariance, if any topic may."""
+    def passed_over(self, block: Block, without_covariance: Booleans) -> list[Ragged]:
+        """List messages that were skipped since they lack a covariance, if any topic may."""
         control = self.stage.model.control
         drops_controls = control is not None and control.interpolated
         if not drops_controls and not any(sensor.covariance for sensor in self.stage.sensors):
@@ -212,40 +216,35 @@ class Filter:
             else f"topic {topic}: it is not finite"
             for topic in block.streams
         ]
-        events = block.events
+        merged = block.events
         stream = reason_stream(
             f"/estimates/{self.name}/skipped",
             schemas.SKIPPED,
-            events.time_ns[lacking],
-            events.topic[lacking],
+            merged.time_ns[without_covariance],
+            merged.topic[without_covariance],
             reasons,
         )
-        return [Ragged(stream, ragged_rows(lacking, events.offsets))]
+        return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]
 
-    def finish(self, state: State) -> list[Ragged]:
-        """What still waits for messages that do not come any more."""
+    def finish(self, state: FilterState) -> list[Ragged]:
+        """Filter what still waits for messages that do not come any more."""
         return self.ended(state)[1]
 
-    def ended(self, state: State) -> tuple[State, list[Ragged]]:
-        """The state after what waits for messages that do not come any more, and its outputs."""
+    def ended(self, state: FilterState) -> tuple[FilterState, list[Ragged]]:
+        """Filter what waits for messages that do not come any more: the state and its outputs."""
         made: list[Ragged] = []
         if state.unsettled is not None:
-            no_more = of_rows(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
+            no_more = select_events(state.unsettled, np.zeros(len(state.unsettled.time_ns), bool))
             state, made = self.through(state, no_more, is_end=True)
         if state.waiting is None:
             return state, made
-        tail = with_control(self.stage, held(state.waiting, self.initial, self.gap_ns))
+        tail = fill_control(self.stage, hold_control(state.waiting, self.initial, self.gap_ns))
         state, last = self.follow(state, tail)
         return state, [*made, *last]
 
     @property
-    def form(self) -> Form:
-        """What stands for covariances in what it carries."""
-        return _steps(self.stage, self.method).form
-
-    @property
     def gap_ns(self) -> float:
-        """How long an interpolated control may be silent."""
+        """Read how long an interpolated control may be silent."""
         control = self.stage.model.control
         if control is None or not control.gap:
             return np.inf
@@ -254,18 +253,18 @@ class Filter:
 
     @cached_property
     def delays_ns(self) -> Integers:
-        """See `delays_of`."""
+        """Compute the delays of messages, see `delays_of`."""
         return delays_of(self.stage, self.settings)
 
     @property
     def initial(self) -> tuple[float, ...]:
-        """What drives the motion before the first message of the control."""
+        """Return what drives the motion before the first message of the control."""
         control = self.stage.model.control
         return (control.initial or (0.0,) * len(control.components)) if control else ()
 
     @property
-    def cannot_rewind(self) -> str:
-        """Why it cannot go back for late messages; empty where it can."""
+    def why_in_sequence(self) -> str:
+        """Explain why it needs its messages in order; empty where it can take late ones."""
         control = self.stage.model.control
         if self.parameters.every_s is not None:
             return "there are no estimates between messages (every_s, --every) then"
@@ -277,34 +276,34 @@ class Filter:
             return "its samples are random, so that a message that is used again gets others"
         return ""
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events."""
-        after, estimated, made = self.filtered(state, happenings)
-        states, *others = self.told(*estimated)
-        return after, [issued(states, happenings, state.carried.time_ns), *others, *made]
+        after, estimated, made = self.filtered(state, events)
+        states, *others = self.output_streams(*estimated)
+        return after, [issued(states, events, state.carried.time_ns), *others, *made]
 
     def filtered(
-        self, state: State, happenings: Happenings
-    ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
+        self, state: FilterState, events: FilterEvents
+    ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
         """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
         sensors = self.stage.sensors
         loop, steps = _compiled(self.stage, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
-        due = ragged_rows(happenings.is_due, happenings.offsets)
-        noted = ragged_rows(happenings.source >= 0, happenings.offsets)
-        slots = len(slots_of(sensors))
-        estimates, innovations = self.no_results(due, noted, slots)
-        if slots > min((len(sensor.measured) for sensor in sensors), default=slots):
+        due = ragged_rows(events.wants_estimate, events.offsets)
+        recorded = ragged_rows(events.source >= 0, events.offsets)
+        innovation_size = len(innovation_components(sensors))
+        estimates, innovations = self.no_results(due, recorded, innovation_size)
+        if innovation_size > min((len(sensor.measured) for sensor in sensors), default=innovation_size):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
         settings = np.repeat(self.settings[None], runs, axis=0)
         generators = state.generators
         if any(each.redrawn for each in self.samplers):
-            generators = _seeded(generators, happenings, len(self.samplers), self.parameters.seed)
-        for part, sets in self.sets(generators, happenings):
+            generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
+        for part, sets in self.sets(generators, events):
             loop(
                 part.stop - part.start,
-                happenings._replace(offsets=happenings.offsets[part.start : part.stop + 1]),
+                events._replace(offsets=events.offsets[part.start : part.stop + 1]),
                 settings[part],
                 self.gates,
                 of_runs(carried, part),
@@ -312,7 +311,7 @@ class Filter:
                 innovations._replace(end=innovations.end[part]),
                 scratch=partial(steps.memory, sets),
             )
-        made = [self.innovations(*filled(innovations, noted))] if sensors else []
+        made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{self.name}", *failures))
@@ -320,18 +319,20 @@ class Filter:
         return after, filled(estimates, due), made
 
     def sets(
-        self, generators: tuple[Any, ...], happenings: Happenings
+        self, generators: tuple[Any, ...], events: FilterEvents
     ) -> Iterator[tuple[slice, tuple[Any, ...]]]:
-        """Runs, and what the steps get for them: the samples of all functions."""
-        return _sets(self.samplers, generators, happenings.offsets)
+        """Iterate over runs and the samples of all functions for them."""
+        return sample_sets(self.samplers, generators, events.offsets)
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
-        """Estimates and innovations to be filled in, see `recursion.no_results`."""
-        return no_results(due, noted, self.stage.model, slots)
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
+        """Make estimates and innovations to be filled in, see `recursion.no_results`."""
+        return no_results(due, recorded, self.stage.model, innovation_size)
 
     @cached_property
     def gates(self) -> Floats:
-        """Bounds of the NIS (sensors + 1, largest measurement + 1), by the number of components.
+        """Compute bounds of the NIS (sensors + 1, largest measurement + 1), by the number of components.
 
         The last row is that of a gate that is open.
         """
@@ -343,15 +344,15 @@ class Filter:
 
     @property
     def truth(self) -> str:
-        """The topic that the estimates are compared with."""
+        """Name the topic that the estimates are compared with."""
         return self.found.truth
 
-    def told(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
-        """The streams of what was estimated; run r owns offsets[r]:offsets[r + 1]."""
+    def output_streams(self, estimates: Any, offsets: Integers, /) -> list[Ragged]:
+        """Make the streams of estimates; run r owns offsets[r]:offsets[r + 1]."""
         return [self.states(estimates, offsets)]
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
-        """The stream of estimates; run r owns offsets[r]:offsets[r + 1]."""
+        """Make the stream of states; run r owns offsets[r]:offsets[r + 1]."""
         model = self.stage.model
         stream = state_stream(
             f"/estimates/{self.name}/{model.output}",
@@ -364,11 +365,11 @@ class Filter:
         return Ragged(stream, offsets)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
-        """The stream of innovations, which needs a sensor; see `states`."""
+        """Make the stream of innovations, which needs a sensor; see `states`."""
         stream = innovation_stream(
             f"/estimates/{self.name}/innovation",
             innovations.time_ns,
-            slots_of(self.stage.sensors),
+            innovation_components(self.stage.sensors),
             self.truth,
             target_id=innovations.target_id,
             accepted=innovations.numbers[:, 2].astype(np.uint32),
@@ -382,36 +383,5 @@ class Filter:
 
 @lru_cache(maxsize=64)
 def _nis_bounds(probability: float, components: int) -> Floats:
-    """The quantiles (components + 1,) of the NIS of so many components; nothing is always let in."""
+    """Compute the quantiles (components + 1,) of the NIS by its components; zero are always let in."""
     return np.append(np.inf, chi2.ppf(probability, np.arange(1, components + 1)))
-
-
-def _seeded(
-    generators: tuple[Any, ...], happenings: Happenings, count: int, seed: int
-) -> tuple[Any, ...]:
-    """Generators of every sampled function and run, from the seed and the run's first data."""
-    runs = len(happenings.offsets) - 1
-    before = generators or ((None,) * runs,) * count
-    return tuple(
-        seeded_by_data(each, happenings.data, happenings.offsets, seed, function)
-        for function, each in enumerate(before)
-    )
-
-
-def _sets(
-    samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
-) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
-    """Runs, and the samples of all functions for them; the largest randomised ones say how many runs."""
-    drawn = [index for index, each in enumerate(samplers) if each.redrawn]
-    if not drawn:
-        sets = tuple(next(sets_by_runs(each, (), offsets))[1] for each in samplers)
-        yield slice(0, len(offsets) - 1), sets
-        return
-    largest = max(drawn, key=lambda index: samplers[index].count * (samplers[index].dimension + 1))
-    for part, most in sets_by_runs(samplers[largest], generators[largest], offsets):
-        span = offsets[part.start : part.stop + 1]
-        others = (
-            most if index == largest else next(sets_by_runs(each, generators[index][part], span))[1]
-            for index, each in enumerate(samplers)
-        )
-        yield part, tuple(others)

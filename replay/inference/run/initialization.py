@@ -1,4 +1,4 @@
-"""Where a filter begins in a log that does not say so, and where its plane lies.
+"""Initializes a filter in a log without a prior, and finds the origin of its plane.
 
 A log without a prior gets one at the first message that measures the state, see `model.Start`. It is so
 much wider than that message that the message itself, used like any other, is what counts. The origin of
@@ -8,26 +8,35 @@ a plane that no channel states is the first geodetic fix. All of it is told, on 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic, make_stream, schemas
-from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.replaying.estimator import Opened, Opening
+from replay.engine.arrays import Floats
+from replay.engine.replaying.estimator import Initialization, Initialized
 from replay.engine.streams.blocks import Block, Ragged, merge_events
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.results import gaussian_stream, named
-from replay.engine.vectors.tangent import tangent_components, things
+from replay.engine.vectors.tangent import tangent_components
 from replay.inference.model.binding import Found, measures_state
-from replay.inference.model.model import Sensor, Start
+from replay.inference.model.model import Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.events import World, data_columns, happenings_of, sensor_table
-from replay.inference.run.recursion import CONTROL, Happenings
+from replay.inference.run.events import Context, data_columns, filter_events, sensor_table
+from replay.inference.run.first_messages import (
+    Begun,
+    Fact,
+    diagonal_places,
+    first_of_runs,
+    of_runs,
+    run_count,
+    unknown,
+)
+from replay.inference.run.recursion import CONTROL, FilterEvents
 
 WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
 FOREVER_NS = np.iinfo(np.int64).max
@@ -35,8 +44,8 @@ CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows whe
 
 
 @dataclass(frozen=True)
-class Beginning:
-    """What a filter looks for in the first messages of a log.
+class Initializer:
+    """Finds where a filter begins from the first messages of a log.
 
     Attributes:
         name: what its output topics begin with, after `/estimates/`.
@@ -53,22 +62,22 @@ class Beginning:
     assumed: Mapping[str, float]
 
     @property
-    def opening(self) -> Opening | None:
-        """How it is found; None where the log states all."""
+    def initialization(self) -> Initialization | None:
+        """Return how the start is found; None where the log states all."""
         needs_origin = self.found.geodetic if self.found.origin is None else ()
-        needs_messages = not self.found.has_prior or self._suspect is not None
+        needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        return Opening(topics, self.find) if topics else None
+        return Initialization(topics, self.find) if topics else None
 
     @property
-    def _suspect(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
+    def _prior_check(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
         start = self.stage.model.start
-        return start.suspect if start is not None else None
+        return start.check_prior if start is not None else None
 
     @cached_property
     def _measuring(self) -> list[tuple[int, Sensor, Topic]]:
-        """The sensors that measure the state itself, with their numbers; none of a thing without."""
+        """List the sensors that measure the state itself, with their numbers."""
         return [
             (number, sensor, topic)
             for number, (sensor, topic) in enumerate(self.found.sensors)
@@ -77,9 +86,9 @@ class Beginning:
 
     @property
     def _starting(self) -> list[Topic]:
-        """The topics whose first message is where to begin."""
+        """List the topics whose first message says where to begin."""
         control = [] if self.found.control is None else [self.found.control]
-        drives = [*control, *(topic for _, topic in self.found.instead)]
+        drives = [*control, *(topic for _, topic in self.found.fallbacks)]
         if self.stage.model.finds_start:
             return [*drives, *(topic for _, topic in self.found.sensors)]
         needs_drives = self._aligns or not self._measuring
@@ -87,47 +96,57 @@ class Beginning:
 
     @property
     def _aligns(self) -> bool:
-        """Whether fixes alone have to tell the whole state, and can."""
+        """Tell whether fixes alone have to determine the whole state, and can."""
         model = self.stage.model
         sizes = [len(sensor.measured) for _, sensor, _ in self._measuring]
         return bool(model.start and model.start.align) and len(sizes) == 1 and sizes[0] < model.size
 
-    def find(self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], clock: Clock) -> Opened:
-        """What is found in the first messages; raises BadInput where none of them can be used."""
+    def find(
+        self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock
+    ) -> Initialized:
+        """Find starts in the first messages; raises BadInput where none of them can be used.
+
+        Args:
+            first: the first messages of every run, by topic.
+            static: the topics that the filter starts from, by name.
+            clock: by which the replay stamps estimates.
+        """
         found: dict[str, Ragged] = {}
         told: list[Ragged] = []
-        facts: list[_Fact] = []
-        origins = None if self.found.origin is None else np.tile(self.found.origin, (_runs(first), 1))
+        facts: list[Fact] = []
+        origins = (
+            None if self.found.origin is None else np.tile(self.found.origin, (run_count(first), 1))
+        )
         for topic in self.found.geodetic if origins is None else ():
             fixes = first[topic.name]
-            time_ns, has_one, rows = _first_of(fixes, clock, None)
-            found[topic.name] = _of_runs(fixes.stream.take(rows[has_one]), has_one)
+            time_ns, has_one, rows = first_of_runs(fixes, clock, None)
+            found[topic.name] = of_runs(fixes.stream.take(rows[has_one]), has_one)
             origins = origins_of(found[topic.name])
             told.append(self._told_origin(found[topic.name]))
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
-            facts.append(_Fact(what, time_ns, has_one))
+            facts.append(Fact(what, time_ns, has_one))
         if not self.found.has_prior:
-            prior, begun = self._prior(first, whole, clock, origins)
+            prior, begun = self._prior(first, static, clock, origins)
             found[self.found.prior.name] = prior
             facts += begun
-        elif self._suspect is not None:
-            facts += self._suspected(self._suspect, first, whole, origins)
-        return Opened(found, [*told, *self._told(facts)])
+        elif self._prior_check is not None:
+            facts += self._checked_prior(self._prior_check, first, static, origins)
+        return Initialized(found, [*told, *self._told(facts)])
 
     def _prior(
         self,
         first: Mapping[str, Ragged],
-        whole: Mapping[str, Ragged],
+        static: Mapping[str, Ragged],
         clock: Clock,
         origins: Floats | None,
-    ) -> tuple[Ragged, list["_Fact"]]:
-        """The priors of all runs, and what is to be told of them."""
-        model, runs = self.stage.model, _runs(first)
+    ) -> tuple[Ragged, list["Fact"]]:
+        """Make the priors of all runs, and the facts to be reported of them."""
+        model, runs = self.stage.model, run_count(first)
         mean, sigma = unknown(model.state, model.start)
         covariance = np.tile(sigma**2 * np.eye(len(sigma)), (runs, 1, 1))
-        begun = _Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
+        begun = Begun(np.full(runs, FOREVER_NS), np.tile(mean, (runs, 1)), covariance)
         if model.finds_start:
-            facts = self._found(first, whole, origins, begun)
+            facts = self._found(first, static, origins, begun)
         elif self._measuring:
             facts = self._at_first(first, clock, origins, begun)
         else:
@@ -138,7 +157,7 @@ class Beginning:
             facts = [aligned, *others, self._unaligned(aligned, begun)]
         has_begun = begun.time_ns < FOREVER_NS
         facts += [
-            _Fact(self._assumption(name, number), begun.time_ns, has_begun)
+            Fact(self._assumption(name, number), begun.time_ns, has_begun)
             for name, number in self.assumed.items()
         ]
         stream = gaussian_stream(
@@ -148,20 +167,20 @@ class Beginning:
             begun.covariance[has_begun],
             named(model.state),
         )
-        return _of_runs(stream, has_begun), facts
+        return of_runs(stream, has_begun), facts
 
-    def _unaligned(self, aligned: "_Fact", begun: "_Begun") -> "_Fact":
-        """That fixes did not tell all where a run begins without."""
+    def _unaligned(self, aligned: "Fact", begun: "Begun") -> "Fact":
+        """Report that fixes did not determine all, where a run begins without."""
         [measured] = [sensor.measured for _, sensor, _ in self._measuring]
         names = ", ".join(name for name in self.stage.model.state if name not in measured)
         text = (
             f"{names}: unknown at the start, since with these noise densities the path between the "
             "first fixes does not tell it; state the densities of your sensors first, or give a prior"
         )
-        return _Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
+        return Fact(text, begun.time_ns, ~aligned.is_so & (begun.time_ns < FOREVER_NS))
 
     def _assumption(self, name: str, number: float) -> str:
-        """The sentence for a parameter that is assumed, with what it means where the model says that."""
+        """Write the sentence for a parameter that is assumed, with its meaning if the model gives it."""
         meaning = " ".join((self.stage.model.parameters.model_fields[name].description or "").split())
         said = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
         return f"{said} ({meaning.rstrip('.')})" if meaning else said
@@ -170,27 +189,27 @@ class Beginning:
     def _without(self) -> str:
         return f"the log has no prior ({self.found.prior.name}): it begins"
 
-    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "_Begun") -> list["_Fact"]:
+    def _at_zero(self, first: Mapping[str, Ragged], clock: Clock, begun: "Begun") -> list["Fact"]:
         """Begin all runs at their first control: the frame of what has no sensor is where it begins."""
         for topic in self._starting:
-            found_ns, has_one, _ = _first_of(first[topic.name], clock, None)
+            found_ns, has_one, _ = first_of_runs(first[topic.name], clock, None)
             begun.time_ns[has_one] = np.minimum(begun.time_ns, found_ns)[has_one]
         begun.covariance[:] *= CERTAIN**2
         where = "at zero, where its frame is"
-        return [_Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
+        return [Fact(f"{self._without} {where}", begun.time_ns, begun.time_ns < FOREVER_NS)]
 
     def _found(
         self,
         first: Mapping[str, Ragged],
-        whole: Mapping[str, Ragged],
+        static: Mapping[str, Ragged],
         origins: Floats | None,
-        begun: "_Begun",
-    ) -> list["_Fact"]:
+        begun: "Begun",
+    ) -> list["Fact"]:
         """Begin all runs where the model finds them; raises BadInput where it finds none."""
         model = self.stage.model
         assert model.start is not None
         assert model.start.find is not None
-        given, parameters = self._given(first, whole, origins)
+        given, parameters = self._given(first, static, origins)
         how = [""] * len(begun.time_ns)
         for run in range(len(how)):
             try:
@@ -203,14 +222,14 @@ class Beginning:
             begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
             begun.covariance[run], how[run] = started.covariance, started.how
         return [
-            _Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
+            Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
             for words in dict.fromkeys(filter(None, how))
         ]
 
     def _given(
-        self, first: Mapping[str, Ragged], whole: Mapping[str, Ragged], origins: Floats | None
+        self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], origins: Floats | None
     ) -> tuple[dict[str, Ragged], Any]:
-        """The first messages and the maps, by the model's names for their topics, and the parameters."""
+        """Collect first messages and maps by the model's names for their topics, and the parameters."""
         model, control = self.stage.model, self.found.control
         given = {}
         if model.control is not None and control is not None:
@@ -220,58 +239,58 @@ class Beginning:
             if origins is not None and topic in self.found.geodetic:
                 ragged = in_plane(ragged, origins)
             given[sensor.topic] = ragged
-            given |= {each.topic: whole[each.topic] for each in sensor.maps}
+            given |= {each.topic: static[each.topic] for each in sensor.maps}
         return given, reading_settings(number_fields(model.parameters))(self.settings, 0)
 
-    def _suspected(
+    def _checked_prior(
         self,
-        suspect: Callable[[Mapping[str, Stream], Any], list[str]],
+        check_prior: Callable[[Mapping[str, Stream], Any], list[str]],
         first: Mapping[str, Ragged],
-        whole: Mapping[str, Ragged],
+        static: Mapping[str, Ragged],
         origins: Floats | None,
-    ) -> list["_Fact"]:
-        """What the model suspects of the first messages of runs whose prior is known."""
-        given, parameters = self._given(first, whole, origins)
+    ) -> list["Fact"]:
+        """Check the prior of runs against their first messages, as the model does."""
+        given, parameters = self._given(first, static, origins)
         said = [
-            suspect({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
-            for run in range(_runs(first))
+            check_prior({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
+            for run in range(run_count(first))
         ]
-        time_ns, _, _ = _first_of(next(iter(given.values())), "publish_time", None)
+        time_ns, _, _ = first_of_runs(next(iter(given.values())), "publish_time", None)
         return [
-            _Fact(text, time_ns, np.array([text in of_run for of_run in said]))
+            Fact(text, time_ns, np.array([text in of_run for of_run in said]))
             for text in dict.fromkeys(text for of_run in said for text in of_run)
         ]
 
     def _at_first(
-        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
-    ) -> list["_Fact"]:
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
+    ) -> list["Fact"]:
         """Begin all runs at their first message that measures components of the state."""
         chosen = np.full(len(begun.time_ns), -1)
         for number, _, topic in self._measuring:
             ragged = first[topic.name]
-            table = sensor_table(self.stage, number, ragged, World({}, origins), self.settings)
-            found_ns, has_one, rows = _first_of(ragged, clock, table.source >= 0)
+            table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
+            found_ns, has_one, rows = first_of_runs(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
                 begun.time_ns[run], chosen[run] = found_ns[run], number
-                begun.mean[run], sigma = self._about(number, table.data[rows[run]])
+                begun.mean[run], sigma = self._reference(number, table.data[rows[run]])
                 begun.covariance[run] = sigma**2 * np.eye(len(sigma))
         if (chosen < 0).all():
             raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
         return [
-            _Fact(
+            Fact(
                 f"{self._without} at the first message of {topic.name}", begun.time_ns, chosen == number
             )
             for number, _, topic in self._measuring
         ]
 
-    def _about(self, number: int, data: Floats) -> tuple[Floats, Floats]:
-        """The mean and the much wider sigmas of a state that one message tells of."""
+    def _reference(self, number: int, data: Floats) -> tuple[Floats, Floats]:
+        """Compute the mean and the much wider sigmas of a state that one message measures."""
         model, sensor = self.stage.model, self.stage.sensors[number]
         mean, sigma = unknown(model.state, model.start)
         components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
         size = len(sensor.measured)
         for place, (name, variance) in enumerate(
-            zip(sensor.measured, data[size + _diagonal(size)], strict=True)
+            zip(sensor.measured, data[size + diagonal_places(size)], strict=True)
         ):
             if not np.isnan(data[place]):
                 mean[list(model.state).index(name)] = data[place]
@@ -280,8 +299,8 @@ class Beginning:
         return mean, sigma
 
     def _aligned(
-        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "_Begun"
-    ) -> "_Fact":
+        self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
+    ) -> "Fact":
         """Begin runs just after the first fixes that, with the path between them, tell all."""
         numbers = [number for number, _, _ in self._measuring]
         sensors = tuple(self.found.sensors[number] for number in numbers)
@@ -291,19 +310,19 @@ class Beginning:
         names = [topic.name for topic in self._starting]
         streams = {name: first[name] for name in names}
         block = Block(streams, merge_events(streams, clock))
-        happenings, _ = happenings_of(stage, found, block, World({}, origins), settings)
+        events, _ = filter_events(stage, found, block, Context({}, origins), settings)
         is_aligned = np.zeros(len(begun.time_ns), bool)
         for run in range(len(is_aligned)):
-            solved = self._align(happenings, run, stage, settings)
+            solved = self._align(events, run, stage, settings)
             if solved is not None:
                 begun.time_ns[run], begun.mean[run], begun.covariance[run] = solved
                 is_aligned[run] = True
-        return _Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
+        return Fact(f"{self._without} where its path fits the first fixes", begun.time_ns, is_aligned)
 
     def _align(
-        self, happenings: Happenings, run: int, stage: Stage, settings: Floats
+        self, events: FilterEvents, run: int, stage: Stage, settings: Floats
     ) -> tuple[int, Floats, Floats] | None:
-        """Stamp, mean and covariance of a run at the last of its first fixes; None where they end."""
+        """Align a run: stamp, mean and covariance at the last of its first fixes; None if they end."""
         model = stage.model
         assert model.start is not None
         assert model.start.align is not None
@@ -312,15 +331,15 @@ class Beginning:
         path: list[Any] = []
         places: list[Floats] = []
         spreads: list[Floats] = []
-        begin, end = happenings.offsets[run : run + 2]
+        begin, end = events.offsets[run : run + 2]
         _, first = data_columns(stage)
         before_ns = first_ns = 0
         for event in range(begin, end):
-            time_ns, source = int(happenings.time_ns[event]), happenings.source[event]
+            time_ns, source = int(events.time_ns[event]), events.source[event]
             duration_s = (time_ns - before_ns) * 1e-9
             if event > begin and duration_s > 0.0:
                 state = model.motion.move(state, tuple(control), duration_s, parameters)
-            before_ns, data = time_ns, happenings.data[event]
+            before_ns, data = time_ns, events.data[event]
             if source == CONTROL:
                 own = data[first : first + len(control)]
                 control = np.where(np.isnan(own), control, own)
@@ -346,7 +365,7 @@ class Beginning:
         return "; ".join(complaints)
 
     def _told_origin(self, fixes: Ragged) -> Ragged:
-        """The origins as fixes, on a topic of their own."""
+        """Make the stream of origins, as fixes on a topic of their own."""
         stream = fixes.stream
         columns: dict[str, Any] = {
             name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")
@@ -355,8 +374,8 @@ class Beginning:
         told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
         return Ragged(told, fixes.offsets)
 
-    def _told(self, facts: list["_Fact"]) -> list[Ragged]:
-        """What was assumed, on the topic `started`: a message for each sentence and run."""
+    def _told(self, facts: list["Fact"]) -> list[Ragged]:
+        """Make the stream `started` of what was assumed: a message for each sentence and run."""
         if not facts:
             return []
         texts, times, which = zip(*facts, strict=True)
@@ -369,60 +388,3 @@ class Beginning:
             texts,
         )
         return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]
-
-
-class _Begun(NamedTuple):
-    """Where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; means and covariances."""
-
-    time_ns: Integers
-    mean: Floats
-    covariance: Floats
-
-
-class _Fact(NamedTuple):
-    """A sentence, when it is told (runs,), and in which runs (runs,)."""
-
-    text: str
-    time_ns: Integers
-    is_so: Booleans
-
-
-def _diagonal(size: int) -> Integers:
-    """Where the diagonal stands among the rows of a lower triangle."""
-    rows = np.arange(1, size + 1)
-    return np.cumsum(rows) - 1
-
-
-def _runs(first: Mapping[str, Ragged]) -> int:
-    return next(iter(first.values())).runs
-
-
-def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
-    """The mean (n,) and standard deviations (t,), NaN where none is said, of a state nobody knows."""
-    sigmas = start.sigmas if start else {}
-    kinds = list(state.values())
-    mean = np.zeros(len(kinds))
-    for kind, columns in things(kinds):
-        if kind in ("axis", "quaternion"):
-            mean[columns.start] = 1.0
-    names = [name for name, _ in tangent_components(list(state), kinds)]
-    return mean, np.array([sigmas.get(name, np.nan) for name in names])
-
-
-def _first_of(
-    ragged: Ragged, clock: Clock, usable: Booleans | None
-) -> tuple[Integers, Booleans, Integers]:
-    """The first usable message of every run (runs,): its stamp, whether there is one, its row."""
-    every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
-    place = np.searchsorted(every, ragged.offsets)
-    has_one = place[1:] > place[:-1]
-    rows = np.zeros(ragged.runs, np.int64)
-    rows[has_one] = every[place[:-1][has_one]]
-    time_ns = np.zeros(ragged.runs, np.int64)
-    time_ns[has_one] = ragged.stream.times(clock)[rows[has_one]]
-    return time_ns, has_one, rows
-
-
-def _of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """A stream of one message for each of some runs."""
-    return Ragged(stream, np.append(0, np.cumsum(has_one)))

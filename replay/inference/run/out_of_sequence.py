@@ -1,4 +1,4 @@
-"""Going back for messages that come late: what a filter then believes is what it would have in order.
+"""Processes out-of-sequence measurements: the belief afterwards equals that of in-order processing.
 
 Of every message within a window the filter keeps the message, what it carried after it, and how the
 message fitted the prediction. A late message is put where it belongs by its stamp and its place in the
@@ -9,141 +9,42 @@ told when no message can change it any more.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from recorders.log import make_stream, schemas
-from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.streams.results import ALL_WELL, failures_of
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, Steps
-from replay.inference.kalman.update import slots_of
+from replay.inference.kalman.update import innovation_components
 from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import data_columns, happenings_of
+from replay.inference.run.events import filter_events
+from replay.inference.run.history import (
+    History,
+    KeptMessages,
+    Structure,
+    copying_rows,
+    most_within,
+    no_history,
+    structure_of,
+)
 from replay.inference.run.recursion import (
     CONTROL,
-    NOTHING,
-    Carried,
-    Happenings,
+    FilterEvents,
     Innovations,
+    RecursionState,
     fault_of,
     filled,
-    taking_in,
+    processing,
 )
 from replay.sampling.sets import sets_by_runs
-
-BEFORE_ALL_NS = np.iinfo(np.int64).min
-Structure = tuple[tuple[str, Any], ...]
-
-
-class Kept(NamedTuple):
-    """Messages in order, and what they did; first axis = run and message.
-
-    Attributes:
-        time_ns, source, data, target_id: see `recursion.Happenings`; the last of uint32.
-        position: in the file.
-        after: what was carried after the message.
-        is_noted: whether it was an update, and so has an innovation.
-        difference, covariance, numbers: see `steps.Note`.
-    """
-
-    time_ns: Integers
-    source: Integers
-    data: Floats
-    target_id: Any
-    position: Integers
-    after: Carried
-    is_noted: Booleans
-    difference: Floats
-    covariance: Floats
-    numbers: Floats
-
-
-class History(NamedTuple):
-    """What is kept of the latest messages.
-
-    Attributes:
-        start_ns: (runs,) stamps of the priors.
-        first, counts: (runs,) which rows are a run's: run r has C rows of `kept`, of which `counts[r]`
-            are filled, from row r C + first[r] on. What was carried after the first of them is where
-            the others are repeated from.
-        kept: (runs C).
-    """
-
-    start_ns: Integers
-    first: Integers
-    counts: Integers
-    kept: Kept
-
-    @property
-    def capacity(self) -> int:
-        """How many rows every run has."""
-        return len(self.kept.time_ns) // max(len(self.first), 1)
-
-    @property
-    def rows(self) -> Integers:
-        """The filled rows, run by run."""
-        begin = np.arange(len(self.first)) * self.capacity + self.first
-        before = np.cumsum(self.counts) - self.counts
-        return np.repeat(begin - before, self.counts) + np.arange(self.counts.sum())
-
-    @property
-    def offsets(self) -> Integers:
-        """Run r has the rows offsets[r]:offsets[r + 1] of `rows`."""
-        return np.append(0, np.cumsum(self.counts))
-
-    def with_room(self, capacity: int) -> "History":
-        """A copy with so many rows for every run, of which the filled ones are the first."""
-        rows, runs = self.rows, np.arange(len(self.first))
-        places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
-
-        def moved(column: Any) -> Any:
-            if isinstance(column, tuple):
-                made: Any = type(column)
-                return made(*map(moved, column))
-            wider = np.zeros((len(runs) * capacity, *column.shape[1:]), column.dtype)
-            wider[places] = column[rows]
-            return wider
-
-        return self._replace(
-            first=np.zeros_like(self.first), counts=self.counts.copy(), kept=moved(self.kept)
-        )
-
-
-def _no_history(stage: Stage, carried: Carried) -> History:
-    """The priors alone, before all messages."""
-    runs, slots, (width, _) = len(carried.time_ns), len(slots_of(stage.sensors)), data_columns(stage)
-    kept = Kept(
-        np.full(runs, BEFORE_ALL_NS),
-        np.full(runs, NOTHING),
-        np.zeros((runs, width)),
-        np.zeros(runs, np.uint32),
-        np.full(runs, -1),
-        carried,
-        np.zeros(runs, bool),
-        *(np.zeros((runs, *shape)) for shape in ((slots,), (slots, slots), (3,))),
-    )
-    return History(carried.time_ns, np.zeros(runs, np.int64), np.ones(runs, np.int64), kept)
-
-
-def _most_within(history: History, happenings: Happenings, window_ns: int) -> int:
-    """The most messages of a run that lie within a window, of those kept and those that come."""
-    most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
-    for run, (begin, end) in enumerate(
-        zip(happenings.offsets[:-1], happenings.offsets[1:], strict=True)
-    ):
-        before_ns = kept_ns[kept[run] + 1 : kept[run + 1]]
-        time_ns = np.sort(np.concatenate([before_ns, happenings.time_ns[begin:end]]))
-        through = np.searchsorted(time_ns, time_ns + window_ns, side="right")
-        most = max(most, int((through - np.arange(len(time_ns))).max(initial=0)))
-    return most
-
 
 # The loop
 
@@ -152,20 +53,20 @@ def _most_within(history: History, happenings: Happenings, window_ns: int) -> in
 def _compiled(stage: Stage, method: Method, structure: Structure) -> tuple[Function, Steps]:
     steps = method.steps(stage)
     reads = reading_settings(number_fields(stage.model.parameters))
-    loop = going_back(stage.model, taking_in(stage, steps, reads), steps.estimate, structure)
+    loop = reprocessing(stage.model, processing(stage, steps, reads), steps.estimate, structure)
     title = f"{title_of(stage.model, method.summary)}, which goes back for late messages"
     return compile_over_runs(loop, allocates=False, title=title), steps
 
 
-def going_back(model: Model, take_in: Function, estimate: Function, structure: Structure) -> Function:
-    """The loop over the events of one run in the order in which they came; see `recursion.recursion`.
+def reprocessing(model: Model, process: Function, estimate: Function, structure: Structure) -> Function:
+    """Make the loop over the events of one run in the order of arrival; see `recursion.recursion`.
 
-    `structure` is that of `Kept`.
+    `structure` is that of `KeptMessages`.
     """
     copy, restore = copying_rows(structure), copying_rows(dict(structure)["after"])
     passes_controls = model.control is not None and not model.control.estimates
 
-    def insert(run: int, event: int, happenings: Happenings, history: History, capacity: int) -> int:
+    def insert(run: int, event: int, events: FilterEvents, history: History, capacity: int) -> int:
         """Put an event where it belongs, by stamp and place in the file; returns its row."""
         kept, base = history.kept, run * capacity
         if history.first[run] + history.counts[run] == capacity:
@@ -173,41 +74,41 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
                 copy(kept, base + history.first[run] + k, kept, base + k)
             history.first[run] = 0
         row = base + history.first[run] + history.counts[run]
-        time_ns, position = happenings.time_ns[event], happenings.came[event, 1]
+        time_ns, position = events.time_ns[event], events.arrival[event, 1]
         while kept.time_ns[row - 1] > time_ns or (
             kept.time_ns[row - 1] == time_ns and kept.position[row - 1] > position
         ):
             copy(kept, row - 1, kept, row)
             row -= 1
         kept.time_ns[row], kept.position[row] = time_ns, position
-        kept.source[row], kept.target_id[row] = happenings.source[event], happenings.target_id[event]
-        for k in range(happenings.data.shape[1]):
-            kept.data[row, k] = happenings.data[event, k]
+        kept.source[row], kept.target_id[row] = events.source[event], events.target_id[event]
+        for k in range(events.data.shape[1]):
+            kept.data[row, k] = events.data[event, k]
         history.counts[run] += 1
         return row
 
-    def take_again(
+    def process_again(
         run: int,
         row: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
-        carried: Carried,
-        kept: Kept,
+        carried: RecursionState,
+        kept: KeptMessages,
         at: Integers,
         memory: Any,
     ) -> int:
         """Predict to a kept message and update by it; returns what failed, or ALL_WELL."""
-        events = Happenings(
-            happenings.offsets,
+        stored = FilterEvents(
+            events.offsets,
             kept.time_ns,
             kept.source,
             kept.data,
-            kept.is_noted,
+            kept.has_innovation,
             kept.target_id,
-            happenings.came,
+            events.arrival,
         )
-        notes = Innovations(
+        records = Innovations(
             at, kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
         )
         for i in range(kept.difference.shape[1]):
@@ -215,29 +116,29 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
             for j in range(kept.difference.shape[1]):
                 kept.covariance[row, i, j] = np.nan
         at[run] = row
-        failure = take_in(run, row, events, settings, gates, carried, notes, memory)
-        kept.is_noted[row] = at[run] > row
+        failure = process(run, row, stored, settings, gates, carried, records, memory)
+        kept.has_innovation[row] = at[run] > row
         restore(carried, run, kept.after, row)
         return failure
 
-    def tell(run: int, row: int, kept: Kept, innovations: Innovations) -> None:
+    def write_innovation(run: int, row: int, kept: KeptMessages, innovations: Innovations) -> None:
         """Fill in the innovation of a kept message."""
-        if kept.is_noted[row]:
-            told = innovations.end[run]
-            innovations.time_ns[told], innovations.target_id[told] = (
+        if kept.has_innovation[row]:
+            result = innovations.end[run]
+            innovations.time_ns[result], innovations.target_id[result] = (
                 kept.time_ns[row],
                 kept.target_id[row],
             )
             for i in range(kept.difference.shape[1]):
-                innovations.difference[told, i] = kept.difference[row, i]
+                innovations.difference[result, i] = kept.difference[row, i]
                 for j in range(kept.difference.shape[1]):
-                    innovations.covariance[told, i, j] = kept.covariance[row, i, j]
+                    innovations.covariance[result, i, j] = kept.covariance[row, i, j]
             for i in range(3):
-                innovations.numbers[told, i] = kept.numbers[row, i]
-            innovations.end[run] = told + 1
+                innovations.numbers[result, i] = kept.numbers[row, i]
+            innovations.end[run] = result + 1
 
-    def newest_estimated(last: int, kept: Kept) -> int:
-        """The last row of the newest stamp at which there are estimates."""
+    def newest_estimated(last: int, kept: KeptMessages) -> int:
+        """Find the last row of the newest stamp at which there are estimates."""
         row = last
         while passes_controls and kept.source[row] == CONTROL:
             row -= 1
@@ -247,11 +148,11 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
 
     def follow(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         window_ns: int,
-        carried: Carried,
+        carried: RecursionState,
         history: History,
         estimates: Any,
         innovations: Innovations,
@@ -261,21 +162,21 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
     ) -> None:
         """Move what is carried and kept, and fill the results, until the events end or the run fails."""
         kept, capacity = history.kept, len(history.kept.time_ns) // len(history.first)
-        for event in range(happenings.offsets[run], happenings.offsets[run + 1]):
+        for event in range(events.offsets[run], events.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
-            begin = insert(run, event, happenings, history, capacity)
+            begin = insert(run, event, events, history, capacity)
             last = run * capacity + history.first[run] + history.counts[run] - 1
             repeated[event] = last - begin
             restore(kept.after, begin - 1, carried, run)
             failure = ALL_WELL
             for row in range(begin, last + 1):
-                failure = take_again(
-                    run, row, happenings, settings[run], gates, carried, kept, at, memory
+                failure = process_again(
+                    run, row, events, settings[run], gates, carried, kept, at, memory
                 )
                 if failure != ALL_WELL:
                     break
-            if failure == ALL_WELL and happenings.is_due[event]:
+            if failure == ALL_WELL and events.wants_estimate[event]:
                 row, result = newest_estimated(last, kept), estimates.end[run]
                 estimate(row, kept.after.belief, estimates, result, memory)
                 failure = fault_of(estimates.mean[result], estimates.covariance[result])
@@ -284,7 +185,7 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
                     estimates.end[run] = result + 1
             first = run * capacity + history.first[run]
             while first < last and kept.time_ns[first + 1] < kept.time_ns[last] - window_ns:
-                tell(run, first, kept, innovations)
+                write_innovation(run, first, kept, innovations)
                 first += 1
             history.counts[run] = last - first + 1
             history.first[run] = first - run * capacity
@@ -293,35 +194,12 @@ def going_back(model: Model, take_in: Function, estimate: Function, structure: S
     return follow
 
 
-def structure_of(rows: Any) -> Structure:
-    """Of a NamedTuple of arrays, or of such NamedTuples, the names and numbers of axes."""
-    return tuple(
-        (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
-        for name, column in zip(rows._fields, rows, strict=True)
-    )
-
-
-@lru_cache(maxsize=64)
-def copying_rows(structure: Structure) -> Function:
-    """`copy(source, i, target, j)`: row i of a NamedTuple of arrays into row j of another."""
-    columns = tuple(name for name, of in structure if not isinstance(of, tuple))
-    groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
-
-    def copy(source: Any, i: int, target: Any, j: int) -> None:
-        for name in columns:
-            getattr(target, name)[j] = getattr(source, name)[i]
-        for name, copy_group in groups:
-            copy_group(getattr(source, name), i, getattr(target, name), j)
-
-    return copy
-
-
 # As an estimator
 
 
 @dataclass(frozen=True)
-class Rewinding:
-    """A filter that goes back by up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
+class OutOfSequenceFilter:
+    """Runs a filter that reprocesses up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
 
     `inner` is an `estimators.Filter`, and the states are of its type.
     """
@@ -329,30 +207,32 @@ class Rewinding:
     inner: Any
     window_ns: int
 
-    def start(self, whole: Mapping[str, Ragged]) -> Any:
-        """The state at every run's prior."""
-        state = self.inner.start(whole)
-        return state._replace(kept=_no_history(self.inner.stage, state.carried))
+    def start(self, static: Mapping[str, Ragged]) -> Any:
+        """Make the state at every run's prior."""
+        state = self.inner.start(static)
+        return state._replace(kept=no_history(self.inner.stage, state.carried))
 
     def run(self, state: Any, block: Block) -> tuple[Any, list[Ragged]]:
-        """Filter a block, its messages in the order in which they came."""
+        """Filter a block, its messages in the order of arrival."""
         inner, sensors = self.inner, self.inner.stage.sensors
-        happenings, lacking = happenings_of(inner.stage, inner.found, block, state.world, inner.settings)
+        events, without_covariance = filter_events(
+            inner.stage, inner.found, block, state.context, inner.settings
+        )
         carried, before = copied(state.carried), state.kept
-        history = before.with_room(2 * (_most_within(before, happenings, self.window_ns) + 3))
+        history = before.with_room(2 * (most_within(before, events, self.window_ns) + 3))
         runs = len(history.first)
-        run = np.repeat(np.arange(runs), np.diff(happenings.offsets))
-        is_due = happenings.is_due & (happenings.time_ns >= history.start_ns[run])
-        happenings = happenings._replace(is_due=is_due)
-        due = ragged_rows(is_due, happenings.offsets)
-        noted = ragged_rows(happenings.source >= 0, happenings.offsets) + history.offsets
-        estimates, innovations = inner.no_results(due, noted, len(slots_of(sensors)))
-        repeated = np.zeros(len(is_due), np.int64)
+        run = np.repeat(np.arange(runs), np.diff(events.offsets))
+        wants_estimate = events.wants_estimate & (events.time_ns >= history.start_ns[run])
+        events = events._replace(wants_estimate=wants_estimate)
+        due = ragged_rows(wants_estimate, events.offsets)
+        recorded = ragged_rows(events.source >= 0, events.offsets) + history.offsets
+        estimates, innovations = inner.no_results(due, recorded, len(innovation_components(sensors)))
+        repeated = np.zeros(len(wants_estimate), np.int64)
         loop, steps = _compiled(inner.stage, inner.method, structure_of(history.kept))
-        sets = tuple(next(sets_by_runs(each, (), happenings.offsets))[1] for each in inner.samplers)
+        sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
         loop(
             runs,
-            happenings,
+            events,
             np.repeat(inner.settings[None], runs, axis=0),
             inner.gates,
             self.window_ns,
@@ -364,50 +244,50 @@ class Rewinding:
             np.zeros(runs, np.int64),
             scratch=partial(steps.memory, sets),
         )
-        states, *others = inner.told(*filled(estimates, due))
-        made = [issued(states, happenings, history.start_ns), *others]
-        made += [inner.innovations(*filled(innovations, noted))] if sensors else []
+        states, *others = inner.output_streams(*filled(estimates, due))
+        made = [issued(states, events, history.start_ns), *others]
+        made += [inner.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
-        made += [self.rewound(happenings, repeated), *inner.passed_over(block, lacking)]
+        made += [self.reprocessed(events, repeated), *inner.passed_over(block, without_covariance)]
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:
-        """The innovations that might still have changed."""
+        """Put out the innovations that might still have changed."""
         history: History = state.kept
-        is_noted = history.kept.is_noted[history.rows]
-        rows, offsets = history.rows[is_noted], ragged_rows(is_noted, history.offsets)
+        has_innovation = history.kept.has_innovation[history.rows]
+        rows, offsets = history.rows[has_innovation], ragged_rows(has_innovation, history.offsets)
         if not self.inner.stage.sensors:
             return []
         kept = history.kept
         columns: Any = kept.time_ns, kept.target_id, kept.difference, kept.covariance, kept.numbers
-        told = Innovations(offsets[1:], *(column[rows] for column in columns))
-        return [self.inner.innovations(told, offsets)]
+        innovations = Innovations(offsets[1:], *(column[rows] for column in columns))
+        return [self.inner.innovations(innovations, offsets)]
 
-    def rewound(self, happenings: Happenings, repeated: Integers) -> Ragged:
-        """The late messages, and how many updates each had repeated."""
+    def reprocessed(self, events: FilterEvents, repeated: Integers) -> Ragged:
+        """List the late messages, and how many updates each had repeated."""
         is_late = repeated > 0
         stream = make_stream(
             f"/estimates/{self.inner.name}/rewound",
             schemas.REWOUND,
-            happenings.time_ns[is_late],
-            log_time_ns=happenings.came[is_late, 0],
+            events.time_ns[is_late],
+            log_time_ns=events.arrival[is_late, 0],
             repeated=repeated[is_late],
         )
-        return Ragged(stream, ragged_rows(is_late, happenings.offsets))
+        return Ragged(stream, ragged_rows(is_late, events.offsets))
 
 
-def issued(estimates: Ragged, happenings: Happenings, start_ns: Integers) -> Ragged:
-    """Estimates whose log times are the moments at which the events that called for them were taken.
+def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:
+    """Stamp estimates with the log times at which the events that called for them arrived.
 
     Every run has one for each event that is due, from its prior's stamp on, or only the first of these.
     """
-    if not happenings.came.shape[1]:
+    if not events.arrival.shape[1]:
         return estimates
-    run = np.repeat(np.arange(estimates.runs), np.diff(happenings.offsets))
-    called = happenings.is_due & (happenings.time_ns >= start_ns[run])
-    begin = ragged_rows(called, happenings.offsets)[:-1]
+    run = np.repeat(np.arange(estimates.runs), np.diff(events.offsets))
+    called = events.wants_estimate & (events.time_ns >= start_ns[run])
+    begin = ragged_rows(called, events.offsets)[:-1]
     first = np.repeat(begin - estimates.offsets[:-1], np.diff(estimates.offsets))
-    moment_ns = happenings.came[called, 0][first + np.arange(len(estimates))]
+    moment_ns = events.arrival[called, 0][first + np.arange(len(estimates))]
     return replace(estimates, stream=replace(estimates.stream, log_time_ns=moment_ns))

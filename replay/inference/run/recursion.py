@@ -1,4 +1,4 @@
-"""The one recursion: through the messages of a run in time, whatever the model and the method.
+"""Goes through the events of a run in time: the one recursion for all models and methods.
 
 One prediction per distinct stamp, one update per message in the order given; a control message changes
 what drives the next prediction. Messages before the state's own time say nothing. The run ends where its
@@ -21,7 +21,7 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     UNKNOWN,
-    Note,
+    InnovationRecord,
     Steps,
 )
 from replay.inference.linear_algebra.tuples import range_of
@@ -36,8 +36,8 @@ CONTROL = -1  # an event's source; sensors count from zero, and NOTHING is only 
 NOTHING = -2
 
 
-class Happenings(NamedTuple):
-    """The events of all runs in order: run r owns offsets[r]:offsets[r + 1].
+class FilterEvents(NamedTuple):
+    """Holds the events of all runs in order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
@@ -45,7 +45,7 @@ class Happenings(NamedTuple):
         source: (n,) a sensor's number, CONTROL or NOTHING.
         data: (n, width) the numbers of the message, see `steps.reading`; the control's where that is
             interpolated.
-        is_due: (n,) whether the estimate after the event is wanted.
+        wants_estimate: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
         came: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the order
             of the stamps.
@@ -55,13 +55,13 @@ class Happenings(NamedTuple):
     time_ns: Integers
     source: Integers
     data: Floats
-    is_due: NDArray[np.bool_]
+    wants_estimate: NDArray[np.bool_]
     target_id: Integers
-    came: Integers
+    arrival: Integers
 
 
-class Carried(NamedTuple):
-    """What the recursion carries from block to block; first axis = run.
+class RecursionState(NamedTuple):
+    """Holds what the recursion carries from block to block; first axis = run.
 
     Attributes:
         belief: the method's own.
@@ -79,7 +79,7 @@ class Carried(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """The estimates as the recursion fills them in: those of run r end before row `end[r]`."""
+    """Holds estimates as the recursion fills them in: those of run r end before row `end[r]`."""
 
     end: Integers
     time_ns: Integers
@@ -88,7 +88,7 @@ class Estimates(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """The innovations as the recursion fills them in, see `Estimates` and `steps.Note`."""
+    """Holds innovations as the recursion fills them in, see `Estimates` and `steps.InnovationRecord`."""
 
     end: Integers
     time_ns: Integers
@@ -102,9 +102,9 @@ ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
 
 
 def no_results(
-    due: Integers, noted: Integers, model: Model, slots: int
+    due: Integers, recorded: Integers, model: Model, innovation_size: int
 ) -> tuple[Estimates, Innovations]:
-    """Results to be filled in: run r has the rows due[r]:due[r + 1] and noted[r]:noted[r + 1].
+    """Make results to be filled in: run r has the rows from due[r] and recorded[r] up to the next run's.
 
     All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
     every page by itself, and that takes as long as half of a small filter.
@@ -112,7 +112,10 @@ def no_results(
     n, t = model.size, model.tangent
     shapes = [
         *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
-        *((int(noted[-1]), *shape) for shape in ((), (), (slots,), (slots, slots), (3,))),
+        *(
+            (int(recorded[-1]), *shape)
+            for shape in ((), (), (innovation_size,), (innovation_size, innovation_size), (3,))
+        ),
     ]
     ends = list(accumulate(map(math.prod, shapes), initial=0))
     memory = np.empty(ends[-1])
@@ -121,13 +124,15 @@ def no_results(
         for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
     )
     estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
-    about = target_id.view(np.uint32)[: len(target_id)]
-    told = Innovations(noted[:-1].copy(), noted_ns.view(np.int64), about, difference, spread, numbers)
-    return estimates, told
+    reference = target_id.view(np.uint32)[: len(target_id)]
+    innovations = Innovations(
+        recorded[:-1].copy(), noted_ns.view(np.int64), reference, difference, spread, numbers
+    )
+    return estimates, innovations
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
-    """What was filled in of results that began at these offsets, laid end to end, and its offsets."""
+    """Cut results down to what was filled in, laid end to end, and return their offsets."""
     end, *columns = results
     rows, kept = filled_rows(offsets, end)
     if isinstance(rows, slice):
@@ -136,17 +141,25 @@ def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Intege
     return made(kept[1:], *(column[rows] for column in columns)), kept
 
 
-def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """What one event does to a run, `take_in(run, event, happenings, ...)`; see `recursion`."""
+def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
+    """Make the function that processes one event of a run; see `recursion`.
+
+    Args:
+        stage: the model as the method takes it.
+        steps: the method's steps for it.
+        settings_of: `settings_of(settings, row)` makes a row's parameters.
+
+    Returns `process(run, event, events, settings, gates, carried, innovations, memory)`.
+    """
     predict = steps.predict
     update = choosing(steps.updates)
     interpolated = stage.model.control is not None and stage.model.control.interpolated
     has_gaps = stage.model.control is not None and bool(stage.model.control.gap)
-    resumes = steps.resumes
+    resumes_after_gap = steps.resumes_after_gap
     controls = stage.model.controls
 
-    def drive(run: int, data: Floats, carried: Carried) -> None:
-        """The control from this event on, of what it has; an interpolated one stands at the end."""
+    def drive(run: int, data: Floats, carried: RecursionState) -> None:
+        """Take over the control that an event has; an interpolated one stands at the end of its data."""
         first = len(data) - controls if interpolated else 0
         for k in range(controls):
             if not np.isnan(data[first + k]):
@@ -156,27 +169,27 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         run: int,
         event: int,
         duration_s: float,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
-        carried: Carried,
+        carried: RecursionState,
         memory: Any,
     ) -> bool:
         """Predict to an event."""
         control = carried.control[run]
-        first = happenings.data.shape[1] - controls
+        first = events.data.shape[1] - controls
         if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
             for k in range(controls):
-                control[k] = 0.5 * (control[k] + happenings.data[event, first + k])
+                control[k] = 0.5 * (control[k] + events.data[event, first + k])
         parameters = settings_of(settings, 0)
         return predict(run, carried.belief, control, duration_s, parameters, event, memory)
 
-    def take_in(
+    def process(
         run: int,
         event: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
-        carried: Carried,
+        carried: RecursionState,
         innovations: Innovations,
         memory: Any,
     ) -> int:
@@ -184,74 +197,74 @@ def taking_in(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
         UNKNOWN in a gap of the control after which it goes on.
         """
-        source, data = happenings.source[event], happenings.data[event]
-        duration_s = (happenings.time_ns[event] - carried.time_ns[run]) * 1e-9
+        source, data = events.source[event], events.data[event]
+        duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
             if has_gaps and np.isnan(data[len(data) - 1]):
-                if not resumes:
+                if not resumes_after_gap:
                     return NOT_DRIVEN
                 carried.control[run, :] = np.nan
                 return UNKNOWN
-            carried.time_ns[run] = happenings.time_ns[event]
-            if not advance(run, event, duration_s, happenings, settings, carried, memory):
+            carried.time_ns[run] = events.time_ns[event]
+            if not advance(run, event, duration_s, events, settings, carried, memory):
                 return NOT_POSITIVE_DEFINITE
         if duration_s >= 0.0 if interpolated else source == CONTROL:
             drive(run, data, carried)
         if source >= 0 and duration_s >= 0.0:
             row = innovations.end[run]
-            note = Note(
+            record = InnovationRecord(
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
             parameters = settings_of(settings, source + 1)
-            waited_s = (happenings.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
+            waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
-            told = update(source, run, carried.belief, data, parameters, gate, event, memory, note)
-            if told >= 0:
-                return told
-            if told == ALL_WELL:
-                if note.numbers[2] > 0.0:
-                    carried.accepted_ns[run, source] = happenings.time_ns[event]
-                innovations.time_ns[row] = happenings.time_ns[event]
-                innovations.target_id[row] = happenings.target_id[event]
+            outcome = update(source, run, carried.belief, data, parameters, gate, event, memory, record)
+            if outcome >= 0:
+                return outcome
+            if outcome == ALL_WELL:
+                if record.numbers[2] > 0.0:
+                    carried.accepted_ns[run, source] = events.time_ns[event]
+                innovations.time_ns[row] = events.time_ns[event]
+                innovations.target_id[row] = events.target_id[event]
                 innovations.end[run] = row + 1
         return ALL_WELL
 
-    return take_in
+    return process
 
 
 def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """The loop over the events of one run, for `replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over the events of one run, for `replay.engine.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
     """
-    take_in, estimate = taking_in(stage, steps, settings_of), steps.estimate
+    process, estimate = processing(stage, steps, settings_of), steps.estimate
 
     def follow(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
-        carried: Carried,
+        carried: RecursionState,
         estimates: Estimates,
         innovations: Innovations,
         memory: Any,
     ) -> None:
         """Move what is carried, and fill the results, until the events end or the run fails."""
         start_ns = carried.time_ns[run]
-        for event in range(happenings.offsets[run], happenings.offsets[run + 1]):
+        for event in range(events.offsets[run], events.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
-            failure = take_in(run, event, happenings, settings[run], gates, carried, innovations, memory)
+            failure = process(run, event, events, settings[run], gates, carried, innovations, memory)
             if (
                 failure == ALL_WELL
-                and happenings.is_due[event]
-                and happenings.time_ns[event] >= start_ns
+                and events.wants_estimate[event]
+                and events.time_ns[event] >= start_ns
             ):
                 row = estimates.end[run]
                 estimate(run, carried.belief, estimates, row, memory)
                 failure = fault_of(estimates.mean[row], estimates.covariance[row])
                 if failure == ALL_WELL:
-                    estimates.time_ns[row] = happenings.time_ns[event]
+                    estimates.time_ns[row] = events.time_ns[event]
                     estimates.end[run] = row + 1
             carried.failure[run] = ALL_WELL if failure == UNKNOWN else failure
 
@@ -259,7 +272,7 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def fault_of(mean: Floats, covariance: Floats) -> int:
-    """Why an estimate is none: it is not finite, or a variance is negative; ALL_WELL where it is one."""
+    """Find why an estimate is none: it is not finite, or a variance is negative; else ALL_WELL."""
     total = 0.0
     for row in range(len(mean)):
         total += mean[row]
@@ -275,7 +288,7 @@ def fault_of(mean: Floats, covariance: Floats) -> int:
 
 
 def choosing(updates: tuple[Function, ...]) -> Function:
-    """`update(source, ...)`: the update of the sensor with this number."""
+    """Make `update(source, ...)`: it calls the update of the sensor with this number."""
 
     def update(source: int, *arguments: Any) -> int:
         for number in range_of(len(updates)):

@@ -1,4 +1,4 @@
-"""Smoothers: the backward pass over a filter, iterated smoothing, and the bound of all of it.
+"""Smooths: the backward pass over a filter, iterated smoothing, and the posterior bound.
 
 Begin with `backward_pass`.
 """

@@ -1,4 +1,4 @@
-"""The affine filter about a trajectory: how a pass of Gauss-Newton goes forward.
+"""Filters about a trajectory with affine steps: the forward pass of Gauss-Newton.
 
 With motion and sensors linearised at the latest states x_k of a run, the unknowns are the tangent
 vectors d_k from there, which lie in flat space:
@@ -22,7 +22,7 @@ from replay.inference.kalman.predict import motion_derivative, motion_noise
 from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
-    Note,
+    InnovationRecord,
     Steps,
     Workspace,
     gaussian_filter,
@@ -30,10 +30,10 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import reading, sensor_derivative, whitening
 from replay.inference.linear_algebra.gaussian import (
-    moved_covariance,
+    propagate_covariance,
     scalar_update,
 )
-from replay.inference.linear_algebra.manifold import differencing, is_flat, resetting, retraction
+from replay.inference.linear_algebra.manifold import boxminus, boxplus, by_right_jacobian, is_flat
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.stage import Stage
 from replay.inference.smoothing.backward_pass import (
@@ -108,13 +108,13 @@ def affine_steps(stage: Stage) -> Steps:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        event: int,
         memory: ForwardMemory,
     ) -> bool:
-        if not advance(run, belief, control, duration_s, parameters, use, memory):
+        if not advance(run, belief, control, duration_s, parameters, event, memory):
             return False
         trajectory = memory.filter.samples[0]
-        hold(belief.mean[run], belief.covariance[run], trajectory, trajectory.node[use])
+        hold(belief.mean[run], belief.covariance[run], trajectory, trajectory.node[event])
         return True
 
     return chained._replace(predict=predict)
@@ -140,7 +140,7 @@ def affine_motion(stage: Stage) -> Function:
     add_noise, reach = motion_noise(model, motion), reaching(model.kinds)
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     flat, carry = is_flat(model.kinds), carrying(model.kinds)
-    turn = resetting(model.kinds)
+    turn = by_right_jacobian(model.kinds)
 
     def predict(
         mean: Floats,
@@ -148,11 +148,11 @@ def affine_motion(stage: Stage) -> Function:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        event: int,
         work: Workspace,
     ) -> bool:
         trajectory, step = work.samples[0], work.step
-        node, noise, offset = trajectory.node[use], trajectory.noise, trajectory.offset[0]
+        node, noise, offset = trajectory.node[event], trajectory.noise, trajectory.offset[0]
         state = read_state(trajectory.mean[node - 1])
         linearise(state, read_control(control), duration_s, parameters, work)
         noise[:] = 0.0
@@ -167,7 +167,7 @@ def affine_motion(stage: Stage) -> Function:
             step[row] = -offset[row]
             for k in range(len(step)):
                 step[row] += work.transition[row, k] * mean[k]
-        moved_covariance(covariance, work.transition, work.product)
+        propagate_covariance(covariance, work.transition, work.product)
         for row in range(len(step)):
             mean[row] = step[row]
             for column in range(len(step)):
@@ -182,7 +182,7 @@ def carrying(kinds: tuple[str, ...]) -> Function:
 
     Takes tangent vectors at one state to those at the state that lies `offset` from it.
     """
-    turn, turn_back = resetting(kinds), resetting(kinds, back=True)
+    turn, turn_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
 
     def carry(offset: Floats, rows: Floats, step: Floats) -> None:
         for row in range(len(step)):
@@ -199,7 +199,7 @@ def reaching(kinds: tuple[str, ...]) -> Function:
     Fills `offset`, and adds its square in units of the noise to the costs. Where noise has no part the
     state is moved to what it can reach.
     """
-    add, subtract = retraction(kinds), differencing(kinds)
+    add, subtract = boxplus(kinds), boxminus(kinds)
 
     def reach(trajectory: Trajectory, node: int, origin: Floats) -> bool:
         offset, whitened = trajectory.offset[0], trajectory.column
@@ -280,7 +280,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
 def affine_sensor(stage: Stage, number: int) -> Function:
     """The update of the tangent vector by sensor `number`, one component after the other."""
     model, sensor = stage.model, stage.sensors[number]
-    read_state, read_about = tuple_of(model.size), reading(sensor).about
+    read_state, read_reference = tuple_of(model.size), reading(sensor).reference
     linearise, whiten_residual = sensor_derivative(model, sensor), whitening(sensor, number)
     noise_enters = sensor.noises > 0
 
@@ -290,17 +290,17 @@ def affine_sensor(stage: Stage, number: int) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        event: int,
         work: Workspace,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
         trajectory, innovation = work.samples[0], work.innovations[number]
-        node, about, column = trajectory.node[use], read_about(data), trajectory.column
+        node, reference, column = trajectory.node[event], read_reference(data), trajectory.column
         if noise_enters:
-            linearise(read_state(trajectory.kept[node]), about, parameters, work)
+            linearise(read_state(trajectory.kept[node]), reference, parameters, work)
             _, squared = whiten_residual(data, parameters, work)
             trajectory.held[0] += robust(squared, trajectory.loss)[0]
-        linearise(read_state(trajectory.mean[node]), about, parameters, work)
+        linearise(read_state(trajectory.mean[node]), reference, parameters, work)
         size, squared = whiten_residual(data, parameters, work)
         if np.isnan(squared):
             return NOT_POSITIVE_DEFINITE
@@ -320,7 +320,7 @@ def affine_sensor(stage: Stage, number: int) -> Function:
             if not variance > 0.0:
                 return NOT_POSITIVE_DEFINITE
             scalar_update(mean, covariance, column, variance, difference)
-        return NOTHING_MEASURED  # that is of interest later: nothing is noted
+        return NOTHING_MEASURED  # that is of interest later: nothing is recorded
 
     return update
 

@@ -1,4 +1,4 @@
-"""The way back over a filter: its estimates, corrected by all that was measured later.
+"""Corrects a filter's estimates by later measurements: the Rauch-Tung-Striebel backward pass.
 
 A filter goes forward. At every stamp that has an estimate, a node, it leaves its Gaussian and what ties
 it to the node before; from the last node the way leads back. For a step from k to k + 1 with the
@@ -20,11 +20,11 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.kalman.steps import Note, Steps
+from replay.inference.kalman.steps import InnovationRecord, Steps
 from replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
-    moved_covariance,
     multiply,
+    propagate_covariance,
 )
 from replay.inference.linear_algebra.manifold import tangent_size
 from replay.inference.model.corrections import Kinds, comparing, correcting, sloping
@@ -93,7 +93,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         control: Floats,
         duration_s: float,
         parameters: Any,
-        use: int,
+        sample_index: int,
         memory: ForwardMemory,
     ) -> bool:
         rest, turned, product = memory.rest, memory.turned, memory.product
@@ -101,11 +101,11 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         for row in range(t):
             for column in range(t):
                 rest[row, column] = covariance[row, column]
-        if not predict_filter(run, belief, control, duration_s, parameters, use, memory.filter):
+        if not predict_filter(run, belief, control, duration_s, parameters, sample_index, memory.filter):
             return False
         if not retrace(rest, covariance, memory.filter, turned, memory.factor):
             return False
-        lengthen(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
+        compose(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
         belief.predictions[run] += 1
         find_slope(mean, covariance, belief.slope[run])
         for row in range(len(mean)):
@@ -142,16 +142,16 @@ def _with_memory(update: Function) -> Function:
         data: Floats,
         parameters: Any,
         gate: Floats,
-        use: int,
+        sample_index: int,
         memory: ForwardMemory,
-        note: Note,
+        record: InnovationRecord,
     ) -> int:
-        return update(run, belief, data, parameters, gate, use, memory.filter, note)
+        return update(run, belief, data, parameters, gate, sample_index, memory.filter, record)
 
     return update_filter
 
 
-def lengthen(
+def compose(
     gain: Floats, rest: Floats, predictions: int, next_gain: Floats, next_rest: Floats, product: Floats
 ) -> None:
     """Make one step of the steps so far and the next, which it uses up: G G1, and A + G A1 G'."""
@@ -162,7 +162,7 @@ def lengthen(
                 gain[row, column] = next_gain[row, column]
                 rest[row, column] = next_rest[row, column]
         return
-    moved_covariance(next_rest, gain, product)
+    propagate_covariance(next_rest, gain, product)
     multiply(gain, next_gain, product)
     for row in range(t):
         for column in range(t):
@@ -195,12 +195,14 @@ class BackMemory(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def going_back(kinds: Kinds, correct: Correction | None = None) -> Function:
-    """The same over all runs, compiled; see `way_back`."""
-    return compile_over_runs(way_back(kinds, correct), allocates=False, title="a smoother's way back")
+def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> Function:
+    """The same over all runs, compiled; see `backward_pass`."""
+    return compile_over_runs(
+        backward_pass(kinds, correct), allocates=False, title="a smoother's way back"
+    )
 
 
-def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:
+def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
     """The loop over the nodes of one run, from its last to its first."""
     move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)
@@ -216,7 +218,7 @@ def way_back(kinds: Kinds, correct: Correction | None = None) -> Function:
             for k in range(t):
                 entry += gain[row, k] * change[k]
             step[row] = entry
-        moved_covariance(work.covariance, gain, work.product)
+        propagate_covariance(work.covariance, gain, work.product)
         for row in range(t):
             for column in range(t):
                 work.covariance[row, column] += rest[row, column]

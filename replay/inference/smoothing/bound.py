@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao bound: what the measurements say of the state along its true course.
+"""Computes the posterior Cramer-Rao bound: the information of the measurements along the true states.
 
 At every node, a stamp that has an estimate, stands what the extended Kalman filter would have that
 linearises at the truth, of the filter (`bound`) or of the smoother (`bound:smoother`): the covariance
@@ -25,31 +25,10 @@ from replay.engine.streams.results import named
 from replay.engine.vectors.components import match_components
 from replay.engine.vectors.tangent import truth_at
 from replay.inference.kalman.methods import FILTERS, Method, MethodParameters
-from replay.inference.kalman.predict import motion_derivative, motion_noise
-from replay.inference.kalman.steps import (
-    NO_TRUTH,
-    NOT_POSITIVE_DEFINITE,
-    NOTHING_MEASURED,
-    Note,
-    Steps,
-    Workspace,
-    workspace,
-)
-from replay.inference.kalman.update import linear_sensor, sensor_noise
-from replay.inference.linear_algebra.gaussian import (
-    cholesky,
-    kalman_step,
-    keep_measured,
-    moved_covariance,
-    multiply_into,
-    reduce_covariance,
-    solve_semidefinite,
-    whiten,
-)
-from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Carried, Estimates, Happenings, Innovations
+from replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
+from replay.inference.run.filtering import Filter, FilterState
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
+from replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_steps
 
 
 class BoundParameters(MethodParameters):
@@ -57,154 +36,6 @@ class BoundParameters(MethodParameters):
 
     of: Literal["filter", "smoother"] = "filter"
     gap_limit_s: PositiveFloat = 0.2
-
-
-class Along(NamedTuple):
-    """What is carried along the true trajectories; first axis = run.
-
-    Attributes:
-        mean: (runs, n) the true state.
-        covariance: (runs, t, t) what a filter that linearises there has.
-        transition, noise: (runs, t, t) since the last node.
-        information: (runs, t, t) of what was measured since then: the sum of H' R^-1 H.
-    """
-
-    mean: Floats
-    covariance: Floats
-    transition: Floats
-    noise: Floats
-    information: Floats
-
-
-class Nodes(NamedTuple):
-    """Estimates as the recursion fills them in, with the step to each; see `Along`."""
-
-    end: Integers
-    time_ns: Integers
-    mean: Floats
-    covariance: Floats
-    transition: Floats
-    noise: Floats
-    information: Floats
-
-
-class BoundMemory(NamedTuple):
-    """What one core works in: the true states at all events (events, n), and noise (m, m) by sensor."""
-
-    truth: Floats
-    noise: tuple[Floats, ...]
-    work: Workspace
-
-
-def bound_steps(stage: Stage) -> Steps:
-    """The steps of an extended Kalman filter that knows where it is."""
-    model, motion = stage.model, stage.motion
-    n, t = model.size, model.tangent
-    read_state, read_control = tuple_of(n), tuple_of(model.controls)
-    linearise = motion_derivative(model, motion, by_state=True)
-    add_noise = motion_noise(model, motion)
-
-    def predict(
-        run: int,
-        along: Along,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        event: int,
-        memory: BoundMemory,
-    ) -> bool:
-        mean, work = along.mean[run], memory.work
-        state = read_state(mean)
-        linearise(state, read_control(control), duration_s, parameters, work)
-        multiply_into(work.transition, along.transition[run], work.product)
-        moved_covariance(along.noise[run], work.transition, work.product)
-        add_noise(state, along.noise[run], duration_s, parameters, work)
-        moved_covariance(along.covariance[run], work.transition, work.product)
-        add_noise(state, along.covariance[run], duration_s, parameters, work)
-        for i in range(n):
-            mean[i] = memory.truth[event, i]
-        return True
-
-    def estimate(run: int, along: Along, nodes: Nodes, row: int, _: Any) -> None:
-        for i in range(n):
-            nodes.mean[row, i] = along.mean[run, i]
-        for i in range(t):
-            for j in range(t):
-                nodes.covariance[row, i, j] = along.covariance[run, i, j]
-                nodes.transition[row, i, j] = along.transition[run, i, j]
-                nodes.noise[row, i, j] = along.noise[run, i, j]
-                nodes.information[row, i, j] = along.information[run, i, j]
-                along.transition[run, i, j] = 1.0 if i == j else 0.0
-                along.noise[run, i, j] = along.information[run, i, j] = 0.0
-
-    def memory(sets: tuple[Any, ...]) -> BoundMemory:
-        sizes = [len(sensor.measured) for sensor in stage.sensors] or [0]
-        return BoundMemory(sets[0], tuple(np.empty((m, m)) for m in sizes), workspace(stage))
-
-    updates = tuple(_update(stage, number) for number in range(len(stage.sensors)))
-    return Steps(memory, predict, updates, estimate)
-
-
-def _update(stage: Stage, number: int) -> Function:
-    """The update by sensor `number` as if it had measured what is predicted: nothing moves."""
-    innovate, add_noise = linear_sensor(stage, number), sensor_noise(stage.sensors[number])
-    m = len(stage.sensors[number].measured)
-
-    def update(
-        run: int,
-        along: Along,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        event: int,
-        memory: BoundMemory,
-        note: Note,
-    ) -> int:
-        mean, covariance, work = along.mean[run], along.covariance[run], memory.work
-        if np.isnan(mean[0]):
-            return NO_TRUTH
-        innovate(mean, covariance, data, parameters, event, work)
-        innovation, noise = work.innovations[number], memory.noise[number]
-        for i in range(m):
-            for j in range(m):
-                noise[i, j] = 0.0
-        add_noise(noise, data, parameters, work)
-        size = 0
-        for i in range(m):
-            if not np.isnan(innovation.difference[i]):
-                for k in range(len(covariance)):
-                    work.rows[size, k] = work.rows[i, k]
-                for j in range(m):
-                    noise[size, j] = noise[i, j]
-                for j in range(m):
-                    noise[j, size] = noise[j, i]
-                size += 1
-        add_information(along.information[run], work.rows, noise, size)
-        keep_measured(innovation)
-        for i in range(size):
-            innovation.difference[i] = 0.0
-        if np.isnan(whiten(innovation, size)[0]):
-            return NOT_POSITIVE_DEFINITE
-        kalman_step(innovation, size, work.step)
-        reduce_covariance(covariance, innovation.cross_covariance, size)
-        return NOTHING_MEASURED  # there is no innovation to tell of
-
-    return update
-
-
-def add_information(information: Floats, rows: Floats, noise: Floats, size: int) -> None:
-    """Add H' R^-1 H of the first rows; R becomes its factor. NaN where R is not positive definite."""
-    t = len(information)
-    if not cholesky(noise, noise, size):
-        information[0, 0] = np.nan
-    for i in range(size):
-        for k in range(t):
-            for j in range(i):
-                rows[i, k] -= noise[i, j] * rows[j, k]
-            rows[i, k] /= noise[i, i]
-        for row in range(t):
-            for column in range(t):
-                information[row, column] += rows[i, row] * rows[i, column]
 
 
 class BackMemory(NamedTuple):
@@ -222,7 +53,8 @@ def back_memory(t: int) -> BackMemory:
 
 
 @lru_cache(maxsize=1)
-def _smoothing() -> Function:
+def smooth_over_runs() -> Function:
+    """Compile `smooth` over all runs."""
     return compile_over_runs(smooth, allocates=False, title="the bound of smoothers")
 
 
@@ -244,7 +76,7 @@ def smooth(
         for row in range(len(here)):
             for column in range(len(here)):
                 predicted[row, column] = here[row, column]
-        moved_covariance(predicted, step, turned)  # which becomes F P
+        propagate_covariance(predicted, step, turned)  # which becomes F P
         for row in range(len(here)):
             for column in range(len(here)):
                 predicted[row, column] += noise[node + 1, row, column]
@@ -255,13 +87,13 @@ def smooth(
             for column in range(len(here)):
                 factor[row, column] = turned[column, row]
                 predicted[row, column] = later[row, column] - predicted[row, column]
-        moved_covariance(predicted, factor, product)
+        propagate_covariance(predicted, factor, product)
         for row in range(len(here)):
             for column in range(len(here)):
                 here[row, column] += predicted[row, column]
 
 
-class Kept(NamedTuple):
+class BoundHistory(NamedTuple):
     """What is kept: the truths of all runs, which came to a node (runs,), and nodes to smooth."""
 
     truth: Ragged
@@ -272,30 +104,30 @@ class Kept(NamedTuple):
 class BoundFilter(Filter):
     """A filter that knows the truth, and tells of every step of it."""
 
-    def whole(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
+    def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
         """The topics of a log that it starts from; raises BadInput where it has no truth."""
         if self.truth not in topics:
             raise BadInput(
                 f"estimator {self.name}: a bound needs the true states, and there is no topic "
                 f"{self.truth}; give a log with a truth, such as a simulated one"
             )
-        return (*super().whole(topics), self.truth)
+        return (*super().static(topics), self.truth)
 
     @property
-    def cannot_rewind(self) -> str:
-        """See `Filter.cannot_rewind`."""
+    def why_in_sequence(self) -> str:
+        """See `Filter.why_in_sequence`."""
         return "a bound is that of all messages in the order of their stamps"
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+        state = super().start(static)
         _, covariance = state.carried.belief
         runs, t, _ = covariance.shape
-        kept = Kept(whole[self.truth], np.zeros(runs, bool))
+        kept = BoundHistory(static[self.truth], np.zeros(runs, bool))
         mean = self.truths(kept.truth, state.carried.time_ns, np.arange(runs + 1))
         unit, none = np.tile(np.eye(t), (runs, 1, 1)), np.zeros((2, runs, t, t))
-        along = Along(mean, covariance, unit, *none)
-        return state._replace(carried=state.carried._replace(belief=along), kept=kept)
+        trajectory = TrueTrajectory(mean, covariance, unit, *none)
+        return state._replace(carried=state.carried._replace(belief=trajectory), kept=kept)
 
     def truths(self, truth: Ragged, time_ns: Integers, offsets: Integers) -> Floats:
         """The true states (n, components) at stamps of the runs; NaN where there is none."""
@@ -311,28 +143,30 @@ class BoundFilter(Filter):
         return found
 
     def filtered(
-        self, state: State, happenings: Happenings
-    ) -> tuple[State, tuple[Any, Integers], list[Ragged]]:
+        self, state: FilterState, events: FilterEvents
+    ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
         """Go through events, with the truths at all of them."""
-        truths = self.truths(state.kept.truth, happenings.time_ns, happenings.offsets)
-        after, nodes, made = super().filtered(state._replace(generators=(truths,)), happenings)
+        truths = self.truths(state.kept.truth, events.time_ns, events.offsets)
+        after, nodes, made = super().filtered(state._replace(generators=(truths,)), events)
         failures = [each for each in made if each.stream.schema is schemas.FAILURE]
         return after._replace(generators=()), nodes, failures
 
-    def sets(self, generators: tuple[Any, ...], happenings: Happenings) -> Any:
+    def sets(self, generators: tuple[Any, ...], events: FilterEvents) -> Any:
         """All runs, and the truths."""
-        yield slice(0, len(happenings.offsets) - 1), generators
+        yield slice(0, len(events.offsets) - 1), generators
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Nodes and innovations to be filled in."""
-        estimates, innovations = super().no_results(due, noted, slots)
+        estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Go through events; smoothed covariances have to wait for the end."""
         before, kept = state.carried, state.kept
-        after, (nodes, offsets), made = self.filtered(state, happenings)
+        after, (nodes, offsets), made = self.filtered(state, events)
         kept, first = self.begun(before, kept, nodes, offsets)
         made += [first, self.steps_told(nodes, offsets)]
         if self.parameters.of == "smoother":
@@ -341,7 +175,7 @@ class BoundFilter(Filter):
             made.append(self.states(Estimates(*nodes[:4]), offsets))
         return after._replace(kept=kept), made
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for a control that does not come any more, and what is smoothed."""
         state, made = self.ended(state)
         if self.parameters.of == "smoother" and state.kept.nodes:
@@ -358,7 +192,7 @@ class BoundFilter(Filter):
         ]
         times, mean, covariance, transition, noise = map(np.concatenate, zip(*parts, strict=True))
         offsets = np.sum([rows for _, rows in pieces], axis=0)
-        _smoothing()(runs, offsets, transition, noise, covariance, scratch=partial(back_memory, t))
+        smooth_over_runs()(runs, offsets, transition, noise, covariance, scratch=partial(back_memory, t))
         return self.states(Estimates(offsets[1:], times, mean, covariance), offsets)
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
@@ -367,7 +201,9 @@ class BoundFilter(Filter):
         metadata = {**found.stream.metadata, "bound": self.parameters.of}
         return Ragged(replace(found.stream, metadata=metadata), found.offsets)
 
-    def begun(self, before: Carried, kept: Kept, nodes: Nodes, offsets: Integers) -> tuple[Kept, Ragged]:
+    def begun(
+        self, before: RecursionState, kept: BoundHistory, nodes: Nodes, offsets: Integers
+    ) -> tuple[BoundHistory, Ragged]:
         """The steps to the priors of runs that come to their first node: from nothing.
 
         The noise of such a step is the prior's covariance. Where the first node has the prior's stamp,
@@ -378,11 +214,11 @@ class BoundFilter(Filter):
         is_there[is_new] = nodes.time_ns[first[is_new]] == before.time_ns[is_new]
         nodes.transition[first[is_there]] = 0.0
         nodes.noise[first[is_there]] = before.belief.covariance[is_there]
-        told = is_new & ~is_there
-        noise, mean = before.belief.covariance[told], before.belief.mean[told]
+        output_streams = is_new & ~is_there
+        noise, mean = before.belief.covariance[output_streams], before.belief.mean[output_streams]
         none = np.zeros_like(noise)
-        rows = np.append(0, np.cumsum(told))
-        steps = Nodes(rows[1:], before.time_ns[told], mean, noise, none, noise, none)
+        rows = np.append(0, np.cumsum(output_streams))
+        steps = Nodes(rows[1:], before.time_ns[output_streams], mean, noise, none, noise, none)
         return kept._replace(has_begun=kept.has_begun | is_new), self.steps_told(steps, rows)
 
     def steps_told(self, nodes: Nodes, offsets: Integers) -> Ragged:

@@ -1,4 +1,4 @@
-"""The way back a fixed lag behind a filter, without going over the whole lag for every estimate.
+"""Smooths at a fixed lag behind a filter, in constant work per node whatever the lag.
 
 The lag is a window of steps that slides: as they compose, whatever brackets are put, a queue made of two
 stacks has the composition of all its steps at hand, at two compositions a node however many nodes the
@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.linear_algebra.gaussian import copy_gaussian, moved_covariance
-from replay.inference.linear_algebra.manifold import differencing, retraction
+from replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
+from replay.inference.linear_algebra.manifold import boxminus, boxplus
 from replay.inference.run.recursion import Estimates
-from replay.inference.smoothing.backward_pass import BackMemory, Nodes, lengthen
+from replay.inference.smoothing.backward_pass import BackMemory, Nodes, compose
 
 
 class Window(NamedTuple):
@@ -40,7 +40,7 @@ def sliding_over_runs(kinds: tuple[str, ...]) -> Function:
 
 def sliding(kinds: tuple[str, ...]) -> Function:
     """The loop over the nodes of one run in flat space, from its first to its last, a lag behind."""
-    add, subtract = retraction(kinds), differencing(kinds)
+    add, subtract = boxplus(kinds), boxminus(kinds)
 
     def take_in(
         row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
@@ -67,7 +67,7 @@ def sliding(kinds: tuple[str, ...]) -> Function:
             step[row] = shift[row]
             for k in range(len(step)):
                 step[row] += gain[row, k] * deviation[k]
-        moved_covariance(work.covariance, gain, work.product)
+        propagate_covariance(work.covariance, gain, work.product)
         for row in range(len(step)):
             deviation[row] = step[row]
             for column in range(len(step)):
@@ -128,4 +128,4 @@ def extend(
         for column in range(len(shift)):
             shift[row] += gain[row, column] * next_shift[column]
             work.rest[row, column] = next_rest[row, column]
-    lengthen(gain, rest, 1, next_gain, work.rest, work.product)
+    compose(gain, rest, 1, next_gain, work.rest, work.product)

@@ -1,4 +1,4 @@
-"""Gauss-Newton on all states of a run, damped where a step would raise the cost.
+"""Minimises the cost of all states of a run by damped Gauss-Newton steps.
 
 What is minimised, over the state at the prior's time and at every stamp after it, is
 
@@ -21,13 +21,25 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.results import ALL_WELL
 from replay.inference.kalman.steps import Gaussian, Steps
-from replay.inference.linear_algebra.manifold import is_flat, resetting, retraction
+from replay.inference.linear_algebra.manifold import boxplus, by_right_jacobian, is_flat
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.recursion import Carried, Estimates, Happenings, Innovations, recursion
+from replay.inference.run.recursion import (
+    Estimates,
+    FilterEvents,
+    Innovations,
+    RecursionState,
+    recursion,
+)
 from replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
-from replay.inference.smoothing.backward_pass import FOREVER_NS, ForwardMemory, Later, Nodes, way_back
+from replay.inference.smoothing.backward_pass import (
+    FOREVER_NS,
+    ForwardMemory,
+    Later,
+    Nodes,
+    backward_pass,
+)
 
 SETTLED = 1e-10  # the largest last step, in standard deviations; and what of a state is round-off
 ROUNDING = 1e-15
@@ -56,7 +68,7 @@ class Ended(NamedTuple):
 
     passes: Integers
     converged: Integers
-    told: Floats
+    output_streams: Floats
 
 
 @lru_cache(maxsize=64)
@@ -71,17 +83,17 @@ def searching(stage: Stage) -> tuple[Function, Steps]:
 def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     """The search of one run's trajectory, for `replay.engine.compiling.compile.compile_over_runs`."""
     kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
-    follow, go_back = recursion(stage, steps, settings_of), way_back(("linear",) * t)
-    add, reach, turn = retraction(kinds), reaching(kinds), resetting(kinds)
+    follow, go_back = recursion(stage, steps, settings_of), backward_pass(("linear",) * t)
+    add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)
     flat, hold = is_flat(kinds), damped
 
     def go_forward(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         plan: Plan,
-        carried: Carried,
+        carried: RecursionState,
         nodes: Nodes,
         offsets: Integers,
         innovations: Innovations,
@@ -108,7 +120,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             carried.control[run, row] = plan.initial[row]
         carried.time_ns[run], carried.failure[run] = plan.start_ns[run], ALL_WELL
         nodes.end[run] = begin
-        follow(run, happenings, settings, gates, carried, nodes, innovations, memory)
+        follow(run, events, settings, gates, carried, nodes, innovations, memory)
         whole = carried.failure[run] == ALL_WELL and nodes.end[run] == offsets[run + 1]
         return whole and np.isfinite(trajectory.cost[0] + trajectory.held[0])
 
@@ -137,11 +149,11 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
     def search_run(
         run: int,
-        happenings: Happenings,
+        events: FilterEvents,
         settings: Floats,
         gates: Floats,
         plan: Plan,
-        carried: Carried,
+        carried: RecursionState,
         nodes: Nodes,
         offsets: Integers,
         innovations: Innovations,
@@ -161,7 +173,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         while begin < end:
             trajectory.damping[0] = damping
             well = go_forward(
-                run, happenings, settings, gates, plan, carried, nodes, offsets, innovations, memory
+                run, events, settings, gates, plan, carried, nodes, offsets, innovations, memory
             )
             held, passes = trajectory.held[0], ended.passes[run]
             slack, poor = COST_ROUNDING * max(1.0, best), False
@@ -182,8 +194,8 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 if last:
                     return
                 largest, squares, settled = move(trajectory, kept, smoothed.mean, begin, end)
-                told = ended.told[run, passes]
-                told[0], told[1], told[2] = best, damping, largest
+                output_streams = ended.output_streams[run, passes]
+                output_streams[0], output_streams[1], output_streams[2] = best, damping, largest
                 ended.passes[run] += 1
                 if settled and damping == 0.0:
                     ended.converged[run] = 1

@@ -1,4 +1,4 @@
-"""The iterated smoother: the states of a whole run that are most probable, given all measurements.
+"""Finds the most probable states of a whole run, given all measurements: the iterated smoother.
 
 It keeps the events of a run, smooths them once as the extended smoother does, and from there searches
 the trajectory of the least cost; see `replay.inference.smoothing.gauss_newton`.
@@ -20,9 +20,10 @@ from replay.engine.streams.blocks import Ragged, copied, ragged_rows
 from replay.inference.kalman.methods import FILTERS, Method
 from replay.inference.kalman.steps import Gaussian, Steps
 from replay.inference.model.stage import Stage
-from replay.inference.run.events import data_columns, joined, last_of_stamps, of_rows, times_alone
-from replay.inference.run.filtering import State
-from replay.inference.run.recursion import NOTHING, Estimates, Happenings, no_results
+from replay.inference.run.events import data_columns
+from replay.inference.run.filtering import FilterState
+from replay.inference.run.recursion import NOTHING, Estimates, FilterEvents, no_results
+from replay.inference.run.timing import join_events, last_of_stamps, output_times, select_events
 from replay.inference.smoothing import smoothers
 from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
 from replay.inference.smoothing.backward_pass import (
@@ -60,7 +61,7 @@ class Way(NamedTuple):
     """Runs from their priors to their ends, as the extended smoother has them.
 
     Attributes:
-        happenings: the events up to the last node, without those that a gate kept out.
+        events: the events up to the last node, without those that a gate kept out.
         node: (events,) of every event the node of its stamp.
         nodes, offsets: the stamps, as the filter went through them; run r owns those from offsets[r] on.
         states: the smoothed states there.
@@ -68,7 +69,7 @@ class Way(NamedTuple):
         made: the other outputs of the filter.
     """
 
-    happenings: Happenings
+    events: FilterEvents
     node: Integers
     nodes: Nodes
     offsets: Integers
@@ -85,11 +86,11 @@ class IteratedSmoother(Smoother):
         """The whole run."""
         return FOREVER_NS
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Keep the events."""
-        return state._replace(kept=(*state.kept, happenings)), []
+        return state._replace(kept=(*state.kept, events)), []
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """The best trajectory, and how the search for it ended."""
         state, _ = self.ended(state)
         if not state.kept:
@@ -107,29 +108,29 @@ class IteratedSmoother(Smoother):
         states = self.states(found, ragged_rows(rows, offsets))
         return [states, *way.made, *self._told(ended, way)]
 
-    def smoothed_once(self, state: State) -> "Way":
+    def smoothed_once(self, state: FilterState) -> "Way":
         """The extended smoother's states at all stamps, from the prior's on."""
-        happenings = reduce(joined, (*self._first(state), *state.kept))
-        run = np.repeat(np.arange(len(state.tick)), np.diff(happenings.offsets))
-        asked, start_ns = happenings.is_due, state.carried.time_ns
-        happenings = happenings._replace(
-            is_due=last_of_stamps(happenings) & (happenings.time_ns >= start_ns[run])
+        events = reduce(join_events, (*self._first(state), *state.kept))
+        run = np.repeat(np.arange(len(state.next_output)), np.diff(events.offsets))
+        asked, start_ns = events.wants_estimate, state.carried.time_ns
+        events = events._replace(
+            wants_estimate=last_of_stamps(events) & (events.time_ns >= start_ns[run])
         )
-        _, (nodes, offsets), made = self.filtered(state, happenings)
-        stamp = np.cumsum(happenings.is_due) - happenings.is_due
-        stamp -= np.append(stamp, 0)[happenings.offsets[run]]  # counted in each run
+        _, (nodes, offsets), made = self.filtered(state, events)
+        stamp = np.cumsum(events.wants_estimate) - events.wants_estimate
+        stamp -= np.append(stamp, 0)[events.offsets[run]]  # counted in each run
         known = stamp < np.diff(offsets)[run]  # a run that failed has no more
         node = offsets[run] + stamp
         wanted = np.zeros(offsets[-1], bool)
         wanted[node[asked & known]] = True
         states, _ = self.gone_back([Piece(nodes, offsets)])
-        used = of_rows(self._accepted(happenings, start_ns, made), known)
+        used = select_events(self._accepted(events, start_ns, made), known)
         return Way(used, node[known], nodes, offsets, states, wanted, made)
 
-    def _moved(self, state: State, way: "Way") -> Floats:
+    def _moved(self, state: FilterState, way: "Way") -> Floats:
         """The prior's means, moved along all of every run as if nothing was measured."""
-        unseen = np.where(way.happenings.source >= 0, NOTHING, way.happenings.source)
-        _, (moved, reached), _ = self.filtered(state, way.happenings._replace(source=unseen))
+        unseen = np.where(way.events.source >= 0, NOTHING, way.events.source)
+        _, (moved, reached), _ = self.filtered(state, way.events._replace(source=unseen))
         if not np.array_equal(reached, way.offsets):
             raise BadInput(
                 f"estimator {self.name}: start = motion: the prior cannot be moved along all of a run; "
@@ -137,37 +138,37 @@ class IteratedSmoother(Smoother):
             )
         return moved.mean
 
-    def _first(self, state: State) -> list[Happenings]:
+    def _first(self, state: FilterState) -> list[FilterEvents]:
         """The prior's time as an event; an interpolated control has made one already."""
         control = self.stage.model.control
         if control is not None and control.interpolated:
             return []
-        runs, (width, _) = np.arange(len(state.tick) + 1), data_columns(self.stage)
-        return [times_alone(runs, state.carried.time_ns.copy(), width, is_due=False)]
+        runs, (width, _) = np.arange(len(state.next_output) + 1), data_columns(self.stage)
+        return [output_times(runs, state.carried.time_ns.copy(), width, wants_estimate=False)]
 
     def _accepted(
-        self, happenings: Happenings, start_ns: Integers, made: Sequence[Ragged]
-    ) -> Happenings:
+        self, events: FilterEvents, start_ns: Integers, made: Sequence[Ragged]
+    ) -> FilterEvents:
         """Events without the measurements that the gate kept out on the way forward."""
         if self.parameters.gate_probability == 1.0:
-            return happenings
-        source = happenings.source.copy()
-        told = np.zeros(len(source), bool)
+            return events
+        source = events.source.copy()
+        output_streams = np.zeros(len(source), bool)
         for number, sensor in enumerate(self.stage.sensors):
-            measured = happenings.data[:, : len(sensor.measured)]
-            told |= (source == number) & np.isfinite(measured).any(axis=1)
+            measured = events.data[:, : len(sensor.measured)]
+            output_streams |= (source == number) & np.isfinite(measured).any(axis=1)
         [innovations] = [each for each in made if each.stream.topic.endswith("/innovation")]
-        for run, (begin, end) in enumerate(pairwise(happenings.offsets)):
+        for run, (begin, end) in enumerate(pairwise(events.offsets)):
             accepted = innovations.of_run(run)["accepted"]
-            told[begin:end] &= happenings.time_ns[begin:end] >= start_ns[run]
-            events = begin + np.flatnonzero(told[begin:end])[: len(accepted)]
-            source[events[accepted == 0]] = NOTHING
-        return happenings._replace(source=source)
+            output_streams[begin:end] &= events.time_ns[begin:end] >= start_ns[run]
+            rows = begin + np.flatnonzero(output_streams[begin:end])[: len(accepted)]
+            source[rows[accepted == 0]] = NOTHING
+        return events._replace(source=source)
 
-    def _search(self, state: State, way: Way, scale: Floats) -> Ended:
+    def _search(self, state: FilterState, way: Way, scale: Floats) -> Ended:
         """Search the trajectories of all runs from the way's states, which they replace."""
         stage, asked = self.stage, self.parameters
-        happenings, nodes, offsets, kept = way.happenings, way.nodes, way.offsets, way.states
+        events, nodes, offsets, kept = way.events, way.nodes, way.offsets, way.states
         loop, steps = searching(stage)
         t, runs, count = stage.model.tangent, len(offsets) - 1, len(kept.mean)
         _, innovations = no_results(np.zeros(1, int), np.arange(runs + 1), stage.model, 0)
@@ -212,7 +213,7 @@ class IteratedSmoother(Smoother):
         settings = np.repeat(self.settings[None], runs, axis=0)
         gates = np.full_like(self.gates, np.inf)
         loop(
-            runs, happenings, settings, gates, plan, carried, vectors, offsets, innovations, later,
+            runs, events, settings, gates, plan, carried, vectors, offsets, innovations, later,
             kept.mean, smoothed, ended, scratch=scratch,
         )  # fmt: skip
         return ended
@@ -222,7 +223,7 @@ class IteratedSmoother(Smoother):
         asked, some = self.parameters, np.diff(way.offsets) > 0
         last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
         passes, one = ended.passes, np.arange(len(some))
-        cost = ended.told[one, np.maximum(passes - 1, 0), 0]
+        cost = ended.output_streams[one, np.maximum(passes - 1, 0), 0]
         t = self.stage.model.tangent
         stated = {"start": asked.start, "damping": f"{asked.damping:g}", "loss": asked.loss}
         stated |= {} if asked.loss == "square" else {"loss_scale": f"{asked.loss_scale:g}"}
@@ -244,7 +245,7 @@ class IteratedSmoother(Smoother):
             last_ns[run],
             metadata=stated,
             iteration=number,
-            **dict(zip(("cost", "damping", "largest_step"), ended.told[made].T, strict=True)),
+            **dict(zip(("cost", "damping", "largest_step"), ended.output_streams[made].T, strict=True)),
         )
         return [
             Ragged(solution, np.append(0, np.cumsum(some))),

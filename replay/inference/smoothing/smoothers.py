@@ -1,4 +1,4 @@
-"""Smoothers: filters that keep their nodes, and at the end, or a lag behind, go back over them.
+"""Runs smoothers: filters that keep their nodes and pass back over them, at the end or at a lag.
 
 The steps that a filter leaves, and the way back over them, are in
 `replay.inference.smoothing.backward_pass`; how a fixed lag slides over them is in
@@ -32,14 +32,14 @@ from replay.inference.kalman.steps import Steps
 from replay.inference.linear_algebra.manifold import is_flat
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
-from replay.inference.run.filtering import Filter, State
-from replay.inference.run.recursion import Estimates, Happenings, Innovations
+from replay.inference.run.filtering import Filter, FilterState
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
     Nodes,
     back_memory,
-    going_back,
+    backward_pass_over_runs,
     no_later,
     smoothing_steps,
 )
@@ -131,30 +131,32 @@ class Smoother(Filter):
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
-    def cannot_rewind(self) -> str:
+    def why_in_sequence(self) -> str:
         """A smoother has its estimates from what came later in any case."""
         return "a smoother uses later messages in any case; replay it in the order of the stamps"
 
-    def start(self, whole: Mapping[str, Ragged]) -> State:
+    def start(self, static: Mapping[str, Ragged]) -> FilterState:
         """The state at every run's prior, see `Filter.start`."""
-        state = super().start(whole)
+        state = super().start(static)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         slope, none = np.zeros(covariance.shape[:2]), np.zeros(len(mean), np.int64)
         chain = Chain(mean, covariance, mean.copy(), slope, gain, rest, none)
         return state._replace(carried=state.carried._replace(belief=chain), kept=())
 
-    def no_results(self, due: Integers, noted: Integers, slots: int) -> tuple[Any, Innovations]:
+    def no_results(
+        self, due: Integers, recorded: Integers, innovation_size: int
+    ) -> tuple[Any, Innovations]:
         """Nodes and innovations to be filled in."""
-        estimates, innovations = super().no_results(due, noted, slots)
+        estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
         predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
         gain, rest = (np.empty_like(covariance) for _ in range(2))
         return Nodes(end, times, mean, covariance, predicted, slope, gain, rest), innovations
 
-    def follow(self, state: State, happenings: Happenings) -> tuple[State, list[Ragged]]:
+    def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
         """Filter events, and smooth what the lag lets go."""
-        after, (nodes, offsets), made = self.filtered(state, happenings)
+        after, (nodes, offsets), made = self.filtered(state, events)
         new = Piece(nodes, offsets)
         if self.lag_ns == FOREVER_NS:  # nothing yet
             nothing = self.states(*self.gone_back([new], offsets[:-1]))
@@ -170,7 +172,7 @@ class Smoother(Filter):
         smoothed = self.states(*self.lagging(piece, window, stop))
         return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
-    def finish(self, state: State) -> list[Ragged]:
+    def finish(self, state: FilterState) -> list[Ragged]:
         """What waited for later messages, and what those say of all before them."""
         state, made = self.ended(state)
         if self.lag_ns == FOREVER_NS:
@@ -221,7 +223,7 @@ class Smoother(Filter):
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
             arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            going_back(model.kinds, model.correct)(runs, *arguments, scratch=memory)
+            backward_pass_over_runs(model.kinds, model.correct)(runs, *arguments, scratch=memory)
         return smoothed, offsets
 
 

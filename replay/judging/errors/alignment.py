@@ -20,7 +20,7 @@ from recorders.models.planar import wrap_angle
 from recorders.trajectories import Trajectory
 from replay.engine.streams.sources import LogSource
 from replay.engine.vectors.components import stated_components
-from replay.engine.vectors.tangent import tangent_components, things
+from replay.engine.vectors.tangent import manifold_blocks, tangent_components
 
 Floats = NDArray[np.float64]
 Align = Literal["none", "yaw", "se2", "se3", "sim3"]
@@ -134,7 +134,7 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
             "give --align se2"
         )
     quaternion = Rotation.from_matrix(alignment.rotation).as_quat(scalar_first=True)
-    for kind, columns_of in things(kinds):
+    for kind, columns_of in manifold_blocks(kinds):
         if kind == "quaternion":
             mean[:, columns_of] = compose(quaternion, mean[:, columns_of])
     size = len(tangent)

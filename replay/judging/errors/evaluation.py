@@ -29,8 +29,8 @@ from replay.engine.vectors.tangent import (
     WIDTHS,
     are_kinds,
     difference,
+    manifold_blocks,
     tangent_components,
-    things,
     truth_at,
 )
 from replay.judging.errors.truths import Truths
@@ -264,7 +264,7 @@ def unjudged(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
     )
     return tuple(
         name
-        for _, columns in things(list(components.values()))
+        for _, columns in manifold_blocks(list(components.values()))
         if not there.issuperset(names[columns])
         for name in names[columns]
     )

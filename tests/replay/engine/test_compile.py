@@ -23,7 +23,7 @@ from recorders.importers.ros.files import ros1_file
 from recorders.log import loops
 from replay.engine.compiling.cache import cache_folder, in_turn
 from replay.engine.compiling.compile import compile_over_runs, compiled
-from replay.engine.compiling.keeping import load
+from replay.engine.compiling.kernel_cache import load
 from replay.engine.compiling.kernels import native
 from replay.engine.compiling.kernels.native import Kernel
 from replay.engine.compiling.through_numba import loop_of
@@ -306,7 +306,7 @@ def test_a_class_that_is_gone_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):
     """A whole file that cannot be loaded all the same."""
     assert not by_numba()
     with monkeypatch.context() as broken:
-        broken.setattr("replay.engine.compiling.keeping.pickle.loads", lambda _: 1 / 0)
+        broken.setattr("replay.engine.compiling.kernel_cache.pickle.loads", lambda _: 1 / 0)
         assert not by_numba()
     assert by_numba()
 
@@ -362,7 +362,7 @@ def test_only_a_folder_of_this_user_alone_is_used(
 def test_every_kernel_of_replay_is_compiled_here():
     """A raw `njit(cache=True)` would not notice a change in another file."""
     users = {path.name: path for path in Path("replay").rglob("*.py") if "numba" in imports_of(path)}
-    assert users.keys() == {"bundling.py", "inlining.py", "keeping.py", "through_numba.py"}
+    assert users.keys() == {"inlining.py", "kernel_cache.py", "kernel_source.py", "through_numba.py"}
 
 
 @pytest.mark.parametrize(

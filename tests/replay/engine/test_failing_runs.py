@@ -22,7 +22,7 @@ from replay.engine.api.outputs import Estimates, Results
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.replaying.estimator import Batch, Estimator, Recursive
 from replay.engine.replaying.replaying import Report, collect, replay
-from replay.engine.replaying.supervision import find_unsound
+from replay.engine.replaying.soundness import find_unsound
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import Failure, failure_stream, sentences_of
 from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
@@ -75,7 +75,7 @@ def make_filter(*, compiled: bool = False) -> Estimator[Parameters]:
         "a filter that fails on command",
         parameters=Parameters,
         streams={"bearing": schemas.BEARING},
-        whole={"/landmarks": schemas.LANDMARK},
+        static={"/landmarks": schemas.LANDMARK},
         components={"a_m": "linear", "b_m": "linear"},
         start=start,
         follow=follow,
@@ -204,7 +204,7 @@ def test_a_batch_fails_alone_too(mode: int, reason: str, kept: int, time: int) -
         "all at once",
         parameters=Parameters,
         streams={"bearing": schemas.BEARING},
-        whole={},
+        static={},
         components={"a_m": "linear", "b_m": "linear"},
         solve=each_run(solve_backwards),
     )

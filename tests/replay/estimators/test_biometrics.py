@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 from sklearn.mixture import GaussianMixture
 
-from pipeline.runs.ensemble import replay_ensemble
 from pipeline.runs.experiment import load_experiment
+from pipeline.runs.recorded import replay_ensemble
 from pipeline.studies.biometrics.claims import PAPER_FUSED, REAL_COUNTS, SINGLE
 from recorders.errors import BadInput
 from recorders.recording import import_run, record_run

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import replay_ensemble
+from pipeline.runs.recorded import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing

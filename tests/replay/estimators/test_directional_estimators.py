@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import record_run
 from replay.engine.streams.sources import memory_source

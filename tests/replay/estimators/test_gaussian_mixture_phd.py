@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.ensemble import judge, replay_in_memory
+from pipeline.runs.recorded import judge, replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from replay.engine.replaying.estimator import bind

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import record_ensemble
+from pipeline.runs.recorded import record_ensemble
 from recorders.errors import BadInput
 from recorders.log import LogWriter, open_log
 from recorders.models.planar import range_bearing

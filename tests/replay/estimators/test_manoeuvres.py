@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from replay.engine.streams.sources import MemorySource
 from replay.estimators.models.vehicle_kalman import VEHICLE
 from replay.inference.model.checking import check_model

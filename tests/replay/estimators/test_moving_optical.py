@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fuselog import make_stream, schemas
-from pipeline.runs.ensemble import record_ensemble, replay_in_memory
+from pipeline.runs.recorded import record_ensemble, replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.models.optical import bias_components
@@ -39,10 +39,10 @@ def predicted(source: MemorySource, x: np.ndarray) -> np.ndarray:
     for number in range(3):
         stream = source.streams[f"/sensor{number + 1}/moving_line_of_sight"]
         since_s = (stream.publish_time_ns - source.epoch_ns) * 1e-9
-        about = (stream["target_id"], *stream["position_m"].T, *stream["quaternion"].T)
+        reference = (stream["target_id"], *stream["position_m"].T, *stream["quaternion"].T)
         yaw, pitch, roll, clock_s = x[12 + 4 * number :][:4]
         state = move(tuple(x[:12]), (), since_s, None)
-        found.append(np.stack(sight(state, about, (yaw, pitch, roll), clock_s), axis=1))
+        found.append(np.stack(sight(state, reference, (yaw, pitch, roll), clock_s), axis=1))
     return np.concatenate(found)
 
 

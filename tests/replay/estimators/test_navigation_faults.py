@@ -147,9 +147,9 @@ def test_wrong_units_and_axes_are_said_of_a_log_with_a_prior_too(scales: dict[st
     ]
     source = memory_source(Recording(streams), metadata)
     [filtered] = bound(INERTIAL, "ekf", [source])
-    assert filtered.opening is not None
-    first = {name: gather([source[name]]) for name in filtered.opening.topics}
-    told = filtered.opening.find(first, {}, "publish_time").told
+    assert filtered.initialization is not None
+    first = {name: gather([source[name]]) for name in filtered.initialization.topics}
+    told = filtered.initialization.find(first, {}, "publish_time").outputs
     said = [text for ragged in told for text in sentences_of(ragged.stream)]
     if words:
         assert len(said) == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from replay.estimators.networks.estimates import Estimate
 from replay.estimators.networks.nodes import agrees, divergence

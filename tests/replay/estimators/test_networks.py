@@ -6,7 +6,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.recording import record_run
 from replay.engine.replaying.estimator import bind

@@ -23,7 +23,7 @@ from replay.estimators.models.ranging import (
     see,
     see_by_tag,
 )
-from replay.inference.linear_algebra.gaussian import widening
+from replay.inference.linear_algebra.gaussian import inflation
 from replay.inference.model.augmentation import augmented
 from replay.inference.model.checking import check_model
 from replay.inference.model.point_errors import PointError
@@ -180,8 +180,8 @@ def test_an_innovation_of_nis_18_counts_with_a_larger_covariance(
 
 def test_the_largest_of_several_options_holds_and_none_makes_noise_smaller() -> None:
     given = SimpleNamespace(inflate_nis=9.0, student_freedom=3.0, switch_nis=np.nan)
-    assert widening(18.0, 1, given) == pytest.approx(21.0 / 4.0)
-    assert widening(0.0, 1, given) == 1.0
+    assert inflation(18.0, 1, given) == pytest.approx(21.0 / 4.0)
+    assert inflation(0.0, 1, given) == 1.0
 
 
 # --- the start -------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.ensemble import replay_in_memory
+from pipeline.runs.recorded import replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import SIMULATION_EPOCH_NS, Recording, import_run

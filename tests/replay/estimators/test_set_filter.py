@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import MemorySource
 from replay.judging.sets.filter_evaluation import judge_filter

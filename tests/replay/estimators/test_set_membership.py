@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.path import Path
 
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, open_log, schemas, write_log
 from recorders.recording import Recording, import_run

@@ -139,6 +139,6 @@ def test_a_band_that_the_rate_cannot_hold_is_named() -> None:
 
 def test_hearing_is_later_where_it_is_farther() -> None:
     parameters = SimpleNamespace(speed_of_sound_mps=SPEED)
-    about = (3.0, 4.0, 0.0, 0.0, 0.0, 1.0)
-    (later_s,) = SOUND_SOURCE.sensors[0].measure((0.0, 0.0, 0.0, 2e-3), about, parameters)
+    reference = (3.0, 4.0, 0.0, 0.0, 0.0, 1.0)
+    (later_s,) = SOUND_SOURCE.sensors[0].measure((0.0, 0.0, 0.0, 2e-3), reference, parameters)
     assert later_s == pytest.approx(4.0 / SPEED + 2e-3)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipeline.runs.ensemble import replay_in_memory
+from pipeline.runs.recorded import replay_in_memory
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata

@@ -8,7 +8,7 @@ import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 
-from pipeline.runs.ensemble import record_ensemble, replay_in_memory
+from pipeline.runs.recorded import record_ensemble, replay_in_memory
 from pipeline.studies.vehicles.cases import Scores, scores_of
 from recorders.errors import BadInput
 from recorders.log import Clock

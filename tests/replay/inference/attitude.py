@@ -11,7 +11,8 @@ from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate, rotate
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 STATE = {f"orientation_{part}": "quaternion" for part in "wxyz"} | {
@@ -66,11 +67,11 @@ def seen(state: Any, vector: Any) -> Any:
     )
 
 
-def feel(state: Any, about: Any, parameters: Any) -> Any:
+def feel(state: Any, reference: Any, parameters: Any) -> Any:
     return seen(state, (0.0, 0.0, 9.81))
 
 
-def point(state: Any, about: Any, parameters: Any) -> Any:
+def point(state: Any, reference: Any, parameters: Any) -> Any:
     return seen(state, (0.5, 0.0, -0.4))
 
 

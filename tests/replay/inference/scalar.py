@@ -10,7 +10,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 EPOCH_NS = 10**9
@@ -33,7 +34,7 @@ def move_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return (parameters.sigma_moved**2,)
 
 
-def measure(state: Any, about: Any, parameters: Any) -> Any:
+def measure(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[0],)
 
 
@@ -69,9 +70,10 @@ def simulate(seed: int) -> Floats:
     return np.array(found)
 
 
-def source(values: Sequence[float] | Floats) -> MemorySource:
-    """One value every second as a log in memory."""
+def source(values: Sequence[float] | Floats, first_later_ns: int = 0) -> MemorySource:
+    """One value every second as a log in memory; the first one later, which particles are seeded by."""
     stamps = EPOCH_NS + 10**9 * np.arange(1, len(values) + 1)
+    stamps[0] += first_later_ns
     prior = make_stream(
         "/prior",
         schemas.GAUSSIAN_ESTIMATE,

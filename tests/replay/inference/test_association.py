@@ -8,7 +8,8 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 from recorders.errors import BadInput
-from replay.inference.association.association import MOST_ENUMERATED, existence_after, marginals
+from replay.inference.association.association import existence_after, marginals
+from replay.inference.association.clusters import MOST_ENUMERATED
 
 PLACES = np.array([[0.0, 0.0], [4.0, 1.0], [9.0, -1.0]])
 COVARIANCES = np.array([[[1, 0], [0, 2]], [[2, 0.5], [0.5, 1]], [[1.5, 0], [0, 1.5]]]) + np.array(

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_equal
 from scipy.stats import chi2
 
 import fuselog as fl
-from pipeline.runs.ensemble import record_ensemble, replay_ensemble
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing
@@ -18,7 +18,8 @@ from replay.engine.streams.sources import MemorySource
 from replay.estimators.models.landmarks import RECKONING, ROBOT
 from replay.inference.model.augmentation import augmented
 from replay.inference.model.checking import check_model
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import (
@@ -45,13 +46,13 @@ class BiasedParameters(VehicleParameters):
     bias_range_m: float = BIAS
 
 
-def see(state: Any, about: Any, parameters: Any) -> Any:
-    distance, bearing = range_bearing((state[0], state[1], state[2]), about)
+def see(state: Any, reference: Any, parameters: Any) -> Any:
+    distance, bearing = range_bearing((state[0], state[1], state[2]), reference)
     return distance + parameters.bias_range_m, bearing
 
 
-def see_by_state(state: Any, about: Any, parameters: Any) -> Any:
-    distance, bearing = range_bearing((state[0], state[1], state[2]), about)
+def see_by_state(state: Any, reference: Any, parameters: Any) -> Any:
+    distance, bearing = range_bearing((state[0], state[1], state[2]), reference)
     return distance + state[5], bearing
 
 
@@ -69,7 +70,7 @@ DECLARED = replace(
     VEHICLE_A,
     parameters=BiasedParameters,
     sensors=(replace(RANGE_BEARING, measure=see), SPEED),
-    estimable={"bias_range_m": "linear"},
+    augmentable={"bias_range_m": "linear"},
 )
 WRITTEN = Model(
     "the same by hand",
@@ -111,9 +112,9 @@ def test_it_is_the_model_that_has_it_in_its_state(method: str) -> None:
 
 def test_augmented_models_keep_to_what_they_declare() -> None:
     """With noise of all kinds; what reads none of them stays linear."""
-    check_model(augmented(ROBOT, tuple(ROBOT.estimable)))
+    check_model(augmented(ROBOT, tuple(ROBOT.augmentable)))
     check_model(augmented(RECKONING, ("forward_scale",)))
-    wheel = replace(make_wheel(), estimable={"gate_probability": "linear"})
+    wheel = replace(make_wheel(), augmentable={"gate_probability": "linear"})
     check_model(same := augmented(wheel, ("gate_probability",)))
     assert [sensor.linear for sensor in same.sensors] == [each.linear for each in wheel.sensors]
     assert not augmented(ON_A_LINE, ("delay_s",)).sensors[0].linear
@@ -158,13 +159,13 @@ def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
 @pytest.mark.parametrize(
     ("estimable", "words"),
     [
-        (("delay_s",), "estimator test: estimable is a tuple; it is a mapping from parameter to kind"),
+        (("delay_s",), "estimator test: augmentable is a tuple; it is a mapping from parameter to kind"),
         ({"dellay_s": "linear"}, "'dellay_s' is no parameter of the model; did you mean 'delay_s'"),
         ({"delay_s": "metres"}, "delay_s is of kind 'metres'; known are linear and angle"),
     ],
 )
-def test_what_is_no_list_of_what_can_be_estimated_is_one_sentence(estimable: Any, words: str) -> None:
-    model = replace(ON_A_LINE, estimable=estimable)
+def test_what_is_no_list_of_what_can_be_estimated_is_one_sentence(augmentable: Any, words: str) -> None:
+    model = replace(ON_A_LINE, augmentable=augmentable)
     given: dict[str, Any] = {"estimate": ["delay_s"], "estimate_sigma": {"delay_s": 0.5}}
     with pytest.raises(BadInput, match=words):
         bound(model, "ekf", [MemorySource({}, RunMetadata("line", epoch_ns=0), "line")], **given)
@@ -219,11 +220,11 @@ class OffsetParameters(ModelParameters):
     delay_s: float = 0.0
 
 
-def fix(state: Any, about: Any, parameters: Any) -> Any:
+def fix(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[0] - parameters.delay_s * state[1],)
 
 
-def prompt_fix(state: Any, about: Any, parameters: Any) -> Any:
+def prompt_fix(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[0],)
 
 
@@ -254,7 +255,7 @@ ON_A_LINE = Model(
     OffsetParameters,
     (FIX, replace(FIX, topic="prompt", measure=prompt_fix)),
     Motion(walk, walk_noise, linear=True),
-    estimable={"delay_s": "linear"},
+    augmentable={"delay_s": "linear"},
 )
 
 

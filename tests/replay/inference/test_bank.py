@@ -13,8 +13,9 @@ from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import difference
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Control, Model, ModelParameters, Motion
-from replay.inference.modes.gaussian_sum import cut, widest
+from replay.inference.model.model import Control, Model, Motion
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.modes.gaussian_sum import split, widest
 from tests.replay.inference.replays import outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
@@ -105,7 +106,7 @@ def test_a_cut_prior_is_the_prior_in_parts():
     """Weights, means and covariances of the members give the moments of the whole."""
     root = np.array([[1.0, 0.0, 0.0], [0.3, 0.8, 0.0], [0.2, -0.1, 0.4]])
     mean, covariance = np.array([1.0, -2.0, 0.5]), root @ root.T
-    weights, means, narrow = cut(KINDS, mean, covariance, 45)
+    weights, means, narrow = split(KINDS, mean, covariance, 45)
     away = means - mean
     assert weights.sum() == pytest.approx(1.0)
     assert narrow[2, 2] == pytest.approx((np.pi / 45) ** 2)
@@ -126,10 +127,10 @@ def test_no_two_members_are_opposite_so_that_their_mean_does_not_hang_on_roundin
 
 def test_of_directions_as_wide_the_first_is_cut():
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    about = np.diag([4.0, 4.0, 1.0])
+    reference = np.diag([4.0, 4.0, 1.0])
     for covariance, expected in (
         (4.0 * turn @ turn.T, [1.0, 0.0, 0.0]),
-        (about[::-1, ::-1], [0.0, 1.0, 0.0]),
+        (reference[::-1, ::-1], [0.0, 1.0, 0.0]),
         (turn @ np.diag([1.0, 2.0, 3.0]) @ turn.T, turn[:, 2] * np.sign(turn[:, 2][0])),
     ):
         direction, _ = widest(["quaternion"] * 4, covariance)

@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from pipeline.runs.ensemble import Part, record_ensemble, replay_ensemble, replay_parts
-from pipeline.runs.summary import error_charts
+from pipeline.output.summary import error_charts
+from pipeline.runs.ensemble import Part, replay_parts
+from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing.bound import back_memory, smooth
 from replay.judging.consistency.bounds import Bounds, Output
 from tests.replay.inference import vehicle_a
@@ -52,7 +54,7 @@ def stiff_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return 0.0, 0.0, parameters.density * duration_s, parameters.density * duration_s
 
 
-def measure(state: Any, about: Any, parameters: Any) -> Any:
+def measure(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[1]
 
 

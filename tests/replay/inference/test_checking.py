@@ -59,7 +59,7 @@ def test_a_jacobian_by_hand_is_compared() -> None:
         check_model(replace(VEHICLE_A, motion=wrong))
 
 
-def rows_by_hand(state: Any, about: Any, parameters: Any, rows: Any) -> None:
+def rows_by_hand(state: Any, reference: Any, parameters: Any, rows: Any) -> None:
     rows[:] = 0.0
     rows[0, 4] = 1.0  # the turn rate, where the speed is
 
@@ -78,19 +78,19 @@ def growing(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
     return (*(1.001 * part for part in state[:4]), *state[4:])
 
 
-def by_math(state: Any, about: Any, parameters: Any) -> Any:
+def by_math(state: Any, reference: Any, parameters: Any) -> Any:
     return (math.sqrt(abs(state[3])),)
 
 
-def squared(state: Any, about: Any, parameters: Any) -> Any:
+def squared(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[3] * state[3],)
 
 
-def first_of_quaternion(state: Any, about: Any, parameters: Any) -> Any:
+def first_of_quaternion(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[1], state[2]
 
 
-def pair(state: Any, about: Any, parameters: Any) -> Any:
+def pair(state: Any, reference: Any, parameters: Any) -> Any:
     return state[3], state[3]
 
 
@@ -193,15 +193,15 @@ WRONG: dict[str, tuple[Model, str]] = {
         "stepped_twice .* does not find the step of moved_well",
     ),
     "estimable without kinds": (
-        replace(VEHICLE_A, estimable=("sigma_speed_mps",)),
-        "estimable is a tuple; it is a mapping from parameter to kind, such as",
+        replace(VEHICLE_A, augmentable=("sigma_speed_mps",)),
+        "augmentable is a tuple; it is a mapping from parameter to kind, such as",
     ),
     "an estimable that is no parameter": (
-        replace(VEHICLE_A, estimable={"sigma_sped_mps": "linear"}),
+        replace(VEHICLE_A, augmentable={"sigma_sped_mps": "linear"}),
         "'sigma_sped_mps' is no parameter of the model; did you mean 'sigma_speed_mps'",
     ),
     "an estimable orientation": (
-        replace(VEHICLE_A, estimable={"sigma_speed_mps": "axis"}),
+        replace(VEHICLE_A, augmentable={"sigma_speed_mps": "axis"}),
         "sigma_speed_mps is of kind 'axis'; known are linear and angle",
     ),
     "a wrong mode": (

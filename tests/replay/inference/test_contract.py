@@ -17,7 +17,8 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.inference import estimators
 from replay.inference.all_methods import METHODS
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A

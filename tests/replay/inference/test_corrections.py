@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from replay.estimators.navigation.navigation import INERTIAL
 from replay.estimators.navigation.turning import heading, move, move_back
-from replay.inference.linear_algebra.manifold import differencing
+from replay.inference.linear_algebra.manifold import boxminus
 from replay.inference.model.augmentation import augmented
 from replay.inference.model.corrections import comparing, correcting, relinearising, sloping
 
@@ -45,7 +45,7 @@ def slopes_of(back: bool) -> Any:
     mean, slopes, size = corrected(STEP, back)[0], np.empty((T, T)), 1e-6
     for column in range(T):
         further, _ = corrected(STEP + size * np.eye(T)[column], back)
-        differencing(MODEL.kinds)(further, mean, slopes, column)
+        boxminus(MODEL.kinds)(further, mean, slopes, column)
     return slopes.T / size
 
 

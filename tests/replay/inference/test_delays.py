@@ -14,7 +14,8 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.replaying.estimator import Recursive
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import bound, outputs
 
 pytestmark = pytest.mark.usefixtures("uncompiled")
@@ -135,13 +136,13 @@ def test_delays_serve_smoothers_and_refuse_to_rewind():
     held = replace(TROLLEY, control=replace(UNIT, interpolated=False), sensors=(sensor,))
     [given] = bound(held, "ekf", [trolley()])
     assert isinstance(given, Recursive)
-    assert given.rewinding is not None
-    given.rewinding(10**9)
+    assert given.out_of_sequence is not None
+    given.out_of_sequence(10**9)
     [delayed] = bound(held, "ekf", [trolley()], fix_delay_s=0.1)
     assert isinstance(delayed, Recursive)
-    assert delayed.rewinding is not None
+    assert delayed.out_of_sequence is not None
     with pytest.raises(BadInput, match=r"put where they were measured.*--late wait"):
-        delayed.rewinding(10**9)
+        delayed.out_of_sequence(10**9)
 
 
 def test_a_sensor_may_read_what_the_control_says_at_its_stamp():

@@ -16,7 +16,8 @@ from replay.engine.streams.blocks import gather
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.geodetic import in_plane
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Model, ModelParameters, Motion
+from replay.inference.model.model import Model, Motion
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]

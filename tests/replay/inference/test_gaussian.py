@@ -19,13 +19,14 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     Gaussian,
-    Note,
+    InnovationRecord,
     Workspace,
     workspace,
 )
 from replay.inference.kalman.update import kalman_update
 from replay.inference.linear_algebra.gaussian import cholesky
-from replay.inference.model.model import Control, Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.stage import Stage, stage_of
 from replay.inference.run.recursion import fault_of
 from replay.sampling.samplers import unscented
@@ -68,13 +69,13 @@ def nothing(*_: Any) -> tuple[float, ...]:
     raise AssertionError
 
 
-def empty_note(components: int) -> Note:
-    return Note(np.empty(components), np.empty((components, components)), np.empty(3))
+def empty_record(components: int) -> InnovationRecord:
+    return InnovationRecord(np.empty(components), np.empty((components, components)), np.empty(3))
 
 
 def correct(
     mean: Floats, covariance: Floats, v: Floats, s: Floats, c: Floats, gate: Floats
-) -> tuple[int, Note]:
+) -> tuple[int, InnovationRecord]:
     """The Kalman update by an innovation v with covariance S and cross-covariance C."""
     sensor = Sensor("sensor", schemas.VECTOR_MEASUREMENT, all_linear("z", len(v)), nothing)
     motion = Motion(nothing)
@@ -89,10 +90,10 @@ def correct(
             place[:] = value
         return True
 
-    note = empty_note(len(v))
+    record = empty_record(len(v))
     update = kalman_update(stage, 0, innovate)
     plain = noise_of(np.empty(0), np.empty(0))  # no robust update
-    return update(mean, covariance, v, plain, gate, 0, workspace(stage), note), note
+    return update(mean, covariance, v, plain, gate, 0, workspace(stage), record), record
 
 
 @given(st.integers(1, 5), st.integers(1, 4), seeds)
@@ -106,10 +107,10 @@ def test_correct_is_the_kalman_update_by_what_was_measured(states: int, componen
     kept[generator.integers(components)] = True
     gain = c[:, kept] @ np.linalg.inv(s[np.ix_(kept, kept)])
     mean, covariance = x.copy(), p.copy()
-    told, note = correct(
+    told, record = correct(
         mean, covariance, np.where(kept, v, np.nan), s, c, np.full(components + 1, np.inf)
     )
-    squared, log_likelihood, accepted = note.numbers
+    squared, log_likelihood, accepted = record.numbers
     assert told == ALL_WELL
     assert accepted
     assert_allclose(squared, v[kept] @ np.linalg.solve(s[np.ix_(kept, kept)], v[kept]), rtol=1e-6)
@@ -117,8 +118,8 @@ def test_correct_is_the_kalman_update_by_what_was_measured(states: int, componen
     assert_allclose(mean, x + gain @ v[kept], atol=1e-7)
     assert_allclose(covariance, p - gain @ c[:, kept].T, atol=1e-7)
     assert_array_equal(covariance, covariance.T)
-    assert_array_equal(note.difference, np.where(kept, v, np.nan))
-    assert_array_equal(note.covariance, np.where(np.outer(kept, kept), s, np.nan))
+    assert_array_equal(record.difference, np.where(kept, v, np.nan))
+    assert_array_equal(record.covariance, np.where(np.outer(kept, kept), s, np.nan))
 
 
 def test_a_shut_gate_and_a_broken_innovation_change_nothing():
@@ -126,10 +127,10 @@ def test_a_shut_gate_and_a_broken_innovation_change_nothing():
     for s, gate, expected in (shut, broken):
         mean, covariance = np.zeros(3), np.eye(3)
         gates = np.array([0, 0, gate])
-        told, note = correct(mean, covariance, np.ones(2), s, np.ones((3, 2)), gates)
+        told, record = correct(mean, covariance, np.ones(2), s, np.ones((3, 2)), gates)
         assert told == expected
         if told == ALL_WELL:
-            assert_array_equal(note.numbers, [2.0, 0.0, 0.0])
+            assert_array_equal(record.numbers, [2.0, 0.0, 0.0])
         assert_array_equal(mean, 0)
         assert_array_equal(covariance, np.eye(3))
     taken = np.zeros(3), np.eye(3), np.ones(2), np.eye(2), np.ones((3, 2)), np.full(3, 2.0)
@@ -192,7 +193,7 @@ class Linear(NamedTuple):
         measured = {**all_linear("z", components), f"z{components - 1}": "angle"}
         targets = Map("/targets", schemas.LANDMARK, "landmark_id", "position_m", all_linear("p", states))
         schema = schemas.VECTOR_MEASUREMENT
-        sensor = Sensor("sensor", schema, measured, measure, variances, about=targets)
+        sensor = Sensor("sensor", schema, measured, measure, variances, reference=targets)
         motion = Motion(move, control_noise=control_noise)
         control = Control("control", schema, names("u", controls))
         state = all_linear("x", states)
@@ -236,12 +237,12 @@ def test_filters_are_exact_for_linear_models_of_any_size(
     target = generator.normal(size=states)
     measured = linear.look @ (x - target) + 0.1
     measured[-1] += 2 * np.pi  # a turn more is the same angle
-    data, note = np.append(measured, target), empty_note(components)
+    data, record = np.append(measured, target), empty_record(components)
     gate = np.full(components + 1, np.inf)
-    assert steps.updates[0](0, belief, data, noise, gate, 0, work, note) == ALL_WELL
+    assert steps.updates[0](0, belief, data, noise, gate, 0, work, record) == ALL_WELL
     spread = linear.look @ p @ linear.look.T + np.diag(variance)
-    assert_allclose(note.difference, 0.1, atol=1e-9)
-    assert_allclose(note.covariance, spread, atol=1e-9)
+    assert_allclose(record.difference, 0.1, atol=1e-9)
+    assert_allclose(record.covariance, spread, atol=1e-9)
     gain = p @ linear.look.T @ np.linalg.inv(spread)
     assert_allclose(belief.mean[0], x + gain @ np.full(components, 0.1), atol=1e-7)
     assert_allclose(belief.covariance[0], p - gain @ linear.look @ p, atol=1e-7)
@@ -254,5 +255,5 @@ def test_sampling_says_where_the_covariance_is_none():
     noise, belief = noise_of(one, one), Gaussian(np.zeros((1, 2)), -np.eye(2)[None])
     assert not steps.predict(0, belief, one, 1.0, noise, 0, work)
     update = steps.updates[0]
-    told = update(0, belief, np.ones(4), noise, np.full(3, np.inf), 0, work, empty_note(2))
+    told = update(0, belief, np.ones(4), noise, np.full(3, np.inf), 0, work, empty_record(2))
     assert told == NOT_POSITIVE_DEFINITE

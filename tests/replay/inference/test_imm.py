@@ -19,8 +19,9 @@ from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.all_methods import METHODS
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor, Switching
-from replay.inference.modes.imm import Memory, changing, mixing
+from replay.inference.model.model import Model, Motion, Sensor, Switching
+from replay.inference.model.parameters import ModelParameters
+from replay.inference.modes.mixing import InteractingMemory, mixing, transition_matrix
 from replay.inference.run import filtering
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
@@ -173,7 +174,7 @@ def line_rates(parameters: Any) -> Any:
     return parameters.up_per_s, parameters.down_per_s
 
 
-def read_place(state: Any, about: Any, parameters: Any) -> Any:
+def read_place(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[0],)
 
 
@@ -274,7 +275,7 @@ def test_a_mode_that_nothing_leads_to_comes_back(uncompiled: None) -> None:
 @pytest.mark.parametrize("duration_s", [0.0, 1e-9, 0.05, 3.0, 1e4])
 def test_the_chain_is_the_matrix_exponential(duration_s: float) -> None:
     found, wanted = np.empty((3, 3)), np.array([[-0.4, 0.3, 0.1], [0.0, -2.0, 2.0], [1.5, 0.5, -2.0]])
-    changing(3)(wanted[~np.eye(3, dtype=bool)], duration_s, found)
+    transition_matrix(3)(wanted[~np.eye(3, dtype=bool)], duration_s, found)
     assert_allclose(found, expm(wanted * duration_s), rtol=1e-11, atol=1e-300)
     assert_allclose(found.sum(axis=1), 1.0, rtol=1e-14)
     if duration_s == 0.0:
@@ -284,7 +285,7 @@ def test_the_chain_is_the_matrix_exponential(duration_s: float) -> None:
 def test_the_chain_of_the_sheet() -> None:
     """Section 3: the probabilities after .05 s."""
     found = np.empty((2, 2))
-    changing(2)(np.array([0.1, 0.5]), 0.05, found)
+    transition_matrix(2)(np.array([0.1, 0.5]), 0.05, found)
     wanted = [[0.995074255591, 0.00492574440858], [0.0246287220429, 0.975371277957]]
     assert_allclose(found, wanted, rtol=1e-11)
 
@@ -357,10 +358,10 @@ def test_a_mixture_of_rotations_has_the_moments_of_its_samples() -> None:
     roots = np.array([np.diag([0.25, 0.02, 0.02, 0.1]), np.diag([0.02, 0.25, 0.1, 0.1])])
     roots[:, 3, 0] = 0.05
     covariance = roots @ roots.swapaxes(1, 2)
-    gather, mix = mixing(kinds)
+    to_common_tangent, mix = mixing(kinds)
     memory = memory_of(5, 4, 2)
     found, spread = np.empty(5), np.empty((4, 4))
-    gather(mean, covariance, weights, memory)
+    to_common_tangent(mean, covariance, weights, memory)
     mix(weights, memory, found, spread)
     assert_allclose(spread, spread.T, rtol=1e-14)
 
@@ -385,9 +386,9 @@ def quaternion(turns: Any) -> Any:
 
 def memory_of(n: int, t: int, modes: int) -> Any:
     """As much of a filter's memory as mixing needs."""
-    rest: dict[str, Any] = dict.fromkeys(Memory._fields)
+    rest: dict[str, Any] = dict.fromkeys(InteractingMemory._fields)
     shapes = {"centre": (n,), "away": (modes, t), "carried": (modes, t, t), "shift": (t,)}
-    return Memory(**rest | {name: np.empty(shape) for name, shape in shapes.items()})
+    return InteractingMemory(**rest | {name: np.empty(shape) for name, shape in shapes.items()})
 
 
 # The gate

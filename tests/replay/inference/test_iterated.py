@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
 
-from pipeline.runs.ensemble import replay_ensemble
+from pipeline.runs.recorded import replay_ensemble
 from recorders.errors import BadInput
 from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording
@@ -183,7 +183,7 @@ def test_damping_only_helps_to_get_there(uncompiled: None) -> None:
     assert_allclose(held["state"]["covariance"], free["state"]["covariance"], rtol=1e-8, atol=1e-13)
 
 
-def bend(state: Any, about: Any, parameters: Any) -> Any:
+def bend(state: Any, reference: Any, parameters: Any) -> Any:
     return np.arctan(state[0]), np.arctan(state[0])
 
 
@@ -217,7 +217,7 @@ def acceleration(state: Any, duration_s: Any, parameters: Any) -> Any:
     return (0.5,)
 
 
-def far(state: Any, about: Any, parameters: Any) -> Any:
+def far(state: Any, reference: Any, parameters: Any) -> Any:
     """How far the point is from two others, beside its line."""
     return np.sqrt(4.0 + state[0] * state[0]), np.sqrt(1.0 + (state[0] - 3.0) * (state[0] - 3.0))
 

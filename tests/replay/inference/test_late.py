@@ -16,7 +16,8 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import MemorySource
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import bound
 from tests.replay.inference.test_imm import SWITCHING_A
@@ -42,7 +43,7 @@ def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return near, 0.0, near, mixed, 0.0, fast, 0.0, mixed, 0.0, fast
 
 
-def place(state: Any, about: Any, parameters: Any) -> Any:
+def place(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[1]
 
 
@@ -304,6 +305,7 @@ def delayed(source: MemorySource, seed: int, *topics: str) -> MemorySource:
         (VEHICLE_A, "ukf", {"gate_probability": 0.9}),
         (VEHICLE_A, "lrkf", {"sampling": "s2kf-11"}),
         (SWITCHING_A, "imm", {"filter": "ekf"}),
+        (SWITCHING_A, "imm", {"filter": "sqrt:ekf"}),
     ],
 )
 def test_angles_maps_gates_and_missing_components(

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from recorders.models.orientation import compose, conjugate
 from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.kalman.regression import regression, sample_memory
-from replay.inference.linear_algebra.manifold import resetting
+from replay.inference.linear_algebra.manifold import by_right_jacobian
 from replay.sampling.sets import SampleSets
 from tests.replay.inference import attitude, vehicle_a
 from tests.replay.inference.attitude import ATTITUDE
@@ -231,22 +231,24 @@ def test_the_mean_of_angles_is_the_intrinsic_one() -> None:
     assert_allclose(vehicle_a.wrap(memory.centre[0]), -3.11659265359, rtol=1e-11)
 
 
-def right_jacobian(d: Any) -> Any:
+def right_jacobian_factors(d: Any) -> Any:
     rows = np.eye(3)
-    resetting(("quaternion",) * 4)(np.array(d), rows)
+    by_right_jacobian(("quaternion",) * 4)(np.array(d), rows)
     return rows
 
 
 def test_the_right_jacobian() -> None:
     """Its first row, and that it is the derivative of the exponential: exp(d + e) = exp(d) exp(Jr e)."""
     d = np.array([0.3, -0.2, 0.5])
-    assert_allclose(right_jacobian(d)[0], [0.95257673497, 0.232371223513, 0.121402448423], rtol=1e-10)
+    assert_allclose(
+        right_jacobian_factors(d)[0], [0.95257673497, 0.232371223513, 0.121402448423], rtol=1e-10
+    )
     for small in (d, 0.01 * d, 1e-9 * d):
         for row in range(3):
             e = 1e-6 * np.eye(3)[row]
             ends = [quaternion(small + sign * e) for sign in (1, -1)]
             change = rotation_vector(compose(conjugate(ends[1]), ends[0])[None])[0]
-            assert_allclose(change / 2e-6, right_jacobian(small)[:, row], atol=1e-9)
+            assert_allclose(change / 2e-6, right_jacobian_factors(small)[:, row], atol=1e-9)
 
 
 def quaternion(d: Any) -> Any:
@@ -265,7 +267,7 @@ def test_what_the_reset_changes(variances: list[float], changes: list[float]) ->
     """First order in the correction where the covariance is anisotropic, second where it is not."""
     before = np.diag(variances)
     for size, change in zip((0.001, 0.01, 0.1), changes, strict=True):
-        jacobian = right_jacobian(size * np.array([1.0, 2.0, 2.0]) / 3)
+        jacobian = right_jacobian_factors(size * np.array([1.0, 2.0, 2.0]) / 3)
         moved = jacobian @ before @ jacobian.T
         relative = np.linalg.norm(moved - before) / np.linalg.norm(before)
         assert_allclose(relative, change, rtol=2e-4 if change < 1e-3 else 1e-6)

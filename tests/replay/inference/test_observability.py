@@ -13,7 +13,8 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.measurements import PLANE
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing.iterated import IteratedSmoother
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.test_smoothers import LEVEL, levels
@@ -36,12 +37,12 @@ def move(state: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
     return state[0] + duration_s * state[2], state[1] + duration_s * state[3], state[2], state[3]
 
 
-def distance(state: Any, about: Any, parameters: Any) -> Any:
-    return (np.hypot(state[0] - about[0], state[1] - about[1]),)
+def distance(state: Any, reference: Any, parameters: Any) -> Any:
+    return (np.hypot(state[0] - reference[0], state[1] - reference[1]),)
 
 
-def bearing(state: Any, about: Any, parameters: Any) -> Any:
-    return (np.arctan2(state[1] - about[1], state[0] - about[0]),)
+def bearing(state: Any, reference: Any, parameters: Any) -> Any:
+    return (np.arctan2(state[1] - reference[1], state[0] - reference[0]),)
 
 
 def variance(parameters: Any) -> Any:
@@ -58,7 +59,7 @@ def target(measure: Any, name: str) -> Model:
         kind,
         measure,
         variance,
-        about=seen_from,
+        reference=seen_from,
     )
     state: Any = dict.fromkeys(STATE, "linear")
     return Model("a target", state, SensorParameters, (sensor,), Motion(move, linear=True))

@@ -54,23 +54,25 @@ def test_systematic_resampling_is_the_sheets() -> None:
     assert chosen.tolist() == [0, 2, 2, 3]  # round-off leaves the last position to the last particle
 
 
-def errors(particles: int, repetitions: int) -> tuple[Floats, Floats]:
-    """In units of the Kalman filter's sigma / sqrt(N), (repetitions, 50); log-likelihoods less its."""
+def errors(particles: int, runs: int) -> tuple[Floats, Floats]:
+    """In units of the Kalman filter's sigma / sqrt(N), (runs, 50); log-likelihoods less its.
+
+    All of the same numbers; each run draws its own, for its first stamp is its own.
+    """
     source = scalar.source(scalar.simulate(11))
     exact = outputs(SCALAR, "ekf", [source])
     exact_total = exact["innovation"]["log_likelihood"].sum()
     assert_allclose(exact_total, -66.8856458984, rtol=1e-10)
-    found, totals = [], []
-    for seed in range(repetitions):
-        each = outputs(SCALAR, "particles", [source], particles=particles, seed=seed)
-        found.append(each["state"]["mean"][:, 0] - exact["state"]["mean"][:, 0])
-        totals.append(each["innovation"]["log_likelihood"].sum() - exact_total)
-    return np.array(found) / np.sqrt(exact["state"]["covariance"][:, 0] / particles), np.array(totals)
+    sources = [scalar.source(scalar.simulate(11), first_later_ns=run) for run in range(runs)]
+    found = outputs(SCALAR, "particles", sources, particles=particles)
+    means = found["state"]["mean"].reshape(runs, -1) - exact["state"]["mean"][:, 0]
+    totals = found["innovation"]["log_likelihood"].reshape(runs, -1).sum(axis=1) - exact_total
+    return means / np.sqrt(exact["state"]["covariance"][:, 0] / particles), totals
 
 
 @pytest.mark.parametrize(("particles", "spread"), [(100, 0.62), (1000, 0.20)])
 def test_means_and_likelihoods_err_as_the_sheet_says(particles: int, spread: float) -> None:
-    """Over 150 seeds: the RMS over all steps, no step beyond 10, E exp(ll - exact) = 1, std of ll."""
+    """Over 150 runs: the RMS over all steps, no step beyond 10, E exp(ll - exact) = 1, std of ll."""
     error, total = errors(particles, 150)
     assert 1.2 < np.sqrt(np.mean(error**2)) < 1.6
     assert np.abs(error).max() < 10
@@ -337,18 +339,18 @@ def test_the_cloud_has_the_moments_of_the_estimate() -> None:
 # Likelihoods of a model's own
 
 
-def heavy(state: Any, measured: Any, about: Any, parameters: Any) -> Any:
+def heavy(state: Any, measured: Any, reference: Any, parameters: Any) -> Any:
     """A Cauchy distribution."""
     away = (measured[0] - state[0]) / parameters.sigma_measured
     return -np.log(np.pi * parameters.sigma_measured * (1.0 + away * away))
 
 
-def normal(state: Any, measured: Any, about: Any, parameters: Any) -> Any:
+def normal(state: Any, measured: Any, reference: Any, parameters: Any) -> Any:
     away = (measured[0] - state[0]) / parameters.sigma_measured
     return -0.5 * (away * away + np.log(2.0 * np.pi)) - np.log(parameters.sigma_measured)
 
 
-def nowhere(state: Any, measured: Any, about: Any, parameters: Any) -> Any:
+def nowhere(state: Any, measured: Any, reference: Any, parameters: Any) -> Any:
     return -np.inf if measured[0] > 10.0 else 0.0 * state[0]
 
 
@@ -383,7 +385,7 @@ def test_a_measurement_that_no_particle_explains_ends_the_run() -> None:
 def test_a_particle_of_which_a_sensor_says_nothing_keeps_its_weight() -> None:
     """The sensor sees what is positive alone: the sum of the weights below zero stays as it was."""
 
-    def measure_above(state: Any, about: Any, parameters: Any) -> Any:
+    def measure_above(state: Any, reference: Any, parameters: Any) -> Any:
         return (state[0] if state[0] > 0.0 else np.nan,)
 
     model = replace(SCALAR, sensors=(replace(scalar.VALUE, measure=measure_above, linear=False),))
@@ -402,7 +404,7 @@ def test_what_a_model_lacks_and_bad_numbers_are_one_sentence() -> None:
     assert METHODS["particles"] is BOOTSTRAP
     assert BOOTSTRAP.lacks(SCALAR) == BOOTSTRAP.lacks(make_wheel()) == ""
 
-    def squared(state: Any, noise: Any, about: Any, parameters: Any) -> Any:
+    def squared(state: Any, noise: Any, reference: Any, parameters: Any) -> Any:
         return (state[0] + noise[0] ** 2,)
 
     bent = replace(SCALAR, sensors=(replace(scalar.VALUE, measure=squared, noises=1),))

@@ -16,8 +16,8 @@ from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-from replay.inference.run.events import times_alone, with_ticks
 from replay.inference.run.recursion import no_results
+from replay.inference.run.timing import add_output_times, output_times
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.vehicle_a import VEHICLE_A
@@ -133,15 +133,15 @@ def test_a_prior_of_long_before_makes_no_ticks_before_the_log() -> None:
     """A year of them at 20 Hz would be 600 million estimates; a second of them is as asked for."""
     year_ns, second_ns, every_ns = 366 * 86_400 * 10**9, 10**9, 50_000_000
     log_ns = 2 * year_ns + np.arange(0, 2 * second_ns, 10**8)
-    events = times_alone(np.array([0, 10, 20]), log_ns, 1, is_due=True)
+    events = output_times(np.array([0, 10, 20]), log_ns, 1, wants_estimate=True)
     start_ns = np.array([log_ns[0] - year_ns, log_ns[10] - second_ns])
-    found, tick = with_ticks(events, start_ns, np.zeros(2, np.int64), every_ns)
+    found, next_output = add_output_times(events, start_ns, np.zeros(2, np.int64), every_ns)
     runs = np.split(found.time_ns, found.offsets[1:-1])
     assert [run[0] for run in runs] == [log_ns[0], log_ns[10] - second_ns]
     assert [len(run) for run in runs] == [19, 39]
-    assert tick.tolist() == [log_ns[9] // every_ns + 1, log_ns[19] // every_ns + 1]
-    gap = times_alone(np.array([0, 1, 1]), log_ns[9:10] + 100 * second_ns, 1, is_due=True)
-    assert len(with_ticks(gap, log_ns[[9, 19]], tick, every_ns)[0].time_ns) == 2000
+    assert next_output.tolist() == [log_ns[9] // every_ns + 1, log_ns[19] // every_ns + 1]
+    gap = output_times(np.array([0, 1, 1]), log_ns[9:10] + 100 * second_ns, 1, wants_estimate=True)
+    assert len(add_output_times(gap, log_ns[[9, 19]], next_output, every_ns)[0].time_ns) == 2000
 
 
 @pytest.mark.parametrize("method", ["ekf", "ukf"])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from pipeline.runs.ensemble import replay_ensemble
+from pipeline.runs.recorded import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
@@ -20,8 +20,9 @@ from recorders.recording import Recording, import_run
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.linear_algebra.gaussian import solve_semidefinite
-from replay.inference.linear_algebra.manifold import resetting
-from replay.inference.model.model import Model, ModelParameters, Motion, Sensor
+from replay.inference.linear_algebra.manifold import by_right_jacobian
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing import smoothers
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
@@ -175,7 +176,7 @@ def move_noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return parameters.level * duration_s, parameters.slope * duration_s
 
 
-def read(state: Any, about: Any, parameters: Any) -> Any:
+def read(state: Any, reference: Any, parameters: Any) -> Any:
     return state[0], state[0] + state[1]
 
 
@@ -302,8 +303,8 @@ def test_what_is_known_exactly_is_left_as_it_is() -> None:
 def test_the_reset_back_undoes_the_reset() -> None:
     for size in (1e-9, 0.04, 0.06, 1.0, 3.1):
         d, rows = size * np.array([1.0, 2.0, -2.0]) / 3, np.eye(3)
-        resetting(("quaternion",) * 4)(d, rows)
-        resetting(("quaternion",) * 4, back=True)(d, rows)
+        by_right_jacobian(("quaternion",) * 4)(d, rows)
+        by_right_jacobian(("quaternion",) * 4, back=True)(d, rows)
         assert_allclose(rows, np.eye(3), atol=1e-12)
 
 

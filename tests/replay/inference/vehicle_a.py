@@ -12,7 +12,8 @@ from recorders.models.planar import range_bearing
 from recorders.recording import Recording
 from replay.engine.streams.measurements import PLANE
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Map, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Map, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 MEAN = np.array([0.0, 0.0, 0.0, 1.0, 0.2])
@@ -61,15 +62,15 @@ def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     )
 
 
-def see(state: Any, about: Any, parameters: Any) -> Any:
-    return range_bearing((state[0], state[1], state[2]), about)
+def see(state: Any, reference: Any, parameters: Any) -> Any:
+    return range_bearing((state[0], state[1], state[2]), reference)
 
 
 def see_noise(parameters: Any) -> Any:
     return parameters.sigma_range_m**2, parameters.sigma_bearing_rad**2
 
 
-def read_speed(state: Any, about: Any, parameters: Any) -> Any:
+def read_speed(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[3],)
 
 
@@ -94,7 +95,7 @@ RANGE_BEARING = Sensor(
     {"range_m": "linear", "bearing_rad": "angle"},
     see,
     see_noise,
-    about=Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE),
+    reference=Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLANE),
 )
 SPEED = Sensor(
     "speed",

@@ -13,7 +13,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.inference.model.model import Control, Model, ModelParameters, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
+from replay.inference.model.parameters import ModelParameters
 
 Floats = NDArray[np.float64]
 EPOCH_NS = 10**9
@@ -47,7 +48,7 @@ def noise(state: Any, duration_s: Any, parameters: Any) -> Any:
     return parameters.slip**2, parameters.rate_density**2 * duration_s
 
 
-def read_dial(state: Any, noise: Any, about: Any, parameters: Any) -> Any:
+def read_dial(state: Any, noise: Any, reference: Any, parameters: Any) -> Any:
     """Cosine and sine of twice the angle, by an amplifier whose gain is noisy."""
     x, y = state[0], state[1]
     return (1.0 + noise[0]) * (x * x - y * y) + noise[1], (1.0 + noise[0]) * 2.0 * x * y + noise[2]
@@ -57,7 +58,7 @@ def dial_noise(parameters: Any) -> Any:
     return parameters.sigma_gain**2, parameters.sigma_dial**2, parameters.sigma_dial**2
 
 
-def read_tacho(state: Any, about: Any, parameters: Any) -> Any:
+def read_tacho(state: Any, reference: Any, parameters: Any) -> Any:
     return (state[2],)
 
 

@@ -24,8 +24,8 @@ from replay.judging.errors.trajectories import (
     estimated_offset_s,
     statistics,
     trajectory_metrics,
-    trajectory_of,
 )
+from replay.judging.errors.trajectory_streams import trajectory_of
 
 SECOND = 1_000_000_000
 

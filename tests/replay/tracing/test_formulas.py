@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 
 import fuselog as fl
 from replay.inference.estimators import registered_models
-from replay.inference.model.formulas import formulas_by_function
-from replay.inference.model.model import trial_state
+from replay.inference.formulas import formulas_by_function
 from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.model.validation import trial_state
 from replay.tracing.formulas import formulas_of
 from replay.tracing.functions import traced
 

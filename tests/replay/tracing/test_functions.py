@@ -150,7 +150,7 @@ def test_what_no_graph_holds_is_refused_in_one_sentence_with_its_line_and_the_me
 def measuring(function: Callable[[Any], Any], **changes: Any) -> Model:
     """The scalar model whose sensor measures this of its state."""
 
-    def measure(state: Any, about: Any, parameters: Any) -> Any:
+    def measure(state: Any, reference: Any, parameters: Any) -> Any:
         return (function(state[0]),)
 
     return replace(SCALAR, sensors=(replace(VALUE, measure=measure, linear=False, **changes),))
@@ -184,7 +184,7 @@ class Scaled:
         return self(*arguments)
 
 
-def scaled_by(gain: float, state: Any, about: Any, parameters: Any) -> Any:
+def scaled_by(gain: float, state: Any, reference: Any, parameters: Any) -> Any:
     return (gain * state[0],)
 
 

@@ -1,4 +1,4 @@
-"""Kernels that make no arrays: loops over numbers, from Python's source to machine code in milliseconds.
+"""Compiles kernels that make no arrays: from Python's source to machine code in milliseconds.
 
 Such a kernel is a plain Python function of numbers, arrays, tuples and NamedTuples, with all that it
 calls. `lowering` goes through its source once for the types and sizes at hand and writes LLVM's text:

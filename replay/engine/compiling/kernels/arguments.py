@@ -1,4 +1,4 @@
-"""What a kernel is called with: described for its key, packed as words, and loaded in the kernel.
+"""Describes a kernel's arguments for its key, packs them as words, and loads them in the kernel.
 
 NumPy's own structure of an array says where its numbers and its sizes are; its address is the word.
 """
@@ -16,7 +16,7 @@ from replay.engine.compiling.kernels.values import STORED, Array, Record, combin
 KNOWN = 64  # sizes up to this are part of a kernel
 
 
-class Kept(NamedTuple):
+class KnownArray(NamedTuple):
     """How an array lies in memory: NumPy's letter of its numbers, its sizes (None where they vary)."""
 
     letter: str
@@ -66,7 +66,7 @@ def with_types(value: Any, kinds: Iterator[Any]) -> Any:
             why = "" if is_usual else ", unaligned or in another machine's order"
             raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}{why}")
         shape = (*(None,) * (axes - len(known)), *(n if n <= KNOWN else None for n in known))
-        return Kept(letter, shape, is_packed)
+        return KnownArray(letter, shape, is_packed)
     for types, name in _SCALARS:
         if issubclass(kind, types):
             return name
@@ -83,7 +83,7 @@ _SCALARS: tuple[tuple[Any, str], ...] = (
 
 def letters(kind: Any) -> str:
     """How the numbers of an argument are packed into words."""
-    if isinstance(kind, Kept):
+    if isinstance(kind, KnownArray):
         return "q"
     if isinstance(kind, tuple):
         return "".join(map(letters, kind[1]))
@@ -92,7 +92,7 @@ def letters(kind: Any) -> str:
 
 def value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
     """The value that a described argument is in the kernel: loaded from its words."""
-    if isinstance(kind, Kept):
+    if isinstance(kind, KnownArray):
         return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
     if isinstance(kind, tuple):
         parts = tuple(value_of(each, emitter, words) for each in kind[1])
@@ -113,7 +113,7 @@ def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
     return name
 
 
-def _array_of(kind: Kept, emitter: Emitter, structure: str) -> Array:
+def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
     """An array of NumPy's: where its numbers are, and the sizes that are not known."""
     dtype = _LETTERS[kind.letter]
     sizes = _loaded_from("ptr", emitter, structure, _SHAPE)

@@ -1,10 +1,8 @@
-"""Expressions of a kernel: what is known is worked out as Python would, the rest are instructions."""
+"""Lowers expressions: what is known is evaluated as Python would, the rest becomes instructions."""
 
 import ast
-import builtins
 import operator
 from collections.abc import Hashable, Iterator
-from itertools import count
 from types import FunctionType
 from typing import Any
 
@@ -23,7 +21,6 @@ from replay.engine.compiling.kernels.numbers import (
     REAL,
     TRUTH,
     WHOLE,
-    Emitter,
     Number,
     binary,
     common_kind,
@@ -33,51 +30,15 @@ from replay.engine.compiling.kernels.numbers import (
     is_static,
     negative,
 )
-from replay.engine.compiling.kernels.program import Program, definition_of
+from replay.engine.compiling.kernels.scope import Scope
 from replay.engine.compiling.kernels.values import Array, Record, entries, load, made, part_of, store
 
 # Functions that make arrays, and whether these are zero.
 _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like: True}
 
 
-class Expressions:
+class Expressions(Scope):
     """One function while its expressions are lowered."""
-
-    def __init__(self, program: Program, function: FunctionType) -> None:
-        self.program = program
-        self.emitter = Emitter(self.fault if program.is_checked else None)
-        self.function = function
-        self.line = 0
-        self.known: dict[str, Any] = {}
-        self._outside = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
-        self._globals = function.__globals__
-        self._labels = count()
-
-    def place_in_source(self) -> str:
-        """The file and the line at work."""
-        _, file, above = definition_of(self.function)
-        return f"{file}, line {above + self.line}"
-
-    def fault(self) -> int:
-        """The number that stands for an index of the line at work that is beyond its array."""
-        self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
-        return len(self.program.faults)
-
-    def label(self, stem: str) -> str:
-        """A name for a block."""
-        return f"{stem}{next(self._labels)}"
-
-    def lookup(self, name: str) -> Any:
-        """What a name stands for."""
-        if name in self.known:
-            return self.known[name]
-        if name in self._outside:
-            return from_python(self._outside[name].cell_contents)
-        if name in self._globals:
-            return from_python(self._globals[name])
-        if hasattr(builtins, name):
-            return getattr(builtins, name)
-        raise NameError(f"{name} is not defined here")
 
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
         """`yes if condition else no`."""

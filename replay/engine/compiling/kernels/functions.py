@@ -1,4 +1,4 @@
-"""Functions of numbers, as NumPy, Python and libm have them, in LLVM's text: `FUNCTIONS`."""
+"""Writes functions of numbers, as NumPy, Python and libm have them, in LLVM's text: `FUNCTIONS`."""
 
 import math
 import operator

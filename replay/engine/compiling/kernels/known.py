@@ -1,4 +1,4 @@
-"""What is known while a kernel is lowered, as Python has it."""
+"""Evaluates what is known while a kernel is lowered, as Python would."""
 
 import ast
 import operator

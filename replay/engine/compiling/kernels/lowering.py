@@ -1,4 +1,4 @@
-"""Goes through a function's source once and writes what it does as LLVM's text.
+"""Lowers a function: goes through its source once and writes what it does as LLVM's text.
 
 Statements are here, expressions in `expressions`. A name that gets one value before all its uses is that
 value; any other is a place in memory, of which LLVM makes registers. What is known already is worked
@@ -11,36 +11,27 @@ from collections.abc import Iterator, Sequence
 from types import FunctionType
 from typing import Any, NamedTuple
 
-from replay.engine.compiling.kernels.expressions import Expressions
+from replay.engine.compiling.kernels.frame import Frame, Wider, common_value, unsure
 from replay.engine.compiling.kernels.numbers import (
     WHOLE,
     Emitter,
     Number,
     binary,
-    common_kind,
     compare,
     constant,
     is_static,
 )
-from replay.engine.compiling.kernels.program import DoesNotCompile, Program, definition_of
+from replay.engine.compiling.kernels.program import DoesNotCompile, Program
 from replay.engine.compiling.kernels.values import (
     Array,
-    Record,
     at_run_time,
     entries,
     is_local,
-    leaves,
     load,
     part_of,
-    rebuilt,
     signature,
     store,
 )
-from replay.engine.compiling.kernels.variables import placed_names
-
-
-class _Wider(Exception):
-    """A variable has to hold numbers of another kind than its first value."""
 
 
 class _Loop(NamedTuple):
@@ -57,7 +48,7 @@ def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tup
         lowering = _Lowering(program, function, arguments, kinds)
         try:
             return lowering.emitter, lowering.body()
-        except _Wider:
+        except Wider:
             continue
         except DoesNotCompile:
             raise
@@ -68,38 +59,21 @@ def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tup
             ) from error
 
 
-class _Lowering(Expressions):
+class _Lowering(Frame):
     def __init__(
         self, program: Program, function: FunctionType, arguments: list[Any], kinds: dict[str, str]
     ) -> None:
-        definition, _, _ = definition_of(function)
-        names = [each.arg for each in (*definition.args.posonlyargs, *definition.args.args)]
-        rest = definition.args.vararg
-        super().__init__(program, function)
-        if rest is not None:
-            names, arguments = (
-                [*names, rest.arg],
-                [*arguments[: len(names)], tuple(arguments[len(names) :])],
-            )
-        self.known.update(zip(names, arguments, strict=True))
-        self.definition = definition
-        self._kinds = kinds
-        self._placed = placed_names(definition)
-        self._places: dict[str, Any] = {}
         self._loops: list[_Loop] = []
-        self._ended = False
         self._depth = 0  # of branches and loops that may not be run
         self._returned: Any = None
         self._exit = ""
-        for name in names:
-            if name in self._placed:
-                self.assign(name, self.known.pop(name))
+        super().__init__(program, function, arguments, kinds)
 
     def body(self) -> Any:
         """Lower all of it; what it returns."""
         self.statements(self.definition.body)
         if self._exit:
-            if not self._ended:
+            if not self.ended:
                 if signature(self._returned) != signature(None):
                     raise TypeError("not every way through it returns something")
                 self.go(self._exit)
@@ -107,105 +81,12 @@ class _Lowering(Expressions):
             return self.read(self._returned)
         return self._returned
 
-    # --- blocks ---
-
-    def go(self, label: str) -> None:
-        """End a block by going on elsewhere."""
-        self.emitter.add(f"br label %{label}")
-        self._ended = True
-
-    def begin(self, label: str) -> None:
-        """Begin a block."""
-        self.emitter.lines.append(f"{label}:")
-        self._ended = False
-
-    def branch(self, condition: Number, yes: str, no: str) -> None:
-        """End a block by going on at one of two."""
-        self.emitter.add(f"br i1 {condition.code}, label %{yes}, label %{no}")
-        self._ended = True
-
-    # --- places in memory ---
-
-    def place(self, value: Any) -> Any:
-        """A place for values like this one: its leaves are addresses."""
-        return rebuilt(value, iter([self.emitter.memory(kind) for kind, _ in leaves(value)]))
-
-    def write(self, place: Any, value: Any) -> None:
-        """Write a value to a place for it."""
-        for (kind, code), (_, address) in zip(leaves(value), leaves(place), strict=True):
-            self.emitter.add(f"store {kind} {code}, ptr {address}")
-
-    def read(self, place: Any) -> Any:
-        """The value at a place."""
-        names = []
-        for kind, address in leaves(place):
-            names.append(self.emitter.fresh())
-            self.emitter.add(f"{names[-1]} = load {kind}, ptr {address}")
-        return rebuilt(place, iter(names))
-
-    def assign(self, name: str, value: Any) -> None:
-        """Give a name a value."""
-        if name not in self._placed:
-            self.known[name] = value
-            return
-        value = self.fitting(name, value)
-        if name not in self._places:
-            self._places[name] = self.place(value)
-        self.write(self._places[name], value)
-
-    def fitting(self, name: str, value: Any) -> Any:
-        """The value as one that its place holds; raises `_Wider` where the place has to be another."""
-        value = self.widened(name, _unsure(at_run_time(value)))
-        if name in self._places:
-            value = self.converted(name, value, self._places[name])
-        return value
-
-    def widened(self, name: str, value: Any) -> Any:
-        """The value with the kinds of numbers that its place was found to need."""
-        if isinstance(value, Number):
-            kind = self._kinds.get(name, value.kind)
-            return self.emitter.as_kind(value, common_kind(value, Number(kind, "")))
-        parts = entries(value)
-        if parts is None:
-            return value
-        made = tuple(self.widened(f"{name}[{place}]", each) for place, each in enumerate(parts))
-        return Record(value.type, made) if isinstance(value, Record) else made
-
-    def converted(self, name: str, value: Any, place: Any) -> Any:
-        """A number, or a tuple's numbers, as those of the place; `_Wider` where it cannot hold them."""
-        if signature(value) == signature(place):
-            return value
-        if isinstance(value, Number) and isinstance(place, Number):
-            kind = common_kind(place, value)
-            if kind != place.kind:
-                self._kinds[name] = kind
-                raise _Wider
-            return self.emitter.as_kind(value, kind)
-        parts, places = entries(value), entries(place)
-        if parts is None or places is None or len(parts) != len(places):
-            if isinstance(value, Array) and isinstance(place, Array):
-                raise TypeError(f"{name} is an array of another shape, or another layout, than before")
-            raise TypeError(
-                f"{name} is a {type(value).__name__} here and a {type(place).__name__} before"
-            )
-        made = tuple(
-            self.converted(f"{name}[{at}]", *both)
-            for at, both in enumerate(zip(parts, places, strict=True))
-        )
-        return rebuilt(place, iter([code for each in made for _, code in leaves(each)]))
-
-    def lookup(self, name: str) -> Any:
-        """What a name stands for."""
-        if name in self._places:
-            return self.read(self._places[name])
-        return super().lookup(name)
-
     # --- statements ---
 
     def statements(self, body: Sequence[ast.stmt]) -> None:
         """Lower statements up to the one after which none is run."""
         for statement in body:
-            if self._ended:
+            if self.ended:
                 return
             self.line = statement.lineno
             getattr(self, f"do_{type(statement).__name__}", self.refuse)(statement)
@@ -291,9 +172,9 @@ class _Lowering(Expressions):
         if is_local(value):
             raise TypeError("it returns an array that it has made; pass one that it fills")
         if self._depth == 0 and not self._exit:
-            self._returned, self._ended = value, True
+            self._returned, self.ended = value, True
             return
-        value = self.widened("what is returned", _unsure(at_run_time(value)))
+        value = self.widened("what is returned", unsure(at_run_time(value)))
         if not self._exit:
             self._exit = self.label("exit")
             self._returned = self.place(value)
@@ -315,7 +196,7 @@ class _Lowering(Expressions):
         for label, body in ((yes, statement.body), (no, statement.orelse)):
             self.begin(label)
             self.statements(body)
-            if not self._ended:
+            if not self.ended:
                 self.go(after)
                 is_reached = True
         self._depth -= 1
@@ -338,14 +219,14 @@ class _Lowering(Expressions):
         self.begin(after)
         if is_endless and not any(isinstance(each, ast.Break) for each in ast.walk(statement)):
             self.emitter.add("unreachable")
-            self._ended = True
+            self.ended = True
 
     def inside(self, body: Sequence[ast.stmt], loop: _Loop, then: str) -> None:
         """The statements of a loop, after which it goes on at `then`."""
         self._loops.append(loop)
         self._depth += 1
         self.statements(body)
-        if not self._ended:
+        if not self.ended:
             self.go(then)
         self._depth -= 1
         self._loops.pop()
@@ -395,7 +276,7 @@ class _Lowering(Expressions):
         self._loops.append(_Loop(after, following))
         self._depth += 1
         yield index
-        if not self._ended:
+        if not self.ended:
             self.go(following)
         self._depth -= 1
         self._loops.pop()
@@ -415,9 +296,9 @@ class _Lowering(Expressions):
         for label, expression in zip(labels, (yes, no), strict=True):
             self.emitter.lines = []
             self.begin(label)
-            values.append(_unsure(at_run_time(self.value(expression))))
+            values.append(unsure(at_run_time(self.value(expression))))
             blocks.append(self.emitter.lines)
-        place = self.place(_common(*values))
+        place = self.place(common_value(*values))
         self.emitter.lines = before
         self.branch(condition, *labels)
         for value, block in zip(values, blocks, strict=True):
@@ -428,19 +309,3 @@ class _Lowering(Expressions):
         self.emitter.lines = before
         self.begin(after)
         return self.read(place)
-
-
-def _unsure(value: Any) -> Any:
-    """A number of which it is not known whether it is negative."""
-    return value._replace(natural=False) if isinstance(value, Number) else value
-
-
-def _common(one: Any, other: Any) -> Any:
-    """The one value, with numbers of the kinds that hold the other's too."""
-    if isinstance(one, Number) and isinstance(other, Number):
-        return one._replace(kind=common_kind(one, other))
-    parts, others = entries(one), entries(other)
-    if parts is None or others is None or len(parts) != len(others):
-        return one
-    made = tuple(map(_common, parts, others))
-    return Record(one.type, made) if isinstance(one, Record) else made

@@ -1,4 +1,4 @@
-"""Kernels as machine code: made by LLVM, kept on disk, loaded, and called with arrays as they are.
+"""Makes machine code of kernels through LLVM, keeps and loads it, and calls it with NumPy's arrays.
 
 A kernel is compiled for the kinds and sizes of its arguments: of arrays that a core works in all sizes
 are known, of all others those behind the first axis, up to 64 (see `_described`). Its key is all that it
@@ -33,12 +33,12 @@ from replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
+from replay.engine.compiling.identity import digest_of, identity
 from replay.engine.compiling.kernels.arguments import describe, letters, value_of, with_types
-from replay.engine.compiling.kernels.identity import digest_of, identity
 from replay.engine.compiling.kernels.lowering import lower
 from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
 from replay.engine.compiling.kernels.program import Program
-from replay.engine.compiling.kernels.telling import compiling
+from replay.engine.compiling.notices import compiling
 
 _ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"

@@ -1,4 +1,4 @@
-"""Numbers in LLVM's text: constants, arithmetic, comparisons, and the functions of NumPy and libm.
+"""Writes arithmetic and comparisons of numbers in LLVM's text.
 
 Nothing is contracted or reassociated, so that a result does not depend on how code was optimised.
 Divisions by zero give infinity or NaN.

@@ -1,4 +1,4 @@
-"""One kernel as LLVM's text: the functions that it is made of, each lowered once for its arguments."""
+"""Assembles one kernel as LLVM's text: each function lowered once for each kind of its arguments."""
 
 import ast
 import inspect

@@ -1,4 +1,4 @@
-"""What a kernel's names stand for while it is lowered: numbers, arrays, tuples, and what is known.
+"""Represents what a kernel's names stand for while it is lowered: numbers, arrays, tuples, constants.
 
 A value is a `Number`, an `Array`, a tuple of values, a `Record` (a NamedTuple of values), or anything of
 Python's that is known already: a number, a text, a function. Its leaves are what exists at run time:

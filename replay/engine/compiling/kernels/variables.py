@@ -1,4 +1,4 @@
-"""Which names of a function are one value wherever they are used, and which are places in memory."""
+"""Finds which names of a function are one value wherever they are used, and which need memory."""
 
 import ast
 from collections.abc import Sequence

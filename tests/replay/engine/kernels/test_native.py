@@ -17,8 +17,8 @@ import pytest
 
 from replay.engine.arrays import varying
 from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.compiling.identity import identity
 from replay.engine.compiling.kernels import arguments, native
-from replay.engine.compiling.kernels.identity import identity
 
 # --- the key -----------------------------------------------------------------------------------------
 
@@ -189,7 +189,7 @@ def test_another_process_loads_what_is_kept_and_it_holds_no_address(kernels: Pat
     path.unlink()
     compile_over_runs(kernel_of(doubled), allocates=False)(1, np.array([1.5]), np.zeros(1))
     assert path.read_bytes() == kept  # whatever lies where
-    text = native.program_of(kernel_of(doubled), (arguments.Kept("d", (None,), True),) * 2).text()
+    text = native.program_of(kernel_of(doubled), (arguments.KnownArray("d", (None,), True),) * 2).text()
     addresses = [int(number) for number in re.findall(r"(?<![\w%.])\d{9,}", text)]
     assert addresses == []
 

@@ -18,9 +18,9 @@ from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.engine.api.functions import batch, each_run, recursive
 from replay.engine.api.inputs import Floats, Given, Messages, OneRun
-from replay.engine.api.outputs import Estimates, Measured, Results, Told
+from replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.compiling.keeping import load
+from replay.engine.compiling.kernel_cache import load
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged
@@ -109,7 +109,7 @@ def walking(**more: Any) -> Estimator[Any]:
         "walks at random",
         parameters=SeededParameters,
         streams={"range": schemas.RANGE, "odometry": schemas.ODOMETRY},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=X,  # type: ignore[arg-type]
         optional=("odometry",),
         outputs={"detour": DETOUR},
@@ -144,14 +144,14 @@ def test_further_outputs_and_topics_that_may_be_absent() -> None:
     without = run(walking(), [make_run([1.0, 2.0], odometry=False)])
     assert len(without["/estimates/m/a/state"]) == 2
     assert len(without["/estimates/m/a/detour"]) == 0
-    assert "odometry (fuselog.Odometry, optional)" in walking().needs
+    assert "odometry (fuselog.Odometry, optional)" in walking().requirements
     vector = Schema("V", "v", (Field("sensor_time_ns", "time_ns"), Field("v", "vector")), package="t")
     with pytest.raises(BadInput, match="field v of its output extra is a vector"):
         recursive(
             "v",
             parameters=Parameters,
             streams={},
-            whole={},
+            static={},
             components=X,  # type: ignore[arg-type]
             outputs={"extra": vector},
             start=start,
@@ -178,7 +178,7 @@ def test_what_cannot_be_compiled_is_named_with_its_line() -> None:
         "wrong",
         parameters=Parameters,
         streams={"range": schemas.RANGE},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=X,  # type: ignore[arg-type]
         start=start,
         follow=slips,
@@ -198,7 +198,7 @@ def solved(shape: tuple[int, ...]) -> Estimator[Any]:
         seen = streams["range"]
         mean = mean + streams.generator.normal()
         innovation = seen["range_m"][:, None] - mean
-        told = Told(seen.publish_time_ns[:1], {"by": np.array([2]), "metres": np.array([0.5])})
+        told = Diagnostics(seen.publish_time_ns[:1], {"by": np.array([2]), "metres": np.array([0.5])})
         spread = np.full((len(seen), 1, 1), 4.0)
         return Estimates(
             seen.publish_time_ns[-1:],
@@ -212,7 +212,7 @@ def solved(shape: tuple[int, ...]) -> Estimator[Any]:
         "solves",
         parameters=SeededParameters,
         streams={"range": schemas.RANGE},
-        whole={"prior": schemas.GAUSSIAN_ESTIMATE},
+        static={"prior": schemas.GAUSSIAN_ESTIMATE},
         components=X,  # type: ignore[arg-type]
         measured={"range_m": "linear"},
         outputs={"detour": DETOUR},
@@ -301,7 +301,7 @@ def test_all_runs_at_once_are_one_call() -> None:
     given: dict[str, Any] = {
         "parameters": Parameters,
         "streams": {"range": schemas.RANGE},
-        "whole": {"prior": schemas.GAUSSIAN_ESTIMATE},
+        "static": {"prior": schemas.GAUSSIAN_ESTIMATE},
         "components": X,
         "start": start,
     }
@@ -319,7 +319,7 @@ def test_long_compiling_is_said_once(
 ) -> None:
     """While it happens, and not where the code was kept."""
     monkeypatch.setenv("FUSELOG_CACHE", str(tmp_path))
-    monkeypatch.setattr("replay.engine.compiling.kernels.telling._PATIENCE_S", 0.0)
+    monkeypatch.setattr("replay.engine.compiling.notices._PATIENCE_S", 0.0)
     caplog.set_level(logging.INFO, logger="fuselog")
     arguments = (np.ones((2, 2)), np.stack([np.eye(2)] * 2), np.eye(2), np.zeros(2))
     for _ in range(2):
@@ -336,9 +336,9 @@ def test_long_compiling_is_said_once(
 def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
     """On standard error, as nothing else is there; not where the program logs in its own way."""
     code = (
-        "import sys, logging, replay.engine.compiling.kernels.telling as telling, numpy as np\n"
+        "import sys, logging, replay.engine.compiling.notices as notices, numpy as np\n"
         "from replay.engine.compiling.compile import compiled\n"
-        "telling._PATIENCE_S = 0.0\n"
+        "notices._PATIENCE_S = 0.0\n"
         "if sys.argv[1:]: logging.basicConfig()\n"
         "from recorders.models.planar import wrap_angle\n"
         "for x in (1.0, 1): compiled(wrap_angle)(x)\n"

@@ -1,4 +1,4 @@
-"""Gathers what a kernel is made of: the sources of its functions and of all that they call."""
+"""Gathers the sources of a kernel's functions and of all that they call, for numba."""
 
 import ast
 import copy
@@ -25,7 +25,7 @@ class DoesNotCompile(BadInput):
     """What numba says of a function that it cannot compile, and of which line."""
 
 
-class Bundle:
+class KernelSource:
     """Sources in the order they are needed, each under a name that says what it is.
 
     The name has the hash of the source, in which the names of all that it needs stand: two closures of

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, Style, band, curve, thinned
+from pipeline.output.coverage import coverage_table
 from pipeline.output.results import MetricValue, Outcome, split_metric
-from pipeline.runs.coverage import coverage_table
 from replay.engine.replaying.usage import Row
 from replay.judging.errors.evaluation import Errors
 from replay.judging.judge import Judge

@@ -1,4 +1,4 @@
-"""What a model needs of a log, in words: for a list of models, and for a log that lacks something."""
+"""Says in words what a model requires of a log, in lists and for a log that lacks something."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -17,7 +17,7 @@ OWN_MODEL = (
 )
 
 
-def needs_of(model: Model) -> str:
+def requirements_of(model: Model) -> str:
     """What a log has to have for a model, in words; of one that can start without, what it may have."""
     words = [part.words for part in parts_of(model, UnderPrefix({}, "...", {}))]
     if model.start is None or model.control is None or not model.needs_sensor:

@@ -17,8 +17,13 @@ def untaken(source: Source, labels: Iterable[str], bound: Iterable[Any]) -> list
     """The topics of a log that an estimator does not take at all; truth, maps and controls are none."""
     taken: dict[str, set[str]] = {label: set() for label in labels}
     for each in bound:
-        opening = getattr(each, "opening", None)
-        own = {*each.streams, *each.whole, *each.priors, *(opening.topics if opening else ())}
+        initialization = getattr(each, "initialization", None)
+        own = {
+            *each.streams,
+            *each.static,
+            *each.priors,
+            *(initialization.topics if initialization else ()),
+        }
         taken.setdefault(each.name.partition("/")[0], set()).update(own)
     rows = []
     for name, topic in source.topics.items():

@@ -11,8 +11,8 @@ from mcap.writer import Writer
 from numpy.testing import assert_array_equal
 
 import fuselog as fl
-import pipeline.logs.edit as surgery
-from recorders.log import read_span
+from pipeline.logs import rewriting
+from recorders.log import LogWriter, read_span
 
 Fuselog = Callable[..., Any]
 ODOMETRY, RANGES, TRUTH = "/robot1/odometry", "/robot1/range_bearing", "/robot1/truth"
@@ -24,15 +24,15 @@ ESTIMATE = "/estimates/ekf/robot1/pose"
 def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks of few messages, so that every log has many."""
     monkeypatch.chdir(tmp_path)
-    read = surgery.read_blocks
-    monkeypatch.setattr(surgery, "read_blocks", lambda *a, **b: read(*a, **b, block_messages=20))
+    read = rewriting.read_blocks
+    monkeypatch.setattr(rewriting, "read_blocks", lambda *a, **b: read(*a, **b, block_messages=20))
 
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
     """A log whose chunks hold few messages, and whose epoch is not its first stamp."""
     recording = fl.record("landmarks", seed=3, duration_s=4.0)
-    with surgery.LogWriter(tmp_path / "run.mcap", recording.run, chunk_bytes=1 << 11) as writer:
+    with LogWriter(tmp_path / "run.mcap", recording.run, chunk_bytes=1 << 11) as writer:
         writer.write(recording.streams.values())
     return Path("run.mcap")
 

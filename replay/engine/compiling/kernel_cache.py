@@ -29,7 +29,7 @@ from replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
-from replay.engine.compiling.kernels.telling import compiling
+from replay.engine.compiling.notices import compiling
 
 # In place of the colours in which numba sets its error messages.
 _COLOURLESS = SimpleNamespace(

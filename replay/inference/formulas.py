@@ -1,4 +1,4 @@
-"""What a model says, as formulas: every function with its derivatives, by its components' names."""
+"""Writes a model's functions and their derivatives as formulas, by its components' names."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -75,7 +75,7 @@ def _of_motion(model: Model, motion: Motion) -> Iterator[tuple[str, list[str]]]:
     spread = [f"variance of {each}" for each in noise] or _spread(axes, motion.noise_block)
     yield "noise", _lines(motion.noise, {"state": state, **end}, spread, [])
     yield "control_noise", _lines(motion.control_noise, end, _spread(control), [])
-    yield "lost", _lines(motion.lost, {"state": state, **end}, _spread(axes), [])
+    yield "gap_noise", _lines(motion.gap_noise, {"state": state, **end}, _spread(axes), [])
     by_hand: Given = {"by_state": (axes, axes), "by_control": (axes, control)}
     yield "jacobians", _lines(motion.jacobians, {"state": state, **driven, **by_hand})
     gaussian: Given = {"mean": (state,), "covariance": (axes, axes)}
@@ -87,21 +87,24 @@ def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
     state, axes, measured = list(model.state), _axes(model), list(sensor.measured)
     noise = [f"noise{number}" for number in range(1, sensor.noises + 1)]
     entering = {"noise": noise} if noise else {}
-    about: Given = {"about": _about(sensor), "parameters": None}
+    reference: Given = {"reference": _reference(sensor), "parameters": None}
     told = [f"measured_{each}" if each in model.state else each for each in measured]
-    yield "measure", _lines(sensor.measure, {"state": state, **entering, **about}, told)
+    yield "measure", _lines(sensor.measure, {"state": state, **entering, **reference}, told)
     spread = [f"variance of {each}" for each in noise] or _spread(measured)
     yield "noise", _lines(sensor.noise, {"parameters": None}, spread)
-    yield "jacobian", _lines(sensor.jacobian, {"state": state, **about, "by_state": (measured, axes)})
+    yield (
+        "jacobian",
+        _lines(sensor.jacobian, {"state": state, **reference, "by_state": (measured, axes)}),
+    )
     gaussian: Given = {"mean": (state,), "covariance": (axes, axes)}
     filled: Given = {
         "predicted": (measured,),
         "spread": (measured, measured),
         "cross": (axes, measured),
     }
-    yield "moments", _lines(sensor.moments, {**gaussian, **about, **filled})
+    yield "moments", _lines(sensor.moments, {**gaussian, **reference, **filled})
     values = [f"measured_{each}" for each in measured]
-    given: Given = {"state": state, "measured": values, **about}
+    given: Given = {"state": state, "measured": values, **reference}
     yield "log_likelihood", _lines(sensor.log_likelihood, given, ["log_likelihood"])
 
 
@@ -110,8 +113,8 @@ def _axes(model: Model) -> list[str]:
     return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
 
-def _about(sensor: Sensor) -> list[str]:
-    """What the entries of `about` are, see `Sensor.about_size`."""
+def _reference(sensor: Sensor) -> list[str]:
+    """What the entries of `reference` are, see `Sensor.reference_size`."""
     names = [f"{_topic(each.topic)}_{name}" for each in sensor.maps for name in each.components]
     names += sensor.control.components if sensor.control else ()
     for name, size in sensor.fields.items():

@@ -21,7 +21,7 @@ from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import MemorySource, memory_source
 
 STREAMS = {"heading": schemas.BEARING}
-WHOLE = {"prior": schemas.GAUSSIAN_ESTIMATE}
+STATIC = {"prior": schemas.GAUSSIAN_ESTIMATE}
 
 
 class MeanParameters(Parameters):
@@ -68,7 +68,7 @@ def make_mean(*, compiled: bool = False) -> Estimator[MeanParameters]:
         "mean heading",
         parameters=MeanParameters,
         streams=STREAMS,
-        whole=WHOLE,
+        static=STATIC,
         components={"heading_rad": "angle"},
         truth="truth",
         measured={"heading_rad": "angle"},
@@ -92,7 +92,7 @@ MEAN_OF_ALL = batch(
     "mean heading of all",
     parameters=MeanParameters,
     streams=STREAMS,
-    whole=WHOLE,
+    static=STATIC,
     components={"heading_rad": "angle"},
     solve=each_run(solve),
 )

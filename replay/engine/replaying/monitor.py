@@ -1,4 +1,4 @@
-"""What is watched while an estimator goes through an ensemble, whatever the estimator.
+"""Monitors an estimator while it goes through the runs of an ensemble, whatever the estimator is.
 
 A run that fails ends alone: one that cannot start, whose code raises, whose covariance is none, whose
 stamps go back, or that goes silent. It gets no further messages and says nothing from there on, and the
@@ -6,10 +6,9 @@ others do not notice. Beside that, this counts for how much of each run there we
 time that the estimator took.
 """
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial, reduce
+from functools import partial, reduce
 from math import isqrt
 from typing import TypeVar
 
@@ -18,11 +17,11 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Clock, make_stream, schemas
-from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.replaying.coverage import Coverage
+from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
 from replay.engine.replaying.usage import Usage
 from replay.engine.streams.blocks import Ragged, join, ragged_rows
 from replay.engine.streams.failures import Failure, failure_stream, reason_of
-from replay.engine.vectors.covariances import ROUNDING
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,18 +34,10 @@ ESTIMATES = frozenset(
     schema.full_name
     for schema in (schemas.GAUSSIAN_ESTIMATE, schemas.ESTIMATE_SIZE, schemas.TRACK_ESTIMATE)
 )
-UNSOUND = (
-    "the estimate is no longer finite",
-    "the covariance is no longer positive definite",
-    "the stamps of its estimates go back",
-)
-NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK = range(len(UNSOUND))
-# A share of a variance: a covariance that is singular but for rounding, as of one particle, is one.
-INDEFINITE = 1e-9
 FOREVER = np.iinfo(np.int64).max
 
 
-class Watch:
+class RunMonitor:
     """One bound estimator over the runs of an ensemble; see the module.
 
     Attributes:
@@ -54,7 +45,7 @@ class Watch:
         runs: how many there are.
         seconds: how long the estimator worked.
         usage: what became of its measurements.
-        whole: the streams that it begins with.
+        static: the streams that it begins with.
         refused: what all runs of a part of an ensemble raised.
     """
 
@@ -63,7 +54,7 @@ class Watch:
     ) -> None:
         self.seconds = 0.0
         self.usage = Usage(name)
-        self.whole: Mapping[str, Ragged] = {}
+        self.static: Mapping[str, Ragged] = {}
         self.refused: BadInput | None = None
         self.name = name
         self.runs = runs
@@ -76,7 +67,7 @@ class Watch:
         self._unable: dict[int, str] = {}
         self._failed: dict[int, Failure] = {}
         self._told: dict[str, list[Ragged]] = {}
-        self._rhythms: dict[str, _Rhythm] = {}
+        self._coverages: dict[str, Coverage] = {}
         self._states: set[str] = set()
         self._speaks = False
 
@@ -93,7 +84,7 @@ class Watch:
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
-        self.usage.note_given(streams, self.whole)
+        self.usage.note_given(streams, self.static)
         began = time.perf_counter()
         try:
             try:
@@ -119,9 +110,9 @@ class Watch:
             self._speaks = True
             if schema in ESTIMATES:
                 case = topic.rpartition("/")[0]
-                rhythm = self._rhythms.setdefault(case, _Rhythm(topic, self._starts()))
-                if rhythm.topic == topic:
-                    rhythm.note(each)
+                coverage = self._coverages.setdefault(case, Coverage(topic, self._starts()))
+                if coverage.topic == topic:
+                    coverage.note(each)
             if schema == GAUSSIAN:
                 self._states.add(topic.rpartition("/")[0])
         return passed
@@ -152,7 +143,7 @@ class Watch:
         """
         rows = np.flatnonzero(self._last_ns >= 0)
         offsets = np.searchsorted(rows, np.arange(self.runs + 1))
-        cases = {case: rhythm.estimated_s() for case, rhythm in self._rhythms.items()}
+        cases = {case: coverage.estimated_s() for case, coverage in self._coverages.items()}
         if not self._speaks:
             cases = {f"/estimates/{self.name}": np.zeros(self.runs)}
         return [
@@ -239,12 +230,12 @@ class Watch:
         stream = estimates.stream
         if stream.schema.full_name != GAUSSIAN or not len(stream):
             return None
-        rhythm = self._rhythms.get(stream.topic.rpartition("/")[0])
-        before_ns = rhythm.last_ns if rhythm else np.full(self.runs, -1)
+        coverage = self._coverages.get(stream.topic.rpartition("/")[0])
+        before_ns = coverage.last_ns if coverage else np.full(self.runs, -1)
         rows, found = np.full(self.runs, FOREVER), np.full(self.runs, -1)
         mean, covariance = (np.ascontiguousarray(stream[name]) for name in ("mean", "covariance"))
         size = isqrt(covariance.shape[1])
-        _over_runs(find_unsound)(
+        unsound_over_runs(
             self.runs,
             estimates.offsets,
             stream.publish_time_ns,
@@ -282,18 +273,18 @@ class Watch:
 
         What has failed already is left out.
         """
-        rhythms = [self._rhythms[case] for case in self._states]
-        if not rhythms:
+        coverages = [self._coverages[case] for case in self._states]
+        if not coverages:
             return
-        mute = ~reduce(np.logical_or, (rhythm.said for rhythm in rhythms))
+        mute = ~reduce(np.logical_or, (coverage.said for coverage in coverages))
         found = mute
         if not self._is_batch:
-            silent = (rhythm.misses(self._last_ns) for rhythm in rhythms)
+            silent = (coverage.misses(self._last_ns) for coverage in coverages)
             found = mute | reduce(np.logical_and, silent)
         found = found & (self._last_ns >= 0)
         if not found.any():
             return
-        last_ns = reduce(np.maximum, (rhythm.last_ns for rhythm in rhythms))
+        last_ns = reduce(np.maximum, (coverage.last_ns for coverage in coverages))
         for run in set(np.flatnonzero(found).tolist()) - failed:
             if mute[run]:
                 self._failed[run] = Failure(int(self._first_ns[run]), "it gave no estimate")
@@ -303,153 +294,9 @@ class Watch:
             self._failed[run] = Failure(int(last_ns[run]), reason)
 
 
-class _Rhythm:
-    """At what intervals a case's estimates come, run by run, in bins of factors of two.
-
-    Intervals much longer than the usual one, and than a second, are gaps.
-    """
-
-    BINS = 64
-    SECOND = 30  # the bin of intervals about one second long, 2^30 ns
-    GAP = 4  # a gap is this many bins beyond the median: 8 to 32 times as long
-
-    def __init__(self, topic: str, starts_ns: Integers) -> None:
-        self.topic = topic
-        self.last_ns = starts_ns.copy()
-        self.said = np.zeros(len(starts_ns), bool)
-        # a bin's runs side by side: most runs use one or two bins, and the rest is never touched
-        self._counts = np.zeros((self.BINS, len(starts_ns)), np.int64)
-        self._sums_ns = np.zeros((self.BINS, len(starts_ns)))
-
-    def note(self, estimates: Ragged) -> None:
-        """Take in the stamps of a block."""
-        times_ns = estimates.stream.publish_time_ns
-        noted = self.said, self.last_ns, self._counts, self._sums_ns
-        _over_runs(note_intervals)(estimates.runs, estimates.offsets, times_ns, *noted)
-
-    def estimated_s(self) -> Floats:
-        """For how long (runs,) there were estimates, gaps left out."""
-        is_gap = np.arange(self.BINS)[:, None] > self._longest()
-        return np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
-
-    def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
-        """Whether the time (runs,) since each run's last estimate is a gap."""
-        interval = _bin_of(now_ns - self.last_ns)
-        missed: NDArray[np.bool_] = interval > self.SECOND
-        return missed & (interval > self._longest()) if missed.any() else missed
-
-    def _longest(self) -> Integers:
-        """The bin (runs,) of the longest intervals that are no gaps."""
-        reached = np.cumsum(self._counts, axis=0)
-        median = np.argmax(2 * reached >= reached[-1], axis=0)
-        return np.maximum(median + self.GAP, self.SECOND)
-
-
-def _bin_of(interval_ns: Integers) -> Integers:
-    return np.frexp(np.maximum(interval_ns, 1).astype(float))[1].astype(np.int64) - 1
-
-
 def _run_of(ragged: Ragged) -> Integers:
     return np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
 
 
 def _kept(ragged: Ragged, kept: NDArray[np.bool_]) -> Ragged:
     return Ragged(ragged.stream.take(kept), ragged_rows(kept, ragged.offsets))
-
-
-@cache
-def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    return compile_over_runs(run_once, allocates=False)
-
-
-def note_intervals(
-    run: int,
-    offsets: Integers,
-    time_ns: Integers,
-    said: NDArray[np.bool_],
-    last_ns: Integers,
-    counts: Integers,
-    sums_ns: Floats,
-) -> None:
-    """Take in the stamps of a run; see `_Rhythm`.
-
-    Args:
-        run: which.
-        offsets: (runs + 1,) of the stamps.
-        time_ns: (n,) the stamps.
-        said: (runs,) whether there were any.
-        last_ns: (runs,) the last one; negative where there is none.
-        counts: (BINS, runs) of the intervals of every bin, how many there are.
-        sums_ns: (BINS, runs) and their sum, exact up to 2^53 ns, a hundred days.
-    """
-    for row in range(offsets[run], offsets[run + 1]):
-        interval = time_ns[row] - last_ns[run]
-        if last_ns[run] >= 0 and interval > 0:
-            _, exponent = math.frexp(float(interval))
-            counts[exponent - 1, run] += 1
-            sums_ns[exponent - 1, run] += interval
-        said[run], last_ns[run] = True, time_ns[row]
-
-
-def find_unsound(
-    run: int,
-    offsets: Integers,
-    time_ns: Integers,
-    before_ns: Integers,
-    mean: Floats,
-    covariance: Floats,
-    rows: Integers,
-    found: Integers,
-    factor: Floats,
-) -> None:
-    """Fill the first row of a run that is no estimate, and which of `UNSOUND` it is.
-
-    Args:
-        run: which.
-        offsets: (runs + 1,) of the rows.
-        time_ns: (n,) stamps.
-        before_ns: (runs,) the last stamp before these.
-        mean: (n, d).
-        covariance: (n, t * t) row-major.
-        rows: (runs,) filled.
-        found: (runs,) filled.
-        factor: (t, t) to work in.
-    """
-    last_ns, size = before_ns[run], factor.shape[0]
-    for row in range(offsets[run], offsets[run + 1]):
-        wrong = -1
-        is_wrong = False
-        total = 0.0
-        for i in range(mean.shape[1]):
-            total += mean[row, i]
-        for i in range(covariance.shape[1]):
-            total += covariance[row, i]
-        if time_ns[row] < last_ns:
-            wrong = GOES_BACK
-        elif not np.isfinite(total):
-            wrong = NOT_FINITE
-        else:
-            for column in range(size):  # Cholesky
-                variance = covariance[row, column * size + column]
-                for i in range(column, size):
-                    entry = covariance[row, i * size + column]
-                    for k in range(column):
-                        entry -= factor[i, k] * factor[column, k]
-                    if i == column:
-                        is_wrong = not variance >= 0.0 or entry < -INDEFINITE * variance
-                        factor[i, i] = np.sqrt(entry) if entry > ROUNDING * variance else 0.0
-                    elif factor[column, column] > 0.0:
-                        factor[i, column] = entry / factor[column, column]
-                    else:  # nothing is left of this component: it cannot vary with another
-                        both = variance * covariance[row, i * size + i]
-                        is_wrong = entry * entry > INDEFINITE * both
-                        factor[i, column] = 0.0
-                    if is_wrong:
-                        wrong = NOT_POSITIVE_DEFINITE
-                if wrong >= 0:
-                    break
-        if wrong >= 0:
-            rows[run] = row
-            found[run] = wrong
-            break
-        last_ns = time_ns[row]

@@ -1,4 +1,4 @@
-"""What a function is made of, in words: its code, and that of all that it calls, with their constants.
+"""Describes what a function is made of in words: its code, constants, and all that it calls.
 
 Two functions with the same words do the same. They are found without reading sources: from compiled
 bytecode, closures and the globals that it names.

@@ -1,4 +1,4 @@
-"""Says that a kernel is compiled, where that takes long."""
+"""Reports that a kernel is being compiled, where that takes long."""
 
 import logging
 import sys

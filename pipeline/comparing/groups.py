@@ -1,0 +1,177 @@
+"""Groups the estimators of several sides that can be compared, run by run."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from pipeline.api.replays import Kind, replay
+from pipeline.comparing.sides import (
+    Given,
+    Side,
+    name_of,
+    of_estimates,
+    of_replay,
+    of_result,
+    of_trajectory,
+)
+from pipeline.output.results import RESULT_FILE
+from pipeline.runs.ensemble import Progress
+from recorders.errors import BadInput, choices, some_of
+from recorders.log import NotMcap, RunMetadata, open_log, schemas
+from recorders.trajectories import read_trajectory
+from replay.engine.streams.sources import LogSource, MemorySource, Source
+from replay.judging.errors.trajectory_streams import truth_of
+
+# So many settings that differ are named.
+NAMED = 8
+
+
+def runs_of(count: int) -> str:
+    """Say how many runs there are."""
+    return "1 run" if count == 1 else f"{count} runs"
+
+
+def sides_of(
+    paths: Sequence[Path],
+    estimators: Sequence[str | Mapping[str, Kind]],
+    truth: str | Path | None,
+    case: str | None,
+    progress: Progress,
+    *,
+    gap_limit_s: float,
+    recover: bool,
+) -> list[Given]:
+    """What every path stands for; logs without estimates are replayed together."""
+    kinds = [_kind_of(path, recover=recover) for path in paths]
+    logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
+    if logs and len(logs) < len(paths):
+        raise BadInput(f"{logs[0]}: is a log without estimates; make them with fuselog replay")
+    if logs:
+        if not estimators:
+            raise BadInput(f"{logs[0]}: is a log without estimates; name two estimators: -e ekf -e ukf")
+        done = replay(
+            [LogSource(open_log(path, recover=recover)) for path in logs],
+            estimators,
+            gap_limit_s=gap_limit_s,
+        )
+        return [of_replay(name_of(logs[0]), done, gap_limit_s)]
+    found: dict[int, Given] = {}
+    for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
+        if kind == "result":
+            found[number] = of_result(path, progress)
+        elif kind == "estimates":
+            found[number] = of_estimates(path, gap_limit_s, recover=recover)
+    if len(found) < len(paths):
+        source = _true_source(truth, list(found.values()))
+        topic = _truth_topic(source, case)
+        for number, path in enumerate(paths):
+            if number not in found:
+                found[number] = of_trajectory(path, source, topic, gap_limit_s)
+    return [found[number] for number in range(len(paths))]
+
+
+def _kind_of(path: Path, *, recover: bool) -> str:
+    if path.is_dir():
+        return "result" if (path / RESULT_FILE).is_file() else "estimates"
+    try:
+        log = open_log(path, recover=recover)
+    except NotMcap:
+        return "trajectory"
+    return "estimates" if any(topic.startswith("/estimates/") for topic in log.topics) else "log"
+
+
+def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
+    """The run that trajectories are of: that of the other sides, or the true trajectory alone."""
+    if truth is not None:
+        trajectory = read_trajectory(truth)
+        stream = truth_of(trajectory, "/truth")
+        epoch_ns = int(stream.publish_time_ns[0])
+        return MemorySource({"/truth": stream}, RunMetadata("trajectory", epoch_ns=epoch_ns), str(truth))
+    sources = {run: source for each in others for run, source in each.sources.items()}
+    if len(sources) != 1:
+        raise BadInput(
+            "a trajectory file has one run: compare it with the estimates log of that run, or give "
+            "the true trajectory with --truth"
+        )
+    return next(iter(sources.values()))
+
+
+def _truth_topic(source: Source, case: str | None) -> str:
+    truths = {
+        topic.rpartition("/")[0].removeprefix("/"): topic
+        for topic, each in source.topics.items()
+        if each.schema_name == schemas.TRUTH_STATE.full_name
+    }
+    if case is None and len(truths) == 1:
+        return next(iter(truths.values()))
+    if case not in truths:
+        known = some_of(truths) or "none"
+        raise BadInput(
+            f"{source.name}: name with --case the truth that trajectories are judged by: {known}"
+        )
+    return truths[case]
+
+
+def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Side]]:
+    """The sides to compare: the estimators of one thing, or each estimator of several things."""
+    for each in givens:
+        for label in labels:
+            if label not in each.labels and (len(each.labels) > 1 or len(givens) == 1):
+                raise BadInput(f"{each.name}: no estimates of {label}; {choices(label, each.labels)}")
+    if len(givens) == 1:
+        chosen = list(labels) or list(givens[0].labels)
+        if len(chosen) < 2:
+            raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give another side to compare with")
+        yield [givens[0].side(label, label) for label in chosen]
+        return
+    names = _distinct([each.name for each in givens])
+    common = list(labels) or [x for x in givens[0].labels if all(x in each.labels for each in givens)]
+    if not common and all(len(each.labels) == 1 for each in givens):
+        yield [each.side(each.labels[0], name) for each, name in zip(givens, names, strict=True)]
+        return
+    if not common:
+        told = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
+        raise BadInput(f"the sides have no estimator in common: {told}; name those to compare with -e")
+    for label in common:
+        suffix = f":{label}" if len(common) > 1 else ""
+        yield [
+            each.side(label if label in each.labels else each.labels[0], name + suffix)
+            for each, name in zip(givens, names, strict=True)
+        ]
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, numbered where two are the same."""
+    return [
+        f"{name}-{number}" if names.count(name) > 1 else name for number, name in enumerate(names, 1)
+    ]
+
+
+def unlike_runs(first: Side, second: Side) -> Iterator[str]:
+    """A sentence for what two sides do not share; raises BadInput where that is everything."""
+    runs = [list(dict.fromkeys(side.rows["run"])) for side in (first, second)]
+    common = [run for run in runs[0] if run in set(runs[1])]
+    if not common:
+        told = " and ".join(f"{each[0]}" if each else "nothing" for each in runs)
+        raise BadInput(
+            f"{first.name} and {second.name} have no run in common: they begin with {told}; compare "
+            "estimates of the same runs"
+        )
+    for side, own in zip((first, second), runs, strict=True):
+        alone = [run for run in own if run not in set(common)]
+        if alone:
+            yield f"only {side.name} has {runs_of(len(alone))}, left out: {', '.join(alone[:3])}" + (
+                ", ..." if len(alone) > 3 else ""
+            )
+    judged = [run for run in common if run in first.truths and run in second.truths]
+    apart = [run for run in judged if first.truths[run] != second.truths[run]]
+    if apart:
+        count = runs_of(len(apart))
+        yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
+    missing = "not stated"
+    names = dict.fromkeys([*first.settings, *second.settings])
+    values = {name: [side.settings.get(name, missing) for side in (first, second)] for name in names}
+    differing = [f"{name} {a} and {b}" for name, (a, b) in values.items() if a != b]
+    if differing:
+        more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
+        what = ", ".join(differing[:NAMED])
+        yield f"settings differ between {first.name} and {second.name}: {what}{more}"

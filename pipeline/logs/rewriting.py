@@ -1,0 +1,158 @@
+"""Rewrites logs block by block: which topics are taken, what is lost, and the log that is written."""
+
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.output.outputs import CHANGED_BY, CHANGES
+from recorders.errors import BadInput, UnknownName, choices
+from recorders.log import Log, LogWriter, RunMetadata, Stream, read_blocks, read_empty
+from recorders.log.container.sealed import OWN_NAMES
+from recorders.log.schemas import message_class
+from replay.engine.streams.sources import LogSource
+
+Blocks = Iterator[list[Stream]]
+
+
+# The scenario of a log that does not name one, as estimates of such a log have it.
+UNKNOWN = "unknown"
+
+
+class Changed(NamedTuple):
+    """The log that was written, how many messages each topic has there, and what else is to be said."""
+
+    path: Path
+    messages: dict[str, int]
+    notes: list[str]
+
+
+def stream_blocks(
+    log: Log, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
+) -> Blocks:
+    """Blocks of a span, each with its streams in the order of `topics`, which settles ties."""
+    for block in read_blocks(log, topics, start_ns=start_ns, end_ns=end_ns) if topics else ():
+        yield [block[topic] for topic in topics if topic in block]
+
+
+def write_changed(
+    target: Path,
+    run: RunMetadata,
+    empty: Sequence[Stream],
+    blocks: Iterable[list[Stream]],
+    notes: list[str],
+) -> Changed:
+    """Write the log; topics without messages are in it, as they were."""
+    messages = Counter({stream.topic: 0 for stream in empty})
+    with LogWriter(target, run) as writer:
+        writer.write(empty)
+        for block in blocks:
+            writer.write(block)
+            messages.update({stream.topic: len(stream) for stream in block})
+    return Changed(target, dict(messages), notes)
+
+
+def ranked(log: Log) -> list[str]:
+    """The topics in the order in which the log declares them: so its writer ordered equal stamps."""
+    return sorted(log.topics, key=lambda topic: log.topics[topic].channel_ids)
+
+
+def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
+    """The topics that are named, or match a pattern; all where there are none."""
+    for pattern in patterns:
+        if not any(fnmatchcase(topic, pattern) for topic in log.topics):
+            raise UnknownName(f"{log.path}: no topic {pattern}; {choices(pattern, log.topics)}")
+    return [
+        topic
+        for topic in ranked(log)
+        if not patterns or any(fnmatchcase(topic, pattern) for pattern in patterns)
+    ]
+
+
+def losses_of(log: Log) -> list[str]:
+    """What is missing from a log, or is in it beside its topics and is not carried over."""
+    foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
+    losses = [log.loss_statement] if log.loss_statement else []
+    if log.companions:
+        losses.append(
+            f"{log.path}: the companions for viewers are left out; to have them of the new log: "
+            "fuselog export LOG --to foxglove"
+        )
+    if foreign:
+        losses.append(
+            f"{log.path}: metadata of other programs is left out: {', '.join(sorted(foreign))}"
+        )
+    if attachments := log.container.attachments:
+        losses.append(
+            f"{log.path}: attachments, which fuselog does not read, are left out: "
+            f"{len(attachments)} ({', '.join(attachments)})"
+        )
+    return losses
+
+
+def readable_log(
+    log: Log, topics: Sequence[str], notes: list[str], asked: Sequence[str] = ()
+) -> list[str]:
+    """The topics that are columns; the messages and fields that are left out are noted.
+
+    Raises BadInput where a topic that is asked for by name, or every topic, is none.
+    """
+    chosen = []
+    for topic in topics:
+        stated = log.topics[topic]
+        try:
+            schema = read_empty(log, topic).schema
+        except BadInput as error:
+            if topic in asked:
+                raise
+            notes.append(f"{error}; its {stated.messages} messages are left out")
+            continue
+        chosen.append(topic)
+        described = log.container.schemas[log.container.channels[stated.channel_ids[0]].schema_id]
+        fields = message_class(described.data, described.name).DESCRIPTOR.fields
+        left_out = {field.name for field in fields} - {field.name for field in schema}
+        if left_out:
+            notes.append(
+                f"{log.path}: topic {topic}: fields that make no columns are left out: "
+                f"{', '.join(sorted(left_out))}"
+            )
+    if not chosen:
+        raise BadInput(
+            f"{log.path}: has no topic that fuselog reads; import it first, logs of ROS with: "
+            f"fuselog import ros {log.path}"
+        )
+    return chosen
+
+
+def run_of(log: Log, target: Path) -> RunMetadata:
+    """The log's run, with the place of the log that estimates are of as it is seen from the target."""
+    run = log.run or RunMetadata(UNKNOWN, epoch_ns=LogSource(log).epoch_ns)
+    if "log" not in run.notes:
+        return run
+    place = os.path.relpath((log.path.parent / run.notes["log"]).resolve(), target.resolve().parent)
+    return replace(run, notes={**run.notes, "log": place})
+
+
+def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
+    """What the logs say of their run if they are of one, else only their notes, all of them."""
+    runs = [run_of(log, target) for log in logs]
+    notes: dict[str, str] = {}
+    for log, run in zip(logs, runs, strict=True):
+        for subject, fact in run.notes.items():
+            if subject == CHANGED_BY:
+                continue
+            is_new = notes.get(subject, fact) == fact
+            notes[subject if is_new else f"{subject} ({log.path.name})"] = fact
+    first, *others = (replace(run, notes=notes) for run in runs)
+    if all(other == first for other in others) and not any(offsets_ns):
+        return first
+    return RunMetadata(UNKNOWN, epoch_ns=max(0, first.epoch_ns + offsets_ns[0]), notes=notes)
+
+
+def with_operation(run: RunMetadata, command: str, done: str) -> RunMetadata:
+    """The run, with what a command did to its log, after what was done before."""
+    before = [run.notes[CHANGES]] if CHANGES in run.notes else []
+    return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done]), CHANGED_BY: command})

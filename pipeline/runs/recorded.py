@@ -1,0 +1,139 @@
+"""Ensembles whole in memory: recorded, replayed and judged at once, where there is room."""
+
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import Any
+
+from pipeline.runs.ensemble import Progress, Settings, no_progress, replay_blocks
+from recorders.errors import BadInput
+from recorders.log import Clock
+from recorders.recording import record_run
+from replay.engine.replaying.estimator import bind
+from replay.engine.replaying.late import Late
+from replay.engine.replaying.replaying import Report, collect
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import Ensemble, MemorySource, Source, memory_source
+from replay.judging.errors.evaluation import Errors, Innovations, split_topic
+from replay.judging.judge import TIME_BINS, Judge
+from replay.judging.metrics.measuring import Output, find_metrics, measure
+from replay.judging.sets.errors import SetErrors
+
+# Of a run that was judged, so much is kept at least: its sums over time.
+KEPT_BYTES = 8 * TIME_BINS
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """An ensemble in memory, what the estimators made of it, and how that compares with the truth."""
+
+    sources: Sequence[MemorySource]
+    outputs: dict[str, Ragged]
+    errors: list[Errors]
+    innovations: list[Innovations]
+    sets: list[SetErrors]
+
+    @property
+    def judged(self) -> list[Errors | Innovations | SetErrors | Output]:
+        """All that metrics may judge."""
+        outputs = [
+            Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
+            for topic, rows in self.outputs.items()
+        ]
+        return [*self.errors, *self.innovations, *self.sets, *outputs]
+
+    def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
+        """The metrics of these names, of all where none is given; see `measure`."""
+        return measure(self.judged, find_metrics(names))
+
+
+def record_ensemble(
+    scenario: str,
+    parameters: Mapping[str, Any],
+    seed: int,
+    runs: int,
+    progress: Progress = no_progress,
+    executor: Executor | None = None,
+    first_run: int = 0,
+    all_runs: int = 0,
+) -> Ensemble[MemorySource]:
+    """Record so many runs of a scenario, each from its own random stream of `seed`.
+
+    Raises BadInput where the first one shows that memory cannot hold them, nor what is kept of all runs
+    where there are more.
+    """
+    record = partial(_record, scenario, dict(parameters), seed)
+    begin_s = time.perf_counter()
+    first = record(first_run)
+    took_s = time.perf_counter() - begin_s
+    # replay lays the runs end to end, which holds every column twice; estimates come on top
+    need_bytes = max(2 * runs * _size(first), all_runs * KEPT_BYTES)
+    all_runs = max(runs, all_runs)
+    require_memory(f"{all_runs} runs of {scenario}", need_bytes, took_s * all_runs)
+    numbers = range(first_run + 1, first_run + runs)
+    others = executor.map(record, numbers) if executor else map(record, numbers)
+    return Ensemble(progress(chain([first], others), f"recording {scenario}", runs))
+
+
+def require_memory(what: str, need_bytes: float, time_s: float | None = None) -> None:
+    """Raise BadInput with what something takes, where that is more memory than is free."""
+    time_too = "" if time_s is None else f", and about {time_s / 3600:.2g} hours"
+    import psutil  # which takes long to import
+
+    there_bytes = psutil.virtual_memory().available
+    if need_bytes > there_bytes:
+        need, there = (f"{each / 1e9:.3g} GB" for each in (need_bytes, there_bytes))
+        raise BadInput(
+            f"{what} take at least {need} of memory, where {there} are free{time_too}; "
+            "ask for fewer runs or shorter ones"
+        )
+
+
+def _size(source: MemorySource) -> int:
+    """Bytes of all columns of a run."""
+    return sum(
+        column.nbytes
+        for stream in source.streams.values()
+        for column in (stream.publish_time_ns, stream.log_time_ns, *stream.columns.values())
+    )
+
+
+def _record(scenario: str, parameters: Mapping[str, Any], seed: int, run: int) -> MemorySource:
+    return memory_source(*record_run(scenario, parameters, seed, run))
+
+
+def replay_ensemble(
+    sources: Sequence[MemorySource],
+    estimators: Settings,
+    *,
+    gap_limit_s: float,
+    progress: Progress = no_progress,
+) -> Replayed:
+    """Replay estimators (label -> parameters) over an ensemble and judge them against its truth."""
+    return judge(sources, replay_in_memory(sources, estimators, progress=progress), gap_limit_s)
+
+
+def replay_in_memory(
+    sources: Sequence[Source],
+    estimators: Settings,
+    *,
+    order: Clock = "publish_time",
+    late: Late | None = None,
+    progress: Progress = no_progress,
+) -> dict[str, Ragged]:
+    """Replay estimators (label -> parameters) over an ensemble; whole output streams by topic."""
+    outputs: dict[str, Ragged] = {}
+    for label in progress(estimators, "replaying", len(estimators)):
+        bound = bind(label, sources, estimators[label])
+        blocks = replay_blocks(sources, bound, Report(), order=order, late=late)
+        outputs |= collect(list(block.values()) for block in blocks)
+    return outputs
+
+
+def judge(sources: Sequence[MemorySource], outputs: dict[str, Ragged], gap_limit_s: float) -> Replayed:
+    """Errors, innovations and set errors of a replay's outputs."""
+    judged = Judge(sources, {}, gap_limit_s=gap_limit_s).add(outputs)
+    return Replayed(sources, outputs, judged.errors, judged.innovations, judged.sets)

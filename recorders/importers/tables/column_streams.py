@@ -1,0 +1,330 @@
+"""Guesses which streams the columns of a table are: inertial, fix, pose, odometry and others."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from recorders.importers.tables.columns import (
+    GuessedColumn,
+    GuessedTable,
+    largest_of,
+    length_of,
+    name_of,
+    names_of,
+    stated_unit,
+    stream_lines,
+    take,
+    take_axes,
+    unit_by_largest,
+    unit_by_size,
+)
+from recorders.importers.units import unit
+
+# What vectors are called.
+_ACCELEROMETERS = ("acc", "accel", "accelerometer", "acceleration", "specific_force", "a")
+_GYROSCOPES = ("gyr", "gyro", "gyroscope", "angular_velocity", "rate", "omega", "w", "g")
+_QUATERNIONS = ("quaternion", "quat", "orientation", "rotation", "q")
+_POSITIONS = ("pos", "position", "pose", "p", "translation", "t", "")
+_FORWARD_SPEED = (
+    r"(?!.*(ang|yaw|turn|rot|vert|lateral|wind))(.*_)?"
+    r"(v|vel|velocity|speed|v_?x|vel_?x|velocity_x|linear(_velocity|_speed)?(_x)?|forward)"
+)
+
+
+_YAW_RATE = (
+    r"w|(.*_)?(omega(_?z)?|(yaw|turn|heading|rotation)_?rate|(yaw|psi|theta|heading)_?dot|gyr(o|oscope)?_?z"
+    r"|gz|w_?z|ang(ular)?_?(vel(ocity)?|speed|rate)(_?z)?|angular(_z)?)"
+)
+
+
+_HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
+_EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
+_TARGET = (
+    r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
+)
+
+
+# No vehicle goes round a bend faster, and no turn rate of one is larger in rad/s.
+_LARGEST_ACCELERATION_MPS2 = 20.0
+_LARGEST_RATE_RADPS = 10.0
+
+
+def _inertial(table: GuessedTable) -> Iterator[str]:
+    columns = table.columns
+    whole = list(columns)
+    force = take_axes(columns, *_ACCELEROMETERS)
+    rate = take_axes(columns, *_GYROSCOPES)
+    if not (force and rate):
+        columns[:] = whole
+        return
+    force_unit, why = unit_by_size(force, {"m/s^2": (8, 12), "g": (0.8, 1.2), "mg": (800, 1200)})
+    largest = largest_of(rate)
+    rate_unit = stated_unit(rate[0], "rad/s") or ("deg/s" if largest > _LARGEST_RATE_RADPS else "rad/s")
+    yield from stream_lines(
+        f"{table.prefix}/inertial",
+        "InertialSample",
+        "the names are those of an accelerometer and of a gyroscope",
+        f"fields.specific_force_mps2 = {names_of(force)}",
+        f"fields.turn_rate_radps = {names_of(rate)}",
+        f"units.specific_force_mps2 = {json.dumps(force_unit)}   # {why}",
+        f"units.turn_rate_radps = {json.dumps(rate_unit)}   # the largest is {largest:.4g}",
+        "# The axes of the body are forward, left, up; to turn those of the sensor (roll, pitch, yaw):",
+        "# mounting_deg = [0, 0, 0]",
+    )
+
+
+def _magnetic(table: GuessedTable) -> Iterator[str]:
+    field = take_axes(table.columns, "mag", "magnetometer", "magnetic_field", "m")
+    if field:
+        sizes = {"uT": (15, 90), "G": (0.15, 0.9), "mG": (150, 900), "nT": (15e3, 90e3)}
+        given, why = unit_by_size(field, sizes)
+        yield from stream_lines(
+            f"{table.prefix}/magnetic_field",
+            "MagneticField",
+            "the names are those of a magnetometer",
+            f"fields.magnetic_field_ut = {names_of(field)}",
+            f"units.magnetic_field_ut = {json.dumps(given)}   # {why}",
+        )
+
+
+def _fix(table: GuessedTable) -> Iterator[str]:
+    place = take(table.columns, r"(.*_)?lat(itude)?", r"(.*_)?(lon|lng|long)(gitude)?")
+    if not place:
+        return
+    fields = ("latitude_deg", "longitude_deg")
+    lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
+    latitude, longitude = (largest_of([column]) for column in place)
+    if place[0].unit == "rad" or (latitude < np.pi / 2 and longitude <= np.pi):
+        lines += [f'units.{field} = "rad"   # latitudes up to {latitude:.4g}' for field in fields]
+    elif 90 < latitude <= 90e7:
+        lines += [
+            f"factors.{field} = 1e-7   # latitudes up to {latitude:.4g} are not degrees"
+            for field in fields
+        ]
+    height = take(table.columns, r"(.*_)?(alt|altitude|height|ellipsoidal_height|ele|elevation|h)")
+    if height:
+        lines.append(f"fields.altitude_m = {name_of(height[0])}")
+    deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u")
+    if deviations:
+        lines.append(f"deviations.covariance_m2 = {names_of(deviations)}")
+    elif dilution := take(table.columns, r"(.*_)?hdop"):
+        lines += [
+            "# Standard deviations, east, north, up: the dilution times the receiver's range error,",
+            "# horizontally divided by the root of 2. A guess of that error is 2 m; fill in your own.",
+            f"deviations.covariance_m2 = {names_of(3 * dilution)}",
+            "factors.covariance_m2 = [1.4, 1.4, 2.8]",
+        ]
+    else:
+        lines += [
+            "# No standard deviations are named; stated ones, east, north, up:",
+            "# deviations.covariance_m2 = [1, 1, 2]",
+        ]
+    why = "the names are a latitude and a longitude"
+    yield from stream_lines(f"{table.prefix}/fix", "GeodeticFix", why, *lines)
+
+
+def _target(table: GuessedTable) -> Iterator[str]:
+    """Ranges and bearings; one alone only with a target's number, since its name says too little."""
+    columns = table.columns
+    whole = list(columns)
+    number = take(columns, _TARGET)
+    distance = take(columns, r"(.*_)?(range|distance|dist)|r")
+    direction = take(columns, r"(.*_)?(bearing|azimuth)|angle|phi")
+    if not (distance and direction) and not (number and (distance or direction)):
+        columns[:] = whole
+        return
+    becomes = "Range" * bool(distance) + "Bearing" * bool(direction)
+    what = " and ".join(["a range"] * bool(distance) + ["a bearing"] * bool(direction))
+    lines = [f"fields.target_id = {name_of(each)}" for each in number]
+    if not number:
+        lines.append("# No column numbers the targets, so that all rows are of target 0.")
+    for each in distance:
+        lines.append(f"fields.range_m = {name_of(each)}")
+        if stated := stated_unit(each, "m"):
+            lines.append(f"units.range_m = {json.dumps(stated)}   # as its name says")
+    for each in direction:
+        in_unit, why = unit_by_largest(each, "rad", "deg", 2 * np.pi)
+        lines += [
+            f"fields.bearing_rad = {name_of(each)}",
+            f"units.bearing_rad = {json.dumps(in_unit)}   # {why}",
+            "# Bearings are anticlockwise from the sensor's x axis; if these are clockwise:",
+            "# factors.bearing_rad = -1",
+        ]
+    topic = {"RangeBearing": "range_bearing"}.get(becomes, becomes.lower())
+    why = f"the names are {what}" + " of numbered targets" * bool(number)
+    yield from stream_lines(f"{table.prefix}/{topic}", becomes, why, *lines)
+
+
+def _twist(table: GuessedTable) -> Iterator[str]:
+    columns = table.columns
+    whole = list(columns)
+    velocity = take_axes(columns, "linear", "linear_velocity")
+    rate = take_axes(columns, "angular", "angular_velocity")
+    if not (velocity and rate):
+        columns[:] = whole
+        return
+    yield from stream_lines(
+        f"{table.prefix}/twist",
+        "Twist",
+        "the names are a linear and an angular velocity along x, y and z",
+        f"fields.velocity_mps = {names_of(velocity)}",
+        f"fields.turn_rate_radps = {names_of(rate)}",
+    )
+
+
+def _odometry(table: GuessedTable) -> Iterator[str]:
+    both = take(table.columns, _FORWARD_SPEED, _YAW_RATE)
+    if not both:
+        return
+    speed, rate = both
+    speed_unit = stated_unit(speed, "m/s")
+    rate_unit, why = unit_by_largest(rate, "rad/s", "deg/s", _LARGEST_RATE_RADPS)
+    if rate_unit == "rad/s" and not stated_unit(rate, "rad/s"):
+        size = unit(speed_unit).size if speed_unit else 1.0
+        sideways = float(np.nanquantile(np.abs(size * speed.values * rate.values), 0.99))
+        if sideways > _LARGEST_ACCELERATION_MPS2:
+            rate_unit = "deg/s"
+            why = f"in rad/s its product with the speed would be {sideways:.3g} m/s^2"
+    yield from stream_lines(
+        f"{table.prefix}/odometry",
+        "Odometry",
+        "the names are a forward speed and a yaw rate",
+        f"fields.forward_mps = {name_of(speed)}",
+        f"fields.turn_radps = {name_of(rate)}",
+        f"units.forward_mps = {json.dumps(speed_unit or 'm/s')}   # "
+        + ("as its name says" if speed_unit else f"a guess: the largest is {largest_of([speed]):.4g}"),
+        f"units.turn_radps = {json.dumps(rate_unit)}   # {why}",
+        "# Yaw rates are anticlockwise seen from above; if these are clockwise:",
+        "# factors.turn_radps = -1",
+    )
+
+
+def _pose(table: GuessedTable) -> Iterator[str]:
+    """Positions with and without orientation, and orientations alone."""
+    columns = table.columns
+    place, factors = _position(columns)
+    turn = _quaternion(columns)
+    heading = take(columns, _HEADING) if place and not turn else []
+    if not (place or turn):
+        return
+    if place and (table.is_reference or heading):
+        why = "the names are a position and a heading, without a covariance, as the truth has them"
+        if table.is_reference:
+            why = "the file's name says that it is the truth"
+        yield from stream_lines(
+            f"{table.prefix}/truth", "TruthState", why, *_truth(place, factors, turn, heading)
+        )
+        return
+    lines = []
+    if place:
+        lines.append(f"fields.position_m = {names_of(place)}")
+        lines += [f"factors.position_m = {factors}"] * (-1 in factors)
+    if turn:
+        lines.append(f"fields.quaternion = {names_of(turn)}")
+    else:
+        ones = ", ".join("1" for _ in place)
+        lines.append(f"deviations.covariance_m2 = [{ones}]   # fill in the standard deviations")
+    if place:
+        lines += [
+            "# If this is the truth:",
+            '# topic = "/truth", becomes = "TruthState", and in place of the fields above',
+            *(f"# {line}" for line in _truth(place, factors, turn, heading)),
+        ]
+    names = ["a position"] * bool(place) + ["a unit quaternion"] * bool(turn)
+    becomes = "Orientation" if not place else "Pose" if turn else "PositionFix"
+    topic = {"PositionFix": "position"}.get(becomes, becomes.lower())
+    why = f"the names are {' and '.join(names)}"
+    yield from stream_lines(f"{table.prefix}/{topic}", becomes, why, *lines)
+
+
+def _position(columns: list[GuessedColumn]) -> tuple[list[GuessedColumn], list[int]]:
+    """The columns of a position, and what they are multiplied by to be of east, north and up."""
+    for up, sign in (("up", 1), ("down", -1)):
+        if found := take(columns, _EAST, _NORTH, f"(z_)?{up}|{up[0]}"):
+            return found, [1, 1, sign]
+    found = (
+        take_axes(columns, *_POSITIONS)
+        or take_axes(columns, *_POSITIONS, axes="xy")
+        or take(columns, _EAST, _NORTH)
+    )
+    return found, [1] * len(found)
+
+
+def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
+    """The columns w, x, y, z of a quaternion, or those of its parts 0 to 3, if its length is one."""
+    whole = list(columns)
+    found = next(
+        filter(
+            None,
+            (take_axes(columns, stem, axes=axes) for stem in _QUATERNIONS for axes in ("wxyz", "0123")),
+        ),
+        [],
+    )
+    if found and not 0.99 < length_of(found) < 1.01:
+        columns[:] = whole
+        return []
+    return found
+
+
+def _truth(
+    place: list[GuessedColumn],
+    factors: list[int],
+    turn: list[GuessedColumn],
+    heading: list[GuessedColumn],
+) -> list[str]:
+    """The lines of a TruthState of these columns."""
+    names = [f"{axis}_m" for axis, _ in zip("xyz", place, strict=False)]
+    names += [f"orientation_{part}" for part, _ in zip("wxyz", turn, strict=False)]
+    kinds = ["linear"] * len(place) + ["quaternion"] * len(turn)
+    lines, signs = [], [*factors, *[1] * len(turn)]
+    if heading:
+        names, kinds = [*names, "heading_rad"], [*kinds, "angle"]
+        in_unit, why = unit_by_largest(heading[0], "rad", "deg", 2 * np.pi)
+        lines.append(
+            f"units.state = {json.dumps([*['m'] * len(place), in_unit])}   # the heading: {why}"
+        )
+        if _is_compass(place, heading[0], unit(in_unit).size):
+            quarter = round(np.pi / 2 / unit(in_unit).size, 9)
+            lines.append("# By the path, the heading is clockwise from north; fuselog's is from east:")
+            lines.append(f"offsets.state = {[*[0] * len(place), quarter]}")
+            signs.append(-1)
+        else:
+            signs.append(1)
+    if -1 in signs:
+        lines.append(f"factors.state = {signs}")
+    return [
+        f"fields.state = {names_of([*place, *turn, *heading])}",
+        f'components = "{",".join(names)}"',
+        f'kinds = "{",".join(kinds)}"',
+        *lines,
+    ]
+
+
+def _is_compass(place: Sequence[GuessedColumn], heading: GuessedColumn, size_rad: float) -> bool:
+    """Whether a body that goes where it heads does so rather with a heading clockwise from north."""
+    steps = np.diff(place[0].values), np.diff(place[1].values)
+    course_rad = np.arctan2(steps[1], steps[0])
+    heading_rad = size_rad * heading.values[:-1]
+    length = np.hypot(*steps)
+    as_is, compass = (
+        np.nansum(length * np.cos(course_rad - each)) for each in (heading_rad, np.pi / 2 - heading_rad)
+    )
+    return bool(compass > as_is and compass > 0.5 * np.nansum(length))
+
+
+def _velocity(table: GuessedTable) -> Iterator[str]:
+    velocity = take_axes(table.columns, "vel", "velocity", "v") or take(table.columns, "ve", "vn", "vu")
+    if velocity:
+        yield from stream_lines(
+            f"{table.prefix}/velocity",
+            "VelocityFix",
+            "the names are a velocity along three axes",
+            f"fields.velocity_mps = {names_of(velocity)}",
+            "deviations.covariance_m2ps2 = [0.1, 0.1, 0.1]   # fill in the standard deviations",
+        )
+
+
+GUESSES: tuple[Callable[[GuessedTable], Iterator[str]], ...] = (
+    _inertial, _magnetic, _fix, _target, _twist, _velocity, _odometry, _pose,
+)  # fmt: skip

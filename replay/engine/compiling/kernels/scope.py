@@ -1,0 +1,54 @@
+"""Looks up what a lowered function's names stand for, and where in its source it is."""
+
+import builtins
+from itertools import count
+from types import FunctionType
+from typing import Any
+
+from replay.engine.compiling.kernels.known import (
+    from_python,
+)
+from replay.engine.compiling.kernels.numbers import (
+    Emitter,
+)
+from replay.engine.compiling.kernels.program import Program, definition_of
+
+
+class Scope:
+    """One function while it is lowered: where it is, and what its names stand for."""
+
+    def __init__(self, program: Program, function: FunctionType) -> None:
+        self.program = program
+        self.emitter = Emitter(self.fault if program.is_checked else None)
+        self.function = function
+        self.line = 0
+        self.known: dict[str, Any] = {}
+        self._outside = dict(zip(function.__code__.co_freevars, function.__closure__ or (), strict=True))
+        self._globals = function.__globals__
+        self._labels = count()
+
+    def place_in_source(self) -> str:
+        """The file and the line at work."""
+        _, file, above = definition_of(self.function)
+        return f"{file}, line {above + self.line}"
+
+    def fault(self) -> int:
+        """The number that stands for an index of the line at work that is beyond its array."""
+        self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
+        return len(self.program.faults)
+
+    def label(self, stem: str) -> str:
+        """A name for a block."""
+        return f"{stem}{next(self._labels)}"
+
+    def lookup(self, name: str) -> Any:
+        """What a name stands for."""
+        if name in self.known:
+            return self.known[name]
+        if name in self._outside:
+            return from_python(self._outside[name].cell_contents)
+        if name in self._globals:
+            return from_python(self._globals[name])
+        if hasattr(builtins, name):
+            return getattr(builtins, name)
+        raise NameError(f"{name} is not defined here")

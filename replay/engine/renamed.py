@@ -1,0 +1,50 @@
+"""Accepts the public names of the release before, and says what each is called now."""
+
+import warnings
+from collections.abc import Callable
+from functools import wraps
+from operator import attrgetter
+from typing import Any, TypeVar
+
+Target = TypeVar("Target", bound=Callable[..., Any])
+
+
+def renamed(**names: str) -> Callable[[Target], Target]:
+    """Let a function or a dataclass take arguments by their old names too, with a FutureWarning.
+
+    Args:
+        names: the new name of each argument, by the old one. A dataclass lets the field be read by its
+            old name as well.
+
+    >>> @renamed(length="length_m")
+    ... def area(length_m):
+    ...     return length_m**2
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always")
+    ...     area(length=2.0)
+    4.0
+    >>> print(caught[0].message)
+    area: 'length' is called 'length_m' now; the old name goes in the next release
+    """
+
+    def accepting(function: Callable[..., Any], owner: str) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*arguments: Any, **given: Any) -> Any:
+            for old in names.keys() & given.keys():
+                said = f"'{old}' is called '{names[old]}' now; the old name goes in the next release"
+                warnings.warn(f"{owner}: {said}", FutureWarning, stacklevel=2)
+                given[names[old]] = given.pop(old)
+            return function(*arguments, **given)
+
+        return call
+
+    def mark(target: Target) -> Target:
+        marked: Any = target
+        if not isinstance(target, type):
+            return accepting(target, target.__name__)  # type: ignore[return-value]
+        marked.__init__ = accepting(marked.__init__, target.__name__)
+        for old, new in names.items():
+            setattr(marked, old, property(attrgetter(new)))
+        return target
+
+    return mark

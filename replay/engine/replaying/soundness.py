@@ -1,0 +1,86 @@
+"""Finds estimates that are none: not finite, without a covariance, or stamped before the last one."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.vectors.covariances import ROUNDING
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+UNSOUND = (
+    "the estimate is no longer finite",
+    "the covariance is no longer positive definite",
+    "the stamps of its estimates go back",
+)
+NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK = range(len(UNSOUND))
+# A share of a variance: a covariance that is singular but for rounding, as of one particle, is one.
+INDEFINITE = 1e-9
+
+
+def find_unsound(
+    run: int,
+    offsets: Integers,
+    time_ns: Integers,
+    before_ns: Integers,
+    mean: Floats,
+    covariance: Floats,
+    rows: Integers,
+    found: Integers,
+    factor: Floats,
+) -> None:
+    """Fill the first row of a run that is no estimate, and which of `UNSOUND` it is.
+
+    Args:
+        run: which.
+        offsets: (runs + 1,) of the rows.
+        time_ns: (n,) stamps.
+        before_ns: (runs,) the last stamp before these.
+        mean: (n, d).
+        covariance: (n, t * t) row-major.
+        rows: (runs,) filled.
+        found: (runs,) filled.
+        factor: (t, t) to work in.
+    """
+    last_ns, size = before_ns[run], factor.shape[0]
+    for row in range(offsets[run], offsets[run + 1]):
+        wrong = -1
+        is_wrong = False
+        total = 0.0
+        for i in range(mean.shape[1]):
+            total += mean[row, i]
+        for i in range(covariance.shape[1]):
+            total += covariance[row, i]
+        if time_ns[row] < last_ns:
+            wrong = GOES_BACK
+        elif not np.isfinite(total):
+            wrong = NOT_FINITE
+        else:
+            for column in range(size):  # Cholesky
+                variance = covariance[row, column * size + column]
+                for i in range(column, size):
+                    entry = covariance[row, i * size + column]
+                    for k in range(column):
+                        entry -= factor[i, k] * factor[column, k]
+                    if i == column:
+                        is_wrong = not variance >= 0.0 or entry < -INDEFINITE * variance
+                        factor[i, i] = np.sqrt(entry) if entry > ROUNDING * variance else 0.0
+                    elif factor[column, column] > 0.0:
+                        factor[i, column] = entry / factor[column, column]
+                    else:  # nothing is left of this component: it cannot vary with another
+                        both = variance * covariance[row, i * size + i]
+                        is_wrong = entry * entry > INDEFINITE * both
+                        factor[i, column] = 0.0
+                    if is_wrong:
+                        wrong = NOT_POSITIVE_DEFINITE
+                if wrong >= 0:
+                    break
+        if wrong >= 0:
+            rows[run] = row
+            found[run] = wrong
+            break
+        last_ns = time_ns[row]
+
+
+unsound_over_runs = compile_over_runs(find_unsound, allocates=False)

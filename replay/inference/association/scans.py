@@ -1,0 +1,88 @@
+"""Holds unordered scans of detections in columns, and describes the kinds of sensors that give them."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.log import Schema
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.vectors.components import Components
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSensor:
+    """A kind of sensor of unordered scans.
+
+    Its functions take a target as (x_m, vx_mps, y_m, vy_mps), whatever the model's state is, and
+    `origin`, where the sensor is when it scans.
+
+    Attributes:
+        leaf, schema, fields: of the topic with its detections, beside that of its scans.
+        measured: the components of a detection.
+        measure: (target, origin, parameters) -> what it measures of a target.
+        noise: (target, origin, parameters) -> variances, or the rows of a lower triangle.
+        detection: (target, origin, parameters) -> how probable it is that the target is detected.
+        clutter: (detection, parameters) -> how many false detections there are per unit of what is
+            measured.
+        birth: (detection, origin, parameters) -> the position of a target that is there, the rows of
+            the lower triangle of its covariance, and how many m^2 of the plane a unit of what is
+            measured has there; None where a detection does not say enough.
+    """
+
+    leaf: str
+    schema: Schema
+    fields: tuple[str, ...]
+    measured: Components
+    measure: Function
+    noise: Function
+    detection: Function
+    clutter: Function
+    birth: Function | None = None
+
+
+class Scans(NamedTuple):
+    """The scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
+
+    Attributes:
+        offsets: (runs + 1,).
+        time_ns, sensor, kind, number: (scans,), whose each is: of which sensor, of which kind of
+            sensors, and its number there.
+        first, end: (scans,), its detections.
+        origin: (scans, 2), where the sensor is.
+        detection: (detections, 2), what is measured.
+    """
+
+    offsets: Integers
+    time_ns: Integers
+    sensor: Integers
+    kind: Integers
+    number: Integers
+    first: Integers
+    end: Integers
+    origin: Floats
+    detection: Floats
+
+
+BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
+
+
+def take_scans(scans: Scans, rows: Integers) -> Scans:
+    """Some of the scans, in this order, as those of one run."""
+    own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
+    counts = own["end"] - own["first"]
+    ends = np.cumsum(counts)
+    detections = np.arange(int(counts.sum())) + np.repeat(own["first"] - ends + counts, counts)
+    own |= {"first": ends - counts, "end": ends}
+    return Scans(np.array([0, len(rows)]), **own, detection=scans.detection[detections])
+
+
+def in_time(first: Scans, second: Scans) -> Scans:
+    """The scans of both, of one run, in time order; of equal stamps those of the first come first."""
+    shifted = second._replace(
+        first=second.first + len(first.detection), end=second.end + len(first.detection)
+    )
+    own = {name: np.concatenate([getattr(first, name), getattr(shifted, name)]) for name in BY_SCAN}
+    detection = np.concatenate([first.detection, second.detection])
+    both = Scans(np.array([0, len(own["time_ns"])]), **own, detection=detection)
+    return take_scans(both, np.argsort(both.time_ns, kind="stable"))

@@ -1,0 +1,139 @@
+"""Checks that a model is what it declares: sizes, kinds, variances and rates, before any method runs."""
+
+from typing import Any
+
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.arrays import Floats, Function
+from replay.engine.vectors.tangent import are_kinds
+from replay.inference.model.model import Model, Motion, Sensor
+from replay.tracing.functions import place_of
+
+
+def check_state(where: str, model: Model) -> None:
+    """Raise BadInput where a state's kinds are none."""
+    if not are_kinds(model.kinds):
+        raise BadInput(
+            f"{where}: a state of kinds {', '.join(model.kinds)}; give linear, angle, axis (two "
+            "side by side) or quaternion (four side by side)"
+        )
+
+
+def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> None:
+    """Call a motion's functions once, uncompiled.
+
+    `parameters` has a number for every parameter. Raises BadInput where a function fails, or
+    returns what the model denies.
+    """
+    state, control = trial_state(model.kinds), (0.0,) * model.controls
+    sizes = (model.tangent, motion.triangle(model.tangent))
+    entering = ((0.0,) * motion.noises,) if motion.noises else ()
+    _check(where, motion.move, (state, control, *entering, 1.0, parameters), (model.size,))
+    if motion.noises and (motion.noise is None or motion.control_noise is not None):
+        raise BadInput(
+            f"{where}: noise that is not additive needs its variances, `noise`, and takes that of the "
+            "control with it; leave out `control_noise`"
+        )
+    if motion.noise is not None:
+        wanted = (motion.noises,) if motion.noises else sizes
+        _check(where, motion.noise, (state, 1.0, parameters), wanted)
+    if motion.gap_noise is not None:
+        _check(where, motion.gap_noise, (state, 1.0, parameters), (model.tangent,))
+    if motion.control_noise is not None:
+        _check(where, motion.control_noise, (1.0, parameters), (model.controls,))
+
+
+def check_correction(where: str, model: Model) -> None:
+    """Call the functions of how a model is corrected once, uncompiled; see `check_motion`."""
+    if model.correct is not None:
+        state, error = trial_state(model.kinds), (0.0,) * model.tangent
+        _check(where, model.correct.along, (state,), (model.tangent,))
+        for moved in (model.correct.move, model.correct.back):
+            _check(where, moved, (state, error, error), (model.size,))
+        _check(where, model.correct.step, (state, state, error), (model.tangent,))
+
+
+def check_switching(where: str, model: Model, parameters: Any) -> None:
+    """Call the functions of a model's switching once, uncompiled; see `check_motion`."""
+    assert model.modes
+    assert model.switching
+    modes, switching = len(model.modes), model.switching
+    _check(where, switching.rates, (parameters,), (modes * (modes - 1),))
+    if switching.initial is not None:
+        _check(where, switching.initial, (parameters,), (modes,))
+
+
+def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Floats]:
+    """The rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
+
+    Raises BadInput where a rate is negative, or the probabilities are none.
+    """
+    assert model.modes
+    assert model.switching
+    names, switching = list(model.modes), model.switching
+    rates = np.array(switching.rates(parameters), float)
+    changes = [(begin, end) for begin in names for end in names if begin != end]
+    for (begin, end), rate in zip(changes, rates.tolist(), strict=True):
+        if not 0.0 <= rate < np.inf:
+            raise BadInput(
+                f"{where}: the rate from mode {begin} to {end} is {rate:g} per second; give zero or more"
+            )
+    initial = np.full(len(names), 1.0 / len(names))
+    if switching.initial is not None:
+        initial = np.array(switching.initial(parameters), float)
+    if not (np.all(initial >= 0.0) and abs(initial.sum() - 1.0) < 1e-9):
+        told = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
+        raise BadInput(
+            f"{where}: the initial probabilities of the modes are {told}; give numbers of zero or more "
+            "whose sum is one"
+        )
+    return rates, initial
+
+
+def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:
+    """Call a sensor's functions once, uncompiled; see `check_motion`."""
+    where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
+    unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
+    if unknown:
+        raise BadInput(f"{where}: measures a component of kind {unknown[0]}; give linear or angle")
+    state, reference = trial_state(model.kinds), (1.0,) * sensor.reference_size
+    entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
+    _check(where, sensor.measure, (state, *entering, reference, parameters), (size,))
+    if sensor.noise is None and (sensor.noises or not sensor.covariance):
+        raise BadInput(f"{where}: states no noise; give `noise`, or `covariance`, the field that has it")
+    if isinstance(sensor.covariance, str) and sensor.covariance and not sensor.vector:
+        raise BadInput(
+            f"{where}: the covariance {sensor.covariance} needs the field that it is of; give `vector`"
+        )
+    if callable(sensor.covariance) and sensor.read is None:
+        raise BadInput(
+            f"{where}: reads covariances of fields that it does not read; give `read` as well"
+        )
+    if sensor.noise is not None and not sensor.covariance:
+        wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
+        _check(where, sensor.noise, (parameters,), wanted)
+
+
+def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
+    """A state at which to try functions: numbers that differ, unit vectors."""
+    found: list[float] = []
+    while len(found) < len(kinds):
+        kind = kinds[len(found)]
+        number = 0.1 * (1 + len(found))
+        found += {"axis": [0.6, 0.8], "quaternion": [0.1, 0.5, -0.5, 0.7]}.get(kind, [number])
+    return tuple(found)
+
+
+def _check(where: str, function: Function, arguments: tuple[Any, ...], sizes: tuple[int, ...]) -> None:
+    what = f"{where}: {place_of(function)}"
+    with np.errstate(all="ignore"):
+        try:
+            found = function(*arguments)
+        except Exception as error:
+            raise BadInput(f"{what} raised {type(error).__name__}: {error}") from error
+    wanted = " or ".join(str(size) for size in dict.fromkeys(sizes))
+    if not isinstance(found, tuple):
+        raise BadInput(f"{what} returns a {type(found).__name__}; return a tuple of {wanted} components")
+    if len(found) not in sizes:
+        raise BadInput(f"{what} returns {len(found)} components; {wanted} are needed")

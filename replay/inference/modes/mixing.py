@@ -1,0 +1,201 @@
+"""Mixes the Gaussians of modes: the transition matrix, the weights of mixtures, and their moments."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.inference.kalman.steps import InnovationRecord
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
+from replay.inference.linear_algebra.manifold import (
+    boxminus,
+    boxplus,
+    by_right_jacobian,
+    is_flat,
+    tangent_size,
+)
+from replay.inference.linear_algebra.tuples import total
+
+TINY = 1e-280  # below it a probability loses digits
+LONGEST, TERMS = 0.125, 10  # of the series of expm: its argument, and so many terms are exact to 3e-18
+Matrix = tuple[tuple[float, ...], ...]  # its rows
+
+
+class InteractingMemory(NamedTuple):
+    """What the steps of one core work in.
+
+    Attributes:
+        filters: the memory of every mode's filter.
+        rates, transition: (M (M - 1),), and Pi (M, M).
+        weights: (M, M), row j those of all modes in the mixture of mode j.
+        predicted: (M,), the logarithms of c.
+        centre: (n,), the mean in whose tangent space mixtures are made.
+        away, carried: (M, t), (M, t, t), the modes' Gaussians there.
+        shift: (t,), of a mixture.
+        records: what every mode's update tells, first axis = mode.
+        open_gate: (m + 1,), bounds that let everything in.
+    """
+
+    filters: tuple[Any, ...]
+    rates: Floats
+    transition: Floats
+    weights: Floats
+    predicted: Floats
+    centre: Floats
+    away: Floats
+    carried: Floats
+    shift: Floats
+    records: InnovationRecord
+    open_gate: Floats
+
+
+@lru_cache(maxsize=16)
+def transition_matrix(modes: int) -> Function:
+    """`fill_transition(rates, duration_s, transition)`: fills Pi = expm(rates dt), by uniformisation.
+
+    With L dt added to its diagonal, L the fastest rate at which a mode is left, the matrix has no
+    negative entry, so that no digit is lost; exp(-L dt) takes it back. The duration is halved until the
+    series is short, and the result squared as often; what that leaves of the rows' sums is one.
+    """
+    changes = [(begin, end) for begin in range(modes) for end in range(modes) if begin != end]
+    rate_of = tuple(
+        tuple(changes.index((begin, end)) if begin != end else -1 for end in range(modes))
+        for begin in range(modes)
+    )
+    identity = tuple(tuple(float(i == j) for j in range(modes)) for i in range(modes))
+
+    def fill_transition(rates: Floats, duration_s: float, transition: Floats) -> None:
+        leaving = tuple(total(tuple(rates[each] for each in row if each >= 0)) for row in rate_of)
+        fastest = max(*leaving)
+        span_s, doublings = duration_s, 0
+        while fastest * span_s > LONGEST:
+            span_s, doublings = 0.5 * span_s, doublings + 1
+        a = tuple(
+            tuple(
+                span_s * (rates[rate_of[i][j]] if i != j else fastest - leaving[i]) for j in range(modes)
+            )
+            for i in range(modes)
+        )
+        p = identity
+        for power in range(TERMS, 0, -1):  # I + A (I + A / 2 (I + A / 3 ...))
+            scale, times = 1.0 / power, matrix_product(a, p)
+            p = tuple(
+                tuple(identity[i][j] + scale * times[i][j] for j in range(modes)) for i in range(modes)
+            )
+        factor = np.exp(-fastest * span_s)
+        p = tuple(tuple(factor * each for each in row) for row in p)
+        for _ in range(doublings):
+            p = matrix_product(p, p)
+        for i, row in enumerate(p):
+            whole = total(row)
+            for j, entry in enumerate(row):
+                transition[i, j] = entry / whole
+
+    return fill_transition
+
+
+def matrix_product(left: Matrix, right: Matrix) -> Matrix:
+    """The product of two matrices."""
+    return tuple(
+        tuple(
+            total(tuple(row[k] * right[k][j] for k in range(len(right)))) for j in range(len(right[0]))
+        )
+        for row in left
+    )
+
+
+def mixing_weights(modes: int) -> Function:
+    """`fill_weights(probability, log_probability, memory)`: the probabilities become c.
+
+    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still tell
+    it; a mode that none with any probability leads to keeps its own Gaussian.
+    """
+
+    def weigh_by_logarithms(end: int, log_probability: Floats, memory: InteractingMemory) -> float:
+        weights, transition = memory.weights, memory.transition
+        highest, total = -np.inf, 0.0
+        for begin in range(modes):
+            weights[end, begin] = 1.0 if begin == end else 0.0
+            if transition[begin, end] > 0.0:
+                highest = max(highest, log_probability[begin])
+        if highest == -np.inf:
+            return highest
+        for begin in range(modes):
+            weights[end, begin] = transition[begin, end]
+            if transition[begin, end] > 0.0:
+                weights[end, begin] *= np.exp(log_probability[begin] - highest)
+            total += weights[end, begin]
+        for begin in range(modes):
+            weights[end, begin] /= total
+        return highest + np.log(total)
+
+    def fill_weights(probability: Floats, log_probability: Floats, memory: InteractingMemory) -> None:
+        weights, predicted = memory.weights, memory.predicted
+        for end in range(modes):
+            total = 0.0
+            for begin in range(modes):
+                weights[end, begin] = probability[begin] * memory.transition[begin, end]
+                total += weights[end, begin]
+            if total < TINY:
+                predicted[end] = weigh_by_logarithms(end, log_probability, memory)
+                continue
+            predicted[end] = np.log(total)
+            for begin in range(modes):
+                weights[end, begin] /= total
+        for mode in range(modes):
+            log_probability[mode] = predicted[mode]
+            probability[mode] = np.exp(predicted[mode])
+
+    return fill_weights
+
+
+def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, Function]:
+    """Make the two halves of mixing the Gaussians of all modes.
+
+    Returns `to_common_tangent(mean, covariance, probability, memory)`, which carries them to the tangent
+    space of the likeliest, and `mix(weights, memory, mean, covariance)`, which fills mean and covariance
+    of a mixture of them.
+    """
+    add, subtract, flat = boxplus(kinds), boxminus(kinds), is_flat(kinds)
+    reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
+    n, t, turn, mix_covariances = len(kinds), tangent_size(kinds), form.turn, form.mix
+
+    def to_common_tangent(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
+        likeliest = likeliest_of(probability)
+        centre, away = memory.centre, memory.away
+        for row in range(n):
+            centre[row] = mean[likeliest, row]
+        for mode in range(len(probability)):
+            carried = memory.carried[mode]
+            subtract(mean[mode], centre, away, mode)
+            for row in range(t):
+                for column in range(t):
+                    carried[row, column] = covariance[mode, row, column]
+            if not flat:
+                turn(reset_back, away[mode], carried)
+
+    def mix(weights: Floats, memory: Any, mean: Floats, covariance: Floats) -> None:
+        away, carried, shift = memory.away, memory.carried, memory.shift
+        for row in range(t):
+            entry = 0.0
+            for mode in range(len(weights)):
+                entry += weights[mode] * away[mode, row]
+            shift[row] = entry
+        mix_covariances(weights, away, shift, carried, covariance)
+        for row in range(n):
+            mean[row] = memory.centre[row]
+        add(mean, shift)
+        if not flat:
+            turn(reset, shift, covariance)
+
+    return to_common_tangent, mix
+
+
+def likeliest_of(probability: Floats) -> int:
+    """The first mode than which none is more probable."""
+    likeliest = 0
+    for mode in range(1, len(probability)):
+        if probability[mode] > probability[likeliest]:
+            likeliest = mode
+    return likeliest

@@ -1,0 +1,190 @@
+"""Predicts and updates several Gaussians of one state, and the probabilities of each."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.log import make_stream, schemas
+from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.results import ALL_WELL, named
+from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
+from replay.inference.kalman.update import innovation_components, writing_innovation
+from replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
+from replay.inference.linear_algebra.tuples import range_of
+from replay.inference.model.stage import Stage
+from replay.inference.run.filtering import Filter
+from replay.inference.run.recursion import Estimates, Innovations
+
+
+class ModeBelief(NamedTuple):
+    """What is believed of the states, first axis = run: a Gaussian for each of M modes.
+
+    Attributes:
+        mean, covariance: (runs, M, n), (runs, M, t, t).
+        probability, log_probability: (runs, M), of the modes.
+    """
+
+    mean: Floats
+    covariance: Floats
+    probability: Floats
+    log_probability: Floats
+
+
+class Mixtures(NamedTuple):
+    """Estimates as the filter fills them in, see `recursion.Estimates`; and the modes' probabilities."""
+
+    end: Integers
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    probability: Floats
+
+
+def predicting(filters: Sequence[Steps]) -> Function:
+    """`predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
+    predictions = tuple(each.predict for each in filters)
+
+    def predict(
+        belief: Any,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        memories: Any,
+    ) -> bool:
+        well = True
+        for mode in range_of(len(predictions)):
+            predict_mode, memory = predictions[mode], memories[mode]
+            well = (
+                predict_mode(mode, belief, control, duration_s, parameters, sample_index, memory)
+                and well
+            )
+        return well
+
+    return predict
+
+
+def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function:
+    """The update of several Gaussians by sensor `number`, and of the probabilities of their modes.
+
+    `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
+    measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
+    do not compare. The innovation that is told is that of the mixture, whose covariance has the spread
+    of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
+    """
+    components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
+    places = tuple(components.index(name) for name in measured)
+    angular = tuple(kind == "angle" for kind in measured.values())
+    m, write_innovation = len(measured), writing_innovation(stage, number)
+
+    def blend(probability: Floats, memory: Any, record: InnovationRecord) -> float:
+        """Note the innovation of the mixture of all modes; returns its NIS."""
+        innovation, records = memory.filters[0].innovations[number], memory.records
+        difference, covariance, _ = innovation
+        for i in range(m):
+            first = records.difference[0, places[i]]
+            difference[i] = first
+            for mode in range(1, len(probability)):
+                away = wrap(records.difference[mode, places[i]] - first, angular[i])
+                difference[i] += probability[mode] * away
+        for i in range(m):
+            for j in range(i + 1):
+                entry, row, column = 0.0, places[i], places[j]
+                for mode in range(len(probability)):
+                    spread = wrap(records.difference[mode, row] - difference[i], angular[i])
+                    spread *= wrap(records.difference[mode, column] - difference[j], angular[j])
+                    entry += probability[mode] * (records.covariance[mode, row, column] + spread)
+                covariance[i, j] = covariance[j, i] = entry
+        write_innovation(innovation, record)
+        squared = whiten(innovation, drop_missing(innovation))[0]
+        if np.isnan(squared):  # singular but for digits that only factors have: the mean of the modes'
+            squared = 0.0
+            for mode in range(len(probability)):
+                squared += probability[mode] * records.numbers[mode, 0]
+        return squared
+
+    def update(
+        gaussians: Gaussian,
+        weights: tuple[Floats, Floats],
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        sample_index: int,
+        memory: Any,
+        record: InnovationRecord,
+    ) -> int:
+        probability, log_probability = weights
+        numbers, taken = memory.records.numbers, 0
+        for mode in range(len(probability)):
+            numbers[mode, 2] = 0.0
+        for bounds in (gate, memory.open_gate):
+            for mode in range(len(probability)):
+                if numbers[mode, 2] == 0.0:
+                    own = InnovationRecord(
+                        memory.records.difference[mode], memory.records.covariance[mode], numbers[mode]
+                    )
+                    outcome = update_mode(
+                        mode, gaussians, data, parameters, bounds, sample_index, memory.filters[0], own
+                    )
+                    if outcome != ALL_WELL:
+                        return outcome
+                    taken += int(numbers[mode, 2])
+            if taken == 0:
+                break
+        record.numbers[0] = blend(probability, memory, record)
+        record.numbers[1] = 0.0
+        record.numbers[2] = 1.0 if taken else 0.0
+        if taken:
+            record.numbers[1] = reweigh_modes(probability, log_probability, numbers)
+        return ALL_WELL
+
+    def reweigh_modes(probability: Floats, log_probability: Floats, numbers: Floats) -> float:
+        """Weigh the modes by their likelihoods; returns the logarithm of the whole."""
+        highest, total = -np.inf, 0.0
+        for mode in range(len(probability)):
+            log_probability[mode] += numbers[mode, 1]
+            highest = max(highest, log_probability[mode])
+        for mode in range(len(probability)):
+            probability[mode] = np.exp(log_probability[mode] - highest)
+            total += probability[mode]
+        likelihood = highest + np.log(total)
+        for mode in range(len(probability)):
+            log_probability[mode] -= likelihood
+            probability[mode] /= total
+        return likelihood
+
+    return update
+
+
+class MixtureFilter(Filter, ABC):
+    """A filter whose belief are several Gaussians, which tells their probabilities beside the state."""
+
+    @property
+    @abstractmethod
+    def names(self) -> Sequence[str]:
+        """What the Gaussians are of."""
+
+    def no_results(self, due: Integers, recorded: Integers, components: int) -> tuple[Any, Innovations]:
+        """Estimates and innovations to be filled in."""
+        (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
+        probability = np.empty((len(mean), len(self.names)))
+        return Mixtures(end, time_ns, mean, covariance, probability), innovations
+
+    def output_streams(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
+        """The streams of the state and of the modes' probabilities."""
+        modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
+        return [self.states(Estimates(*mixtures[:4]), offsets), modes]
+
+    def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
+        """The stream of the modes' probabilities (n, M)."""
+        stream = make_stream(
+            f"/estimates/{self.name}/{name}",
+            schemas.MODE_PROBABILITIES,
+            time_ns,
+            metadata=named(dict.fromkeys(self.names, "linear")),
+            probability=probability,
+        )
+        return Ragged(stream, offsets)

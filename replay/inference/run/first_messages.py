@@ -1,0 +1,70 @@
+"""Finds the first messages of every run, and describes what they determine."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.log import Clock, Stream
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from replay.inference.model.start import Start
+
+
+class Begun(NamedTuple):
+    """Holds where runs begin, to be filled in: stamps (runs,), FOREVER_NS for none; Gaussians."""
+
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+
+
+class Fact(NamedTuple):
+    """Holds a sentence to be reported, its stamps (runs,), and the runs that it holds for (runs,)."""
+
+    text: str
+    time_ns: Integers
+    is_so: Booleans
+
+
+def diagonal_places(size: int) -> Integers:
+    """Find the diagonal among the rows of a lower triangle."""
+    rows = np.arange(1, size + 1)
+    return np.cumsum(rows) - 1
+
+
+def run_count(first: Mapping[str, Ragged]) -> int:
+    """Count the runs."""
+    return next(iter(first.values())).runs
+
+
+def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
+    """Make the mean (n,) and sigmas (t,) of a state that nobody knows; NaN where none is given."""
+    sigmas = start.sigmas if start else {}
+    kinds = list(state.values())
+    mean = np.zeros(len(kinds))
+    for kind, columns in manifold_blocks(kinds):
+        if kind in ("axis", "quaternion"):
+            mean[columns.start] = 1.0
+    names = [name for name, _ in tangent_components(list(state), kinds)]
+    return mean, np.array([sigmas.get(name, np.nan) for name in names])
+
+
+def first_of_runs(
+    ragged: Ragged, clock: Clock, usable: Booleans | None
+) -> tuple[Integers, Booleans, Integers]:
+    """Find the first usable message of every run (runs,): its stamp, whether there is one, its row."""
+    every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
+    place = np.searchsorted(every, ragged.offsets)
+    has_one = place[1:] > place[:-1]
+    rows = np.zeros(ragged.runs, np.int64)
+    rows[has_one] = every[place[:-1][has_one]]
+    time_ns = np.zeros(ragged.runs, np.int64)
+    time_ns[has_one] = ragged.stream.times(clock)[rows[has_one]]
+    return time_ns, has_one, rows
+
+
+def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
+    """Lay out a stream of one message for each of some runs."""
+    return Ragged(stream, np.append(0, np.cumsum(has_one)))

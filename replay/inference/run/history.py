@@ -1,0 +1,150 @@
+"""Keeps the latest messages of every run, and what a filter believed after each."""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.inference.kalman.update import innovation_components
+from replay.inference.model.stage import Stage
+from replay.inference.run.events import data_columns
+from replay.inference.run.recursion import (
+    NOTHING,
+    FilterEvents,
+    RecursionState,
+)
+
+BEFORE_ALL_NS = np.iinfo(np.int64).min
+Structure = tuple[tuple[str, Any], ...]
+
+
+class KeptMessages(NamedTuple):
+    """Holds messages in order, and the belief after each; first axis = run and message.
+
+    Attributes:
+        time_ns, source, data, target_id: see `recursion.FilterEvents`; the last of uint32.
+        position: in the file.
+        after: what was carried after the message.
+        has_innovation: whether it was an update, and so has an innovation.
+        difference, covariance, numbers: see `steps.InnovationRecord`.
+    """
+
+    time_ns: Integers
+    source: Integers
+    data: Floats
+    target_id: Any
+    position: Integers
+    after: RecursionState
+    has_innovation: Booleans
+    difference: Floats
+    covariance: Floats
+    numbers: Floats
+
+
+class History(NamedTuple):
+    """Holds the latest messages of every run.
+
+    Attributes:
+        start_ns: (runs,) stamps of the priors.
+        first, counts: (runs,) which rows are a run's: run r has C rows of `kept`, of which `counts[r]`
+            are filled, from row r C + first[r] on. What was carried after the first of them is where
+            the others are repeated from.
+        kept: (runs C).
+    """
+
+    start_ns: Integers
+    first: Integers
+    counts: Integers
+    kept: KeptMessages
+
+    @property
+    def capacity(self) -> int:
+        """Count the rows of every run."""
+        return len(self.kept.time_ns) // max(len(self.first), 1)
+
+    @property
+    def rows(self) -> Integers:
+        """List the filled rows, run by run."""
+        begin = np.arange(len(self.first)) * self.capacity + self.first
+        before = np.cumsum(self.counts) - self.counts
+        return np.repeat(begin - before, self.counts) + np.arange(self.counts.sum())
+
+    @property
+    def offsets(self) -> Integers:
+        """Return offsets by which run r has the rows offsets[r]:offsets[r + 1] of `rows`."""
+        return np.append(0, np.cumsum(self.counts))
+
+    def with_room(self, capacity: int) -> "History":
+        """Copy it with so many rows for every run, of which the filled ones are the first."""
+        rows, runs = self.rows, np.arange(len(self.first))
+        places = np.repeat(runs * capacity - self.offsets[:-1], self.counts) + np.arange(len(rows))
+
+        def moved(column: Any) -> Any:
+            if isinstance(column, tuple):
+                made: Any = type(column)
+                return made(*map(moved, column))
+            wider = np.zeros((len(runs) * capacity, *column.shape[1:]), column.dtype)
+            wider[places] = column[rows]
+            return wider
+
+        return self._replace(
+            first=np.zeros_like(self.first), counts=self.counts.copy(), kept=moved(self.kept)
+        )
+
+
+def no_history(stage: Stage, carried: RecursionState) -> History:
+    """Make the history before all messages: the priors alone."""
+    runs, innovation_size, (width, _) = (
+        len(carried.time_ns),
+        len(innovation_components(stage.sensors)),
+        data_columns(stage),
+    )
+    kept = KeptMessages(
+        np.full(runs, BEFORE_ALL_NS),
+        np.full(runs, NOTHING),
+        np.zeros((runs, width)),
+        np.zeros(runs, np.uint32),
+        np.full(runs, -1),
+        carried,
+        np.zeros(runs, bool),
+        *(
+            np.zeros((runs, *shape))
+            for shape in ((innovation_size,), (innovation_size, innovation_size), (3,))
+        ),
+    )
+    return History(carried.time_ns, np.zeros(runs, np.int64), np.ones(runs, np.int64), kept)
+
+
+def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
+    """Count the most messages of a run that lie within a window, of those kept and those that come."""
+    most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
+    for run, (begin, end) in enumerate(zip(events.offsets[:-1], events.offsets[1:], strict=True)):
+        before_ns = kept_ns[kept[run] + 1 : kept[run + 1]]
+        time_ns = np.sort(np.concatenate([before_ns, events.time_ns[begin:end]]))
+        through = np.searchsorted(time_ns, time_ns + window_ns, side="right")
+        most = max(most, int((through - np.arange(len(time_ns))).max(initial=0)))
+    return most
+
+
+def structure_of(rows: Any) -> Structure:
+    """Describe a NamedTuple of arrays, or of such NamedTuples: their names and numbers of axes."""
+    return tuple(
+        (name, structure_of(column) if isinstance(column, tuple) else column.ndim)
+        for name, column in zip(rows._fields, rows, strict=True)
+    )
+
+
+@lru_cache(maxsize=64)
+def copying_rows(structure: Structure) -> Function:
+    """Make `copy(source, i, target, j)`: row i of a NamedTuple of arrays to row j of another."""
+    columns = tuple(name for name, of in structure if not isinstance(of, tuple))
+    groups = tuple((name, copying_rows(of)) for name, of in structure if isinstance(of, tuple))
+
+    def copy(source: Any, i: int, target: Any, j: int) -> None:
+        for name in columns:
+            getattr(target, name)[j] = getattr(source, name)[i]
+        for name, copy_group in groups:
+            copy_group(getattr(source, name), i, getattr(target, name), j)
+
+    return copy

@@ -1,0 +1,42 @@
+"""Draws the samples of randomised filters: a generator for every run, a set for every event."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from replay.engine.arrays import Integers
+from replay.inference.run.recursion import (
+    FilterEvents,
+)
+from replay.sampling.samplers import Sampler
+from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
+
+
+def seeded_generators(
+    generators: tuple[Any, ...], events: FilterEvents, count: int, seed: int
+) -> tuple[Any, ...]:
+    """Seed generators of every sampled function and run, by the seed and the run's first data."""
+    runs = len(events.offsets) - 1
+    before = generators or ((None,) * runs,) * count
+    return tuple(
+        seeded_by_data(each, events.data, events.offsets, seed, function)
+        for function, each in enumerate(before)
+    )
+
+
+def sample_sets(
+    samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
+) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
+    """Iterate over runs and their samples; the largest random function says how many runs at once."""
+    drawn = [index for index, each in enumerate(samplers) if each.redrawn]
+    if not drawn:
+        sets = tuple(next(sets_by_runs(each, (), offsets))[1] for each in samplers)
+        yield slice(0, len(offsets) - 1), sets
+        return
+    largest = max(drawn, key=lambda index: samplers[index].count * (samplers[index].dimension + 1))
+    for part, most in sets_by_runs(samplers[largest], generators[largest], offsets):
+        span = offsets[part.start : part.stop + 1]
+        others = (
+            most if index == largest else next(sets_by_runs(each, generators[index][part], span))[1]
+            for index, each in enumerate(samplers)
+        )
+        yield part, tuple(others)

@@ -1,0 +1,186 @@
+"""Puts events where they belong in time: delays, an interpolated control, and times of output alone."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.streams.blocks import last_of_equals, ragged_rows
+from replay.inference.model.parameters import number_fields
+from replay.inference.model.stage import Stage
+from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
+
+EARLY = 1000  # of the times asked for: a prior of longer before is one of another time
+
+
+def where_wanted(stage: Stage, events: FilterEvents) -> Booleans:
+    """Tell which of the last events of their stamps want an estimate: none of the control alone."""
+    control = stage.model.control
+    if control is None or control.estimates or not stage.sensors:
+        return events.wants_estimate
+    stamp: Integers = np.cumsum(events.wants_estimate) - events.wants_estimate
+    sensed = np.zeros(int(stamp[-1]) + 1 if len(stamp) else 0, bool)
+    sensed[stamp[events.source != CONTROL]] = True
+    return events.wants_estimate & sensed[stamp]
+
+
+def delays_of(stage: Stage, settings: Floats) -> Integers:
+    """Compute how long before their stamps messages were measured, in ns, by an event's source.
+
+    (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
+    """
+    names, control = number_fields(stage.model.parameters), stage.model.control
+    asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
+    asked += [(0, ""), (0, control.delay if control else "")]
+    delays_s = [settings[row, names.index(name)] if name else 0.0 for row, name in asked]
+    return np.rint(1e9 * np.array(delays_s)).astype(np.int64)
+
+
+def compensate_delays(
+    stage: Stage, events: FilterEvents, delays_ns: Integers, *, is_end: bool
+) -> tuple[FilterEvents, FilterEvents]:
+    """Move events to the times at which they were measured, in order; returns those that wait as well.
+
+    What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
+    something older may come.
+    """
+    runs = len(events.offsets) - 1
+    run = np.repeat(np.arange(runs), np.diff(events.offsets))
+    time_ns = events.time_ns - delays_ns[events.source]
+    last_ns = np.append(events.time_ns, 0)[events.offsets[1:] - 1]
+    settled = is_end | (time_ns < last_ns[run] - delays_ns.max())
+    waiting = select_events(events, ~settled)
+    measured = select_events(events._replace(time_ns=time_ns), settled)
+    order = np.lexsort((measured.time_ns, run[settled]))
+    columns: Any = (column[order] for column in measured[1:])
+    measured = FilterEvents(measured.offsets, *columns)
+    measured = measured._replace(wants_estimate=last_of_stamps(measured))
+    return measured._replace(wants_estimate=where_wanted(stage, measured)), waiting
+
+
+def last_of_stamps(events: FilterEvents) -> Booleans:
+    """Tell whether the next event of the run has another stamp, or arrived at another time."""
+    return last_of_equals(events.offsets, events.time_ns, *events.arrival.T[:1])
+
+
+def output_times(
+    offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
+) -> FilterEvents:
+    """Make events that are only times: run r owns offsets[r]:offsets[r + 1]."""
+    count = len(time_ns)
+    nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
+    reference, arrival = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
+    return FilterEvents(offsets, time_ns, *nothing, np.full(count, wants_estimate), reference, arrival)
+
+
+def join_events(first: FilterEvents, second: FilterEvents) -> FilterEvents:
+    """Join two sequences of events in time, run by run; at equal stamps those of the first go first."""
+    first, second = _with_arrivals(first, second), _with_arrivals(second, first)
+    runs = len(first.offsets) - 1
+    run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for each in (first, second)])
+    order = np.lexsort((np.concatenate([first.time_ns, second.time_ns]), run))
+    columns: Any = (
+        np.concatenate([one, other])[order] for one, other in zip(first[1:], second[1:], strict=True)
+    )
+    return FilterEvents(first.offsets + second.offsets, *columns)
+
+
+def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
+    """Add arrivals to events where others have them: times of output alone arrive at their stamps."""
+    if events.arrival.shape[1] >= other.arrival.shape[1]:
+        return events
+    time_ns = events.time_ns
+    return events._replace(arrival=np.stack([time_ns, np.full(len(time_ns), -1)], axis=1))
+
+
+def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
+    """Select some of the events."""
+    columns: Any = (column[chosen] for column in events[1:])
+    return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
+
+
+def interpolate_control(
+    events: FilterEvents, controls: int, gap_ns: float = np.inf
+) -> tuple[FilterEvents, FilterEvents]:
+    """Interpolate the control at events, linear between messages; returns those that wait as well.
+
+    What comes after a run's last control message waits for the next, with that message before it. From
+    one message that comes more than a gap before the next, up to that, the control is NaN.
+    """
+    data, is_control = events.data.copy(), events.source == CONTROL
+    ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
+    columns = range(data.shape[1] - controls, data.shape[1])
+    for begin, end in pairwise(events.offsets):
+        at = begin + np.flatnonzero(is_control[begin:end])
+        if not len(at):
+            continue
+        inside = slice(begin, at[-1] + 1)
+        times_ns, wanted_ns = (events.time_ns[rows] - events.time_ns[begin] for rows in (at, inside))
+        for column in columns:
+            data[inside, column] = np.interp(wanted_ns, times_ns, data[at, column])
+        for late in np.flatnonzero(np.diff(times_ns) > gap_ns):
+            data[at[late] + 1 : at[late + 1] + 1, -controls:] = np.nan
+        ready[inside], waiting[begin : at[-1]] = True, False
+    again = events._replace(wants_estimate=events.wants_estimate & ~ready)  # one estimate is enough
+    return select_events(events._replace(data=data), ready), select_events(again, waiting)
+
+
+def fill_control(stage: Stage, events: FilterEvents) -> FilterEvents:
+    """Fill the known control of events where sensors read it."""
+    data = events.data.copy()
+    for number, sensor in enumerate(stage.sensors):
+        if sensor.control is not None:
+            rows, controls = events.source == number, len(sensor.control.components)
+            begin = len(sensor.measured) + sensor.control_start
+            data[rows, begin : begin + controls] = data[rows, -controls:]
+    return events._replace(data=data)
+
+
+def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float = np.inf) -> FilterEvents:
+    """Hold the last control for events that wait for one that does not come, for up to a gap.
+
+    `initial` holds in a run in which there was none.
+    """
+    data = events.data.copy()
+    for begin, end in pairwise(events.offsets):
+        if begin < end:
+            is_control = events.source[begin] == CONTROL
+            control = data[begin, -len(initial) :].copy() if is_control else initial
+            data[begin:end, -len(initial) :] = control
+            late = events.time_ns[begin:end] - events.time_ns[begin] > gap_ns
+            data[begin:end][late & is_control, -len(initial) :] = np.nan
+    return events._replace(data=data)
+
+
+def add_output_times(
+    events: FilterEvents, start_ns: Integers, next_output: Integers, every_ns: int
+) -> tuple[FilterEvents, Integers]:
+    """Add regular times of output between events, at which an estimate is wanted.
+
+    From the prior on, or, where that is more than EARLY such times before the run's first event, from
+    there on.
+    """
+    times, runs, next_outputs = [], [], next_output.copy()
+    for number, (begin, end) in enumerate(pairwise(events.offsets)):
+        if begin == end:
+            continue
+        first_ns, last_ns = events.time_ns[begin], events.time_ns[end - 1]
+        is_old = next_output[number] == 0 and first_ns - start_ns[number] > EARLY * every_ns
+        begins_ns = int(first_ns if is_old else start_ns[number])
+        first = max(int(next_output[number]), -(-begins_ns // every_ns))
+        stop = max(int(last_ns) // every_ns + 1, first)
+        wanted = np.arange(first, stop) * every_ns
+        own = events.time_ns[begin:end][events.wants_estimate[begin:end]]
+        wanted = wanted[~np.isin(wanted, own)]
+        next_outputs[number] = stop
+        times.append(wanted)
+        runs.append(np.full(len(wanted), number))
+    if not times:
+        return events, next_outputs
+    offsets = np.searchsorted(np.concatenate(runs), np.arange(len(events.offsets)))
+    width = events.data.shape[1]
+    return join_events(
+        events, output_times(offsets, np.concatenate(times), width, wants_estimate=True)
+    ), next_outputs

@@ -1,0 +1,177 @@
+"""Predicts and updates the covariance of a filter that linearises at the true states."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, Integers
+from replay.inference.kalman.predict import motion_derivative, motion_noise
+from replay.inference.kalman.steps import (
+    NO_TRUTH,
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Steps,
+    Workspace,
+    workspace,
+)
+from replay.inference.kalman.update import linear_sensor, sensor_noise
+from replay.inference.linear_algebra.gaussian import (
+    cholesky,
+    downdate,
+    drop_missing,
+    kalman_step,
+    multiply_into,
+    propagate_covariance,
+    whiten,
+)
+from replay.inference.linear_algebra.tuples import tuple_of
+from replay.inference.model.stage import Stage
+
+
+class TrueTrajectory(NamedTuple):
+    """What is carried along the true trajectories; first axis = run.
+
+    Attributes:
+        mean: (runs, n) the true state.
+        covariance: (runs, t, t) what a filter that linearises there has.
+        transition, noise: (runs, t, t) since the last node.
+        information: (runs, t, t) of what was measured since then: the sum of H' R^-1 H.
+    """
+
+    mean: Floats
+    covariance: Floats
+    transition: Floats
+    noise: Floats
+    information: Floats
+
+
+class Nodes(NamedTuple):
+    """Estimates as the recursion fills them in, with the step to each; see `TrueTrajectory`."""
+
+    end: Integers
+    time_ns: Integers
+    mean: Floats
+    covariance: Floats
+    transition: Floats
+    noise: Floats
+    information: Floats
+
+
+class BoundMemory(NamedTuple):
+    """What one core works in: the true states at all events (events, n), and noise (m, m) by sensor."""
+
+    truth: Floats
+    noise: tuple[Floats, ...]
+    work: Workspace
+
+
+def bound_steps(stage: Stage) -> Steps:
+    """The steps of an extended Kalman filter that knows where it is."""
+    model, motion = stage.model, stage.motion
+    n, t = model.size, model.tangent
+    read_state, read_control = tuple_of(n), tuple_of(model.controls)
+    linearise = motion_derivative(model, motion, by_state=True)
+    add_noise = motion_noise(model, motion)
+
+    def predict(
+        run: int,
+        trajectory: TrueTrajectory,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        event: int,
+        memory: BoundMemory,
+    ) -> bool:
+        mean, work = trajectory.mean[run], memory.work
+        state = read_state(mean)
+        linearise(state, read_control(control), duration_s, parameters, work)
+        multiply_into(work.transition, trajectory.transition[run], work.product)
+        propagate_covariance(trajectory.noise[run], work.transition, work.product)
+        add_noise(state, trajectory.noise[run], duration_s, parameters, work)
+        propagate_covariance(trajectory.covariance[run], work.transition, work.product)
+        add_noise(state, trajectory.covariance[run], duration_s, parameters, work)
+        for i in range(n):
+            mean[i] = memory.truth[event, i]
+        return True
+
+    def estimate(run: int, trajectory: TrueTrajectory, nodes: Nodes, row: int, _: Any) -> None:
+        for i in range(n):
+            nodes.mean[row, i] = trajectory.mean[run, i]
+        for i in range(t):
+            for j in range(t):
+                nodes.covariance[row, i, j] = trajectory.covariance[run, i, j]
+                nodes.transition[row, i, j] = trajectory.transition[run, i, j]
+                nodes.noise[row, i, j] = trajectory.noise[run, i, j]
+                nodes.information[row, i, j] = trajectory.information[run, i, j]
+                trajectory.transition[run, i, j] = 1.0 if i == j else 0.0
+                trajectory.noise[run, i, j] = trajectory.information[run, i, j] = 0.0
+
+    def memory(sets: tuple[Any, ...]) -> BoundMemory:
+        sizes = [len(sensor.measured) for sensor in stage.sensors] or [0]
+        return BoundMemory(sets[0], tuple(np.empty((m, m)) for m in sizes), workspace(stage))
+
+    updates = tuple(bound_update(stage, number) for number in range(len(stage.sensors)))
+    return Steps(memory, predict, updates, estimate)
+
+
+def bound_update(stage: Stage, number: int) -> Function:
+    """The update by sensor `number` as if it had measured what is predicted: nothing moves."""
+    innovate, add_noise = linear_sensor(stage, number), sensor_noise(stage.sensors[number])
+    m = len(stage.sensors[number].measured)
+
+    def update(
+        run: int,
+        trajectory: TrueTrajectory,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        event: int,
+        memory: BoundMemory,
+        record: InnovationRecord,
+    ) -> int:
+        mean, covariance, work = trajectory.mean[run], trajectory.covariance[run], memory.work
+        if np.isnan(mean[0]):
+            return NO_TRUTH
+        innovate(mean, covariance, data, parameters, event, work)
+        innovation, noise = work.innovations[number], memory.noise[number]
+        for i in range(m):
+            for j in range(m):
+                noise[i, j] = 0.0
+        add_noise(noise, data, parameters, work)
+        size = 0
+        for i in range(m):
+            if not np.isnan(innovation.difference[i]):
+                for k in range(len(covariance)):
+                    work.rows[size, k] = work.rows[i, k]
+                for j in range(m):
+                    noise[size, j] = noise[i, j]
+                for j in range(m):
+                    noise[j, size] = noise[j, i]
+                size += 1
+        add_information(trajectory.information[run], work.rows, noise, size)
+        drop_missing(innovation)
+        for i in range(size):
+            innovation.difference[i] = 0.0
+        if np.isnan(whiten(innovation, size)[0]):
+            return NOT_POSITIVE_DEFINITE
+        kalman_step(innovation, size, work.step)
+        downdate(covariance, innovation.cross_covariance, size)
+        return NOTHING_MEASURED  # there is no innovation to tell of
+
+    return update
+
+
+def add_information(information: Floats, rows: Floats, noise: Floats, size: int) -> None:
+    """Add H' R^-1 H of the first rows; R becomes its factor. NaN where R is not positive definite."""
+    t = len(information)
+    if not cholesky(noise, noise, size):
+        information[0, 0] = np.nan
+    for i in range(size):
+        for k in range(t):
+            for j in range(i):
+                rows[i, k] -= noise[i, j] * rows[j, k]
+            rows[i, k] /= noise[i, i]
+        for row in range(t):
+            for column in range(t):
+                information[row, column] += rows[i, row] * rows[i, column]

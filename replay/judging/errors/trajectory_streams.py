@@ -1,0 +1,86 @@
+"""Reads the trajectories of estimates and truths from the streams of a log."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from recorders.errors import BadInput
+from recorders.log import Stream, make_stream, schemas
+from recorders.trajectories import Trajectory
+from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from replay.judging.errors.alignment import HEADING
+from replay.judging.errors.evaluation import POSITION
+from replay.judging.errors.trajectories import POSE_KINDS
+
+
+def trajectory_of(stream: Stream) -> Trajectory | None:
+    """The poses that a truth or an estimate stream states; None where it states no position.
+
+    What the position lacks is zero, as the height of a robot in the plane; a heading is a rotation about
+    the vertical. Poses that are not finite are left out.
+    """
+    components = stated_components(stream.metadata, {}, f"topic {stream.topic}")
+    names, kinds = list(components), list(components.values())
+    if POSITION[0] not in names or len(set(names).intersection(POSITION)) < 2:
+        return None
+    column = "mean" if "mean" in stream.columns else "state"
+    state = stream[column].reshape(len(stream), len(names))
+    state, stamps = state[known := np.isfinite(state).all(axis=1)], stream.publish_time_ns[known]
+    position_m = np.zeros((len(state), 3))
+    for axis, name in enumerate(POSITION):
+        if name in names:
+            position_m[:, axis] = state[:, names.index(name)]
+    rotation = None
+    turns = [columns for kind, columns in manifold_blocks(kinds) if kind == "quaternion"]
+    if len(turns) == 1:
+        rotation = Rotation.from_quat(state[:, turns[0]], scalar_first=True).as_matrix()
+    elif components.get(HEADING) == "angle":
+        rotation = Rotation.from_euler("z", state[:, [names.index(HEADING)]]).as_matrix()
+    return Trajectory(stream.topic, position_m, rotation, stamps)
+
+
+def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
+    """A trajectory as an estimate stream, in those of the truth's components that it states.
+
+    It states no covariance: that is zero, of which there is no NEES.
+
+    Raises BadInput where the trajectory has no stamps, or the truth none of its components.
+    """
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+    stated = stated_components(truth.metadata, {}, f"topic {truth.topic}")
+    columns = {
+        name: trajectory.position_m[:, axis] for axis, name in enumerate(POSITION) if name in stated
+    }
+    if trajectory.rotation is not None:
+        turned = Rotation.from_matrix(trajectory.rotation)
+        quaternion = [name for name, kind in stated.items() if kind == "quaternion"]
+        if len(quaternion) == 4:
+            columns |= zip(quaternion, turned.as_quat(scalar_first=True).T, strict=True)
+        elif stated.get(HEADING) == "angle":
+            columns[HEADING] = turned.as_euler("ZYX")[:, 0]
+    if not columns:
+        raise BadInput(f"{trajectory.name}: topic {truth.topic} states no position to judge it by")
+    kinds = [stated[name] for name in columns]
+    width = len(tangent_components(list(columns), kinds))
+    count = len(trajectory)
+    return make_stream(
+        topic,
+        schemas.GAUSSIAN_ESTIMATE,
+        trajectory.time_ns,
+        metadata={"components": ",".join(columns), "kinds": ",".join(kinds), "truth": truth.topic},
+        mean=np.stack(list(columns.values()), axis=1),
+        covariance=np.zeros((count, width * width)),
+    )
+
+
+def truth_of(trajectory: Trajectory, topic: str) -> Stream:
+    """A trajectory as a truth stream; raises BadInput where it has no stamps."""
+    if trajectory.time_ns is None:
+        raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
+    names, state = [*POSITION], trajectory.position_m
+    if trajectory.rotation is not None:
+        turned = Rotation.from_matrix(trajectory.rotation).as_quat(scalar_first=True)
+        names, state = [*names, "qw", "qx", "qy", "qz"], np.hstack([state, turned])
+    metadata = {"components": ",".join(names), "kinds": ",".join(POSE_KINDS[: len(names)])}
+    return make_stream(topic, schemas.TRUTH_STATE, trajectory.time_ns, metadata=metadata, state=state)
