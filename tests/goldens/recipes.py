@@ -184,6 +184,10 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
         estimators={"ekf": AUGMENTED},
         alone=True,
     ),
+    # factors in place of covariances
+    "landmarks-square-root": Recipe(
+        "landmarks", parameters=SHORT, estimators={"sqrt:ekf": {}, "smoother:sqrt:ukf": {}}, alone=True
+    ),
     **{
         f"landmarks-late-{late.partition(':')[0]}": Recipe(
             "landmarks", parameters=OVERTAKING, estimators={"ekf": {}, "ukf": {}}, alone=True, late=late

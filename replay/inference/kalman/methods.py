@@ -6,19 +6,20 @@ Each makes the steps of a filter for one model. `ekf` and `iekf` need nothing bu
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 
 from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters
+from recorders.parameters import Parameters, build
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.results import ALL_WELL
+from replay.inference.kalman.forms import extended, sampled
 from replay.inference.kalman.predict import linear_motion, motion_noise
-from replay.inference.kalman.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.kalman.square_root import FACTORED
 from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
@@ -26,7 +27,6 @@ from replay.inference.kalman.steps import (
     Steps,
     Workspace,
     gaussian_filter,
-    workspace,
 )
 from replay.inference.kalman.update import (
     kalman_update,
@@ -108,6 +108,12 @@ class RegressionParameters(MethodParameters):
     seed: NonNegativeInt = 0
 
 
+class SquareRootParameters(UnscentedParameters):
+    """`filter` is the one whose covariances are carried as factors, ekf or ukf."""
+
+    filter: Literal["ekf", "ukf"] = "ekf"
+
+
 @dataclass(frozen=True, eq=False)
 class Method:
     """Describes one way to estimate the state of any model.
@@ -134,14 +140,6 @@ class Method:
     made_for: Callable[[Any], "Method"] | None = None
     filtering: Callable[..., Any] | None = None
     takes_all_modes: bool = False
-
-
-def _extended(stage: Stage) -> Steps:
-    updates = (
-        kalman_update(stage, number, linear_sensor(stage, number))
-        for number in range(len(stage.sensors))
-    )
-    return gaussian_filter(stage, linear_motion(stage), tuple(updates))
 
 
 def _iterated(stage: Stage) -> Steps:
@@ -229,35 +227,6 @@ def iterated_update(stage: Stage, number: int) -> Function:
     return update
 
 
-def _sampled(stage: Stage) -> Steps:
-    """Make steps by regression at samples; what is linear is passed on exactly."""
-    model, motion = stage.model, stage.motion
-    dimensions: list[int] = []
-    shapes: list[tuple[int, tuple[str, ...]]] = []
-    predict = linear_motion(stage)
-    if not motion.linear:
-        predict = sampled_motion(stage, 0)
-        dimensions.append(model.tangent + motion.noises)
-        shapes.append((motion.noises, model.kinds))
-    updates = []
-    for number, sensor in enumerate(stage.sensors):
-        innovate = linear_sensor(stage, number)
-        if not sensor.linear:
-            innovate = sampled_sensor(stage, number, len(shapes))
-            dimensions.append(model.tangent + sensor.noises)
-            shapes.append((sensor.noises, tuple(sensor.measured.values())))
-        updates.append(kalman_update(stage, number, innovate))
-
-    def memory(sets: tuple[Any, ...]) -> Workspace:
-        made = (
-            sample_memory(each, model.kinds, noises, outputs)
-            for each, (noises, outputs) in zip(sets, shapes, strict=True)
-        )
-        return workspace(stage, tuple(made))
-
-    return gaussian_filter(stage, predict, tuple(updates), memory, tuple(dimensions))
-
-
 def _analytic(stage: Stage) -> Steps:
     motion = stage.motion
     predict = linear_motion(stage)
@@ -272,6 +241,15 @@ def _analytic(stage: Stage) -> Steps:
         for number, sensor in enumerate(stage.sensors)
     )
     return gaussian_filter(stage, predict, updates)
+
+
+def no_steps(stage: Stage) -> Steps:
+    """Refuse to make steps: for a method that `Method.made_for` makes for its parameters."""
+    raise AssertionError("the method was not made for its parameters")
+
+
+def _square_root(parameters: SquareRootParameters) -> Method:
+    return _SQUARE_ROOTS[parameters.filter]
 
 
 def _exact_motion(stage: Stage) -> Function:
@@ -352,18 +330,18 @@ def _lacks_moments(model: Model) -> str:
 
 
 FILTERS: Mapping[str, Method] = {
-    "ekf": Method("extended Kalman filter", MethodParameters, _extended, lacks=_lacks_slopes),
+    "ekf": Method("extended Kalman filter", MethodParameters, extended, lacks=_lacks_slopes),
     "iekf": Method("iterated extended Kalman filter", MethodParameters, _iterated, lacks=_lacks_slopes),
     "ukf": Method(
         "unscented Kalman filter",
         UnscentedParameters,
-        _sampled,
+        sampled,
         sampling=lambda parameters: Unscented(kappa=parameters.kappa),
     ),
     "lrkf": Method(
         "linear regression Kalman filter; the sampling follows the name, as in lrkf:s2kf-50",
         RegressionParameters,
-        _sampled,
+        sampled,
         sampling=lambda parameters: parse_sampling(parameters.sampling),
         variant="sampling",
     ),
@@ -373,12 +351,20 @@ FILTERS: Mapping[str, Method] = {
         _analytic,
         lacks=_lacks_moments,
     ),
+    "sqrt": Method(
+        "square-root filter, which keeps digits that covariances lose; the filter follows the name, as "
+        "in sqrt:ukf",
+        SquareRootParameters,
+        no_steps,
+        lacks=_lacks_slopes,
+        variant="filter",
+        made_for=_square_root,
+    ),
 }
-
-
-def no_steps(stage: Stage) -> Steps:
-    """Refuse to make steps: for a method that `Method.made_for` makes for its parameters."""
-    raise AssertionError("the method was not made for its parameters")
+_SQUARE_ROOTS = {
+    "ekf": replace(FILTERS["ekf"], steps=partial(extended, parts=FACTORED)),
+    "ukf": replace(FILTERS["ukf"], steps=partial(sampled, parts=FACTORED)),
+}
 
 
 def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
@@ -403,6 +389,9 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
 def filter_with(name: str, variant: str) -> Method:
     """Set the variant of a filter, as in `lrkf:s2kf-50`."""
     chosen = FILTERS[name]
+    if chosen.made_for is not None:
+        given = {str(chosen.variant): variant} if variant else {}
+        return chosen.made_for(build(chosen.parameters, given, f"filter {name}"))
     sampling = chosen.sampling
     if not variant or sampling is None:
         return chosen

@@ -83,23 +83,23 @@ def sample_memory(
     )
 
 
-def regression(
+def sampling(
     function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
 ) -> Function:
-    """Make the regression of `function(state, noise, arguments)` at weighted samples.
+    """Make the evaluation of `function(state, noise, arguments)` at weighted samples.
 
-    Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
-    takes the set of samples number `sample_index`, fills `memory.centre` with the intrinsic mean of the
-    values, `spread` (v, v) with their covariance and `cross` (t, v) with that with the state; False
-    where the state's covariance is not positive definite. `variances` is a tuple of those of the noise;
-    `spread` may be the state's covariance itself.
+    Returns `sample(mean, arguments, variances, sample_index, memory)`, before which the leading block of
+    `memory.factor` is the state's factor. It takes the set of samples number `sample_index`, and returns
+    their weights (L,). It fills `memory.offsets`, `memory.centre` with the intrinsic mean of the values,
+    and `memory.values`, which are away from there by them less `memory.shift`. `variances` is a tuple of
+    those of the noise.
     """
-    t, v, components = tangent_size(kinds), tangent_size(outputs), len(kinds)
+    t, components = tangent_size(kinds), len(kinds)
     size = t + noises
     read_state, read_noise = tuple_of(components), tuple_of(noises, t)
     add, subtract = boxplus(kinds), boxminus(outputs)
     fill, fill_offset, fill_noise = filling(len(outputs)), filling(size), filling(noises)
-    lower, offset, moments = lower_of(size), offset_of(size), moments_of(t, v)
+    lower, offset = lower_of(size), offset_of(size)
     settle, flat_states, no_noise = settling(outputs), is_flat(kinds), (0.0,) * noises
 
     def evaluate(mean: Floats, points: Floats, arguments: tuple[Any, ...], memory: SampleMemory) -> None:
@@ -120,6 +120,36 @@ def regression(
             value = function(point, read_noise(away), arguments)
             subtract(value, centre, memory.values, index)
 
+    def sample(
+        mean: Floats,
+        arguments: tuple[Any, ...],
+        variances: tuple[float, ...],
+        sample_index: int,
+        memory: SampleMemory,
+    ) -> Floats:
+        chosen = (sample_index - memory.first) * memory.stride
+        fill_noise(memory.noise, variances)
+        for k in range(noises):
+            memory.factor[t + k, t + k] = np.sqrt(memory.noise[k])
+        evaluate(mean, memory.points[chosen], arguments, memory)
+        settle(memory.weights[chosen], memory.values, memory.centre, memory.shift)
+        return memory.weights[chosen]
+
+    return sample
+
+
+def regression(
+    function: Function, kinds: tuple[str, ...], noises: int, outputs: tuple[str, ...]
+) -> Function:
+    """Make the regression of `function(state, noise, arguments)` at weighted samples; see `sampling`.
+
+    Returns `regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory)`. It
+    fills `spread` (v, v) with the covariance of the values and `cross` (t, v) with that with the state;
+    False where the state's covariance is not positive definite. `spread` may be that covariance itself.
+    """
+    t, v = tangent_size(kinds), tangent_size(outputs)
+    sample, moments = sampling(function, kinds, noises, outputs), moments_of(t, v)
+
     def regress(
         mean: Floats,
         covariance: Floats,
@@ -130,15 +160,9 @@ def regression(
         sample_index: int,
         memory: SampleMemory,
     ) -> bool:
-        chosen = (sample_index - memory.first) * memory.stride
-        weights, factor = memory.weights[chosen], memory.factor
-        if not cholesky(factor, covariance, t):
+        if not cholesky(memory.factor, covariance, t):
             return False
-        fill_noise(memory.noise, variances)
-        for k in range(noises):
-            factor[t + k, t + k] = np.sqrt(memory.noise[k])
-        evaluate(mean, memory.points[chosen], arguments, memory)
-        settle(weights, memory.values, memory.centre, memory.shift)
+        weights = sample(mean, arguments, variances, sample_index, memory)
         moments(weights, memory.offsets, memory.values, memory.shift, spread, cross)
         return True
 
@@ -170,7 +194,8 @@ def settling(kinds: tuple[str, ...]) -> Function:
     return settle
 
 
-def _no_variances(*_: Any) -> tuple[float, ...]:
+def no_variances(*_: Any) -> tuple[float, ...]:
+    """List the variances of no noise."""
     return ()
 
 
@@ -185,8 +210,8 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     """
     model, motion = stage.model, stage.motion
     entering = motion.noise if motion.noises else None
-    regress = regression(_moved(motion), model.kinds, motion.noises, model.kinds)
-    variances_of = entering or _no_variances
+    regress = regression(moved_with_noise(motion), model.kinds, motion.noises, model.kinds)
+    variances_of = entering or no_variances
     add_noise = nothing if entering else motion_noise(model, motion)
     linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
@@ -215,7 +240,8 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     return predict
 
 
-def _moved(motion: Motion) -> Function:
+def moved_with_noise(motion: Motion) -> Function:
+    """Make `function(state, noise, arguments)` of a motion, for `sampling`."""
     move = motion.move
     if motion.noises:
 
@@ -240,11 +266,11 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     """
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
-    regress = regression(_measured(sensor), model.kinds, sensor.noises, kinds)
+    regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)
     read_reference, m = reading(sensor).reference, len(kinds)
     angular = tuple(kind == "angle" for kind in kinds)
     entering = sensor.noise if sensor.noises else None
-    variances_of = entering or _no_variances
+    variances_of = entering or no_variances
     add_noise = nothing if sensor.noises else sensor_noise(sensor)
 
     def innovate(
@@ -268,7 +294,8 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     return innovate
 
 
-def _measured(sensor: Sensor) -> Function:
+def measured_with_noise(sensor: Sensor) -> Function:
+    """Make `function(state, noise, arguments)` of what a sensor measures, for `sampling`."""
     measure = sensor.measure
     if sensor.noises:
 

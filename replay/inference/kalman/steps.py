@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     copy_gaussian,
     no_innovation,
 )
 from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
 
 FAILURES = (
@@ -33,7 +33,10 @@ NOTHING_MEASURED, NOT_STARTED, UNKNOWN = -2, -3, -4  # beside ALL_WELL, -1
 
 
 class Gaussian(NamedTuple):
-    """Holds a Gaussian of every run, first axis = run: means (runs, n), covariances (runs, t, t)."""
+    """Holds a Gaussian of every run, first axis = run: means (runs, n), covariances (runs, t, t).
+
+    What stands for the covariances is up to the filter, see `Steps.form`.
+    """
 
     mean: Floats
     covariance: Floats
@@ -53,6 +56,7 @@ class Steps(NamedTuple):
         sampled: the dimensions in which it takes samples, the motion's first.
         resumes_after_gap: whether it goes on after a gap of the control: `predict` then takes NaN for a
             control.
+        form: what stands for the covariances in beliefs; the estimates have the covariances themselves.
     """
 
     memory: Callable[[tuple[Any, ...]], Any]
@@ -61,6 +65,7 @@ class Steps(NamedTuple):
     estimate: Function
     sampled: tuple[int, ...] = ()
     resumes_after_gap: bool = False
+    form: Form = COVARIANCES
 
 
 class InnovationRecord(NamedTuple):
@@ -83,6 +88,7 @@ class Workspace(NamedTuple):
         state: (n,), the moved state.
         transition: (t, t).
         product: (t, t), after a prediction the covariance of the moved state with the one before.
+        rest: (t, t), what `factors` needs besides to retrace a prediction.
         gain, control_variance: (t, controls), (controls,).
         noise_gain, noise_variance: (t or m, noises), (noises,).
         rows, predicted: (m, t), (m,), a measurement's Jacobian and mean.
@@ -95,6 +101,7 @@ class Workspace(NamedTuple):
     state: Floats
     transition: Floats
     product: Floats
+    rest: Floats
     gain: Floats
     control_variance: Floats
     noise_gain: Floats
@@ -122,6 +129,7 @@ def workspace(stage: Stage, samples: tuple[Any, ...] = ()) -> Workspace:
         state=np.empty(model.size),
         transition=np.empty((t, t)),
         product=np.empty((t, t)),
+        rest=np.empty((t, t)),
         gain=np.empty((t, model.controls)),
         control_variance=np.empty(model.controls),
         noise_gain=np.empty((max(t, m), noises)),
@@ -143,6 +151,8 @@ def gaussian_filter(
     updates: tuple[Function, ...],
     memory: Callable[[tuple[Any, ...]], Any] | None = None,
     sampled: tuple[int, ...] = (),
+    form: Form = COVARIANCES,
+    gap_motion: Callable[[Stage], Function] | None = None,
 ) -> Steps:
     """Make the steps of a filter whose belief is one Gaussian.
 
@@ -154,12 +164,14 @@ def gaussian_filter(
             record)`; see `kalman_update`.
         memory: (sets) -> the workspace; `workspace(stage)` unless given.
         sampled: see `Steps.sampled`.
+        form: what stands for the covariance.
+        gap_motion: (stage) -> the prediction in a gap of the control; `keeping` unless given.
 
     Returns the steps, which pass over gaps of the control where the motion has a `gap_noise`.
     """
-    gap_noise = stage.motion.gap_noise
-    if gap_noise is not None:
-        predict = _predicting_gap(stage.model, gap_noise, predict)
+    has_gaps, to_covariance = stage.motion.gap_noise is not None, form.to_covariance
+    if has_gaps:
+        predict = _predicting_gap((gap_motion or keeping)(stage), predict)
 
     def predict_run(
         run: int,
@@ -176,6 +188,7 @@ def gaussian_filter(
     def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
         copy_gaussian(belief.mean[run], belief.covariance[run], mean, covariance)
+        to_covariance(covariance)
 
     return Steps(
         memory or (lambda _: workspace(stage)),
@@ -183,13 +196,13 @@ def gaussian_filter(
         tuple(_of_run(update) for update in updates),
         estimate,
         sampled,
-        resumes_after_gap=gap_noise is not None,
+        resumes_after_gap=has_gaps,
+        form=form,
     )
 
 
-def _predicting_gap(model: Model, gap_noise: Function, predict_driven: Function) -> Function:
-    """Make the prediction that, where the control is NaN, keeps the mean and adds the gap noise."""
-    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+def _predicting_gap(predict_gap: Function, predict_driven: Function) -> Function:
+    """Make the prediction of one kind where the control is NaN, else of the other."""
 
     def predict(
         mean: Floats,
@@ -200,15 +213,35 @@ def _predicting_gap(model: Model, gap_noise: Function, predict_driven: Function)
         sample_index: int,
         work: Workspace,
     ) -> bool:
-        if not np.isnan(control[0]):
-            return predict_driven(mean, covariance, control, duration_s, parameters, sample_index, work)
+        if np.isnan(control[0]):
+            return predict_gap(mean, covariance, control, duration_s, parameters, sample_index, work)
+        return predict_driven(mean, covariance, control, duration_s, parameters, sample_index, work)
+
+    return predict
+
+
+def keeping(stage: Stage) -> Function:
+    """Make the prediction in a gap of the control: it keeps the mean and adds the gap noise."""
+    model, gap_noise = stage.model, stage.motion.gap_noise
+    assert gap_noise is not None
+    read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
+
+    def keep(
+        mean: Floats,
+        covariance: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
+    ) -> bool:
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
         add(covariance, gap_noise(read_state(mean), duration_s, parameters))
         return True
 
-    return predict
+    return keep
 
 
 def _of_run(update: Function) -> Function:

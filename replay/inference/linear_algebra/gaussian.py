@@ -107,6 +107,37 @@ def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
     return True
 
 
+def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
+    """Solve A X = B in place, by Cholesky's factor of A, which goes into `factor`.
+
+    A pivot of zero, but for round-off, is what A knows exactly: its row of X is zero, a solution where B
+    is in the range of A. False where A is not positive semidefinite.
+
+    Args:
+        matrix: A (n, n), symmetric.
+        right: B (n, m), which becomes X.
+        factor: (n, n) to work in.
+    """
+    size, columns = len(matrix), right.shape[1]
+    if not semidefinite_cholesky(factor, matrix, size):
+        return False
+    for row in range(size):
+        scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
+        for k in range(row):
+            for column in range(columns):
+                right[row, column] -= factor[row, k] * right[k, column]
+        for column in range(columns):
+            right[row, column] *= scale
+    for row in range(size - 1, -1, -1):
+        scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
+        for k in range(row + 1, size):
+            for column in range(columns):
+                right[row, column] -= factor[k, row] * right[k, column]
+        for column in range(columns):
+            right[row, column] *= scale
+    return True
+
+
 def wrap(difference: float, is_angle: bool) -> float:
     """Wrap a difference of angles to [-pi, pi); any other stays as it is."""
     if is_angle and not abs(difference) < np.pi:
@@ -145,6 +176,11 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
     difference, factor, _ = innovation
     if not cholesky(factor, factor, size):
         return np.nan, np.nan
+    return whiten_by(factor, difference, size)
+
+
+def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, float]:
+    """Turn v into L^-1 v; returns its square, and log det L L'."""
     squared, determinant = 0.0, 1.0
     for i in range(size):
         entry = difference[i]

@@ -9,6 +9,7 @@ the state to which it leads.
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from replay.inference.linear_algebra.gaussian import propagate_covariance
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.manifold import (
@@ -25,7 +26,7 @@ from replay.tracing.functions import traced
 Kinds = tuple[str, ...]
 
 
-def sloping(kinds: Kinds, correct: Correction | None) -> Function:
+def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) -> Function:
     """Make `fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
 
     Where nothing bends it is left as it is.
@@ -41,14 +42,12 @@ def sloping(kinds: Kinds, correct: Correction | None) -> Function:
 
         return leave
     along = traced(correct.along, len(kinds))
-    read_state, t = tuple_of(len(kinds)), tangent_size(kinds)
+    read_state, t, times = tuple_of(len(kinds)), tangent_size(kinds), form.times
 
     def fill(mean: Floats, covariance: Floats, slope: Floats) -> None:
         direction, variance = along(read_state(mean)), 0.0
+        times(covariance, direction, slope)
         for row in range(t):
-            slope[row] = 0.0
-            for column in range(t):
-                slope[row] += covariance[row, column] * direction[column]
             variance += direction[row] * slope[row]
         for row in range(t):
             slope[row] = slope[row] / variance if variance > 0.0 else 0.0
@@ -56,7 +55,9 @@ def sloping(kinds: Kinds, correct: Correction | None) -> Function:
     return fill
 
 
-def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) -> Function:
+def correcting(
+    kinds: Kinds, correct: Correction | None, *, back: bool = False, form: Form = COVARIANCES
+) -> Function:
     """Make `move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
 
     Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
@@ -64,15 +65,15 @@ def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) 
     """
     if correct is not None:
         step_together = _stepping(kinds, correct.back if back else correct.move)
-        fill = filling(len(kinds))
+        fill, propagate = filling(len(kinds)), form.propagate
 
         def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
             step_together(mean, work)
             fill(mean, work.state)
-            propagate_covariance(covariance, work.transition, work.product)
+            propagate(covariance, work.transition, work.product)
 
         return move_together
-    add, reset = boxplus(kinds), by_right_jacobian(kinds)
+    add, reset, turn = boxplus(kinds), by_right_jacobian(kinds), form.turn
     if is_flat(kinds):
 
         def move(mean: Floats, covariance: Floats, work: Any) -> None:
@@ -82,8 +83,7 @@ def correcting(kinds: Kinds, correct: Correction | None, *, back: bool = False) 
 
     def move_and_turn(mean: Floats, covariance: Floats, work: Any) -> None:
         add(mean, work.step)
-        reset(work.step, covariance)
-        reset(work.step, covariance.T)
+        turn(reset, work.step, covariance)
 
     return move_and_turn
 

@@ -110,7 +110,8 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     n, t = stage.model.size, stage.model.tangent
     innovation_size = len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    to_common_tangent, mix = mixing(stage.model.kinds)
+    to_common_tangent, mix = mixing(stage.model.kinds, inner.form)
+    to_covariance = inner.form.to_covariance
     predict_member = inner.predict
 
     def predict(
@@ -156,8 +157,10 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         mean, covariance = belief.mean[run, :count], belief.covariance[run, :count]
         probability = belief.probability[run, :count]
         to_common_tangent(mean, covariance, probability, memory)
-        likeliest = likeliest_of(probability)
-        if not cholesky(memory.factor, memory.carried[likeliest], t):
+        likeliest, factor = likeliest_of(probability), memory.factor
+        copy_gaussian(memory.centre, memory.carried[likeliest], memory.centre, factor)
+        to_covariance(factor)
+        if not cholesky(factor, factor, t):
             return
         apart = 0.0
         for each in range(count):
@@ -206,6 +209,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
             mixtures.probability[row, belief.member[run, each]] = probability[each]
         to_common_tangent(belief.mean[run, :count], belief.covariance[run, :count], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+        to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> GaussianSumMemory:
         records = (
@@ -227,7 +231,7 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     updates = (
         of_run(mixture_update(stage, number, update)) for number, update in enumerate(inner.updates)
     )
-    return Steps(memory, predict, tuple(updates), estimate, inner.sampled, inner.resumes_after_gap)
+    return inner._replace(memory=memory, predict=predict, updates=tuple(updates), estimate=estimate)
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
@@ -299,11 +303,12 @@ class GaussianSumFilter(MixtureFilter):
             np.ones(runs, np.int64),
         )
         for run in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))).tolist():
-            parts = split(self.stage.model.kinds, mean[run], covariance[run], members)
-            weights, means, narrow = parts
+            prior = covariance[run].copy()
+            self.form.to_covariance(prior)
+            weights, means, narrow = split(self.stage.model.kinds, mean[run], prior, members)
             member = np.flatnonzero(weights)
             count = len(member)
-            belief.mean[run, :count], belief.covariance[run] = means[member], narrow
+            belief.mean[run, :count], belief.covariance[run] = means[member], self.form.start(narrow)
             belief.probability[run, :count] = weights[member]
             belief.log_probability[run, :count] = np.log(weights[member])
             belief.member[run, :count], belief.left[run] = member, count

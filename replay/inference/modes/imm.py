@@ -87,13 +87,15 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     modes, n, t = len(filters), model.size, model.tangent
     components = len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
-    to_common_tangent, mix = mixing(model.kinds)
+    form = filters[0].form
+    to_common_tangent, mix = mixing(model.kinds, form)
     fill_transition, fill_weights, predict_modes = (
         transition_matrix(modes),
         mixing_weights(modes),
         predicting(filters),
     )
     rates_of, fill_rates = switching.rates, filling(modes * (modes - 1))
+    to_covariance = form.to_covariance
 
     def predict(
         run: int,
@@ -124,6 +126,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
             probability[mode] = belief.probability[run, mode]
         to_common_tangent(belief.mean[run], belief.covariance[run], probability, memory)
         mix(probability, memory, mixtures.mean[row], mixtures.covariance[row])
+        to_covariance(mixtures.covariance[row])
 
     def memory(sets: tuple[Any, ...]) -> InteractingMemory:
         waiting = iter(sets)
@@ -169,7 +172,7 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     )
     sampled = tuple(dimension for each in filters for dimension in each.sampled)
     resumes_after_gap = all(each.resumes_after_gap for each in filters)
-    return Steps(memory, predict, updates, estimate, sampled, resumes_after_gap)
+    return Steps(memory, predict, updates, estimate, sampled, resumes_after_gap, form)
 
 
 # The probabilities of modes

@@ -7,6 +7,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function
 from replay.inference.kalman.steps import InnovationRecord
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
 from replay.inference.linear_algebra.manifold import (
     boxminus,
     boxplus,
@@ -149,7 +150,7 @@ def mixing_weights(modes: int) -> Function:
     return fill_weights
 
 
-def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
+def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, Function]:
     """Make the two halves of mixing the Gaussians of all modes.
 
     Returns `to_common_tangent(mean, covariance, probability, memory)`, which carries them to the tangent
@@ -158,7 +159,7 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
     """
     add, subtract, flat = boxplus(kinds), boxminus(kinds), is_flat(kinds)
     reset, reset_back = by_right_jacobian(kinds), by_right_jacobian(kinds, back=True)
-    n, t = len(kinds), tangent_size(kinds)
+    n, t, turn, mix_covariances = len(kinds), tangent_size(kinds), form.turn, form.mix
 
     def to_common_tangent(mean: Floats, covariance: Floats, probability: Floats, memory: Any) -> None:
         likeliest = likeliest_of(probability)
@@ -172,8 +173,7 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
                 for column in range(t):
                     carried[row, column] = covariance[mode, row, column]
             if not flat:
-                reset_back(away[mode], carried)
-                reset_back(away[mode], carried.T)
+                turn(reset_back, away[mode], carried)
 
     def mix(weights: Floats, memory: Any, mean: Floats, covariance: Floats) -> None:
         away, carried, shift = memory.away, memory.carried, memory.shift
@@ -182,19 +182,12 @@ def mixing(kinds: tuple[str, ...]) -> tuple[Function, Function]:
             for mode in range(len(weights)):
                 entry += weights[mode] * away[mode, row]
             shift[row] = entry
-        for row in range(t):
-            for column in range(row + 1):
-                entry = 0.0
-                for mode in range(len(weights)):
-                    spread = (away[mode, row] - shift[row]) * (away[mode, column] - shift[column])
-                    entry += weights[mode] * (carried[mode, row, column] + spread)
-                covariance[row, column] = covariance[column, row] = entry
+        mix_covariances(weights, away, shift, carried, covariance)
         for row in range(n):
             mean[row] = memory.centre[row]
         add(mean, shift)
         if not flat:
-            reset(shift, covariance)
-            reset(shift, covariance.T)
+            turn(reset, shift, covariance)
 
     return to_common_tangent, mix
 

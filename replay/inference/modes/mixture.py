@@ -104,7 +104,12 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
                     entry += probability[mode] * (records.covariance[mode, row, column] + spread)
                 covariance[i, j] = covariance[j, i] = entry
         write_innovation(innovation, record)
-        return whiten(innovation, drop_missing(innovation))[0]
+        squared = whiten(innovation, drop_missing(innovation))[0]
+        if np.isnan(squared):  # singular but for digits that only factors have: the mean of the modes'
+            squared = 0.0
+            for mode in range(len(probability)):
+                squared += probability[mode] * records.numbers[mode, 0]
+        return squared
 
     def update(
         gaussians: Gaussian,

@@ -19,6 +19,7 @@ from replay.engine.streams.results import ALL_WELL, failures_of, innovation_stre
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
 from replay.inference.kalman.update import innovation_components
+from replay.inference.linear_algebra.covariances import Form
 from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
@@ -134,7 +135,8 @@ class Filter:
         control = np.tile(np.array(self.initial), (len(mean), 1))
         started = np.where(np.isfinite(mean.sum(axis=1)), ALL_WELL, NOT_STARTED)
         accepted_ns = np.repeat(time_ns[:, None], len(self.stage.sensors), axis=1)
-        carried = RecursionState(Gaussian(mean, covariance), control, time_ns, accepted_ns, started)
+        belief = Gaussian(mean, self.form.start(covariance))
+        carried = RecursionState(belief, control, time_ns, accepted_ns, started)
         maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
         points = {topic: points_of(static[topic], asked) for topic, asked in maps.items()}
         waiting = None
@@ -143,6 +145,11 @@ class Filter:
             waiting = output_times(runs, time_ns.copy(), width, wants_estimate=False)
         context = Context(points, self.origins(static, len(mean)))
         return FilterState(carried, context, (), waiting, np.zeros(len(mean), np.int64))
+
+    @property
+    def form(self) -> Form:
+        """What stands for covariances in what it carries."""
+        return _steps(self.stage, self.method).form
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
         """Find the origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""

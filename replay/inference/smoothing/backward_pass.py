@@ -25,7 +25,6 @@ from replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
     multiply,
     propagate_covariance,
-    semidefinite_cholesky,
 )
 from replay.inference.linear_algebra.manifold import tangent_size
 from replay.inference.model.corrections import Kinds, comparing, correcting, sloping
@@ -90,7 +89,8 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         steps: those of the filter that goes forward.
     """
     model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
-    find_slope = sloping(model.kinds, model.correct)
+    retrace, to_covariance = steps.form.retrace, steps.form.to_covariance
+    find_slope = sloping(model.kinds, model.correct, steps.form)
 
     def predict(
         run: int,
@@ -108,18 +108,8 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
                 rest[row, column] = covariance[row, column]
         if not predict_filter(run, belief, control, duration_s, parameters, sample_index, memory.filter):
             return False
-        cross = memory.filter.product
-        for row in range(t):
-            for column in range(t):
-                turned[row, column] = cross[row, column]
-        if not solve_semidefinite(covariance, turned, memory.factor):
+        if not retrace(rest, covariance, memory.filter, turned, memory.factor):
             return False
-        for row in range(t):
-            for column in range(row + 1):
-                entry = rest[row, column]
-                for k in range(t):
-                    entry -= turned[k, row] * cross[k, column]
-                rest[row, column] = rest[column, row] = entry
         compose(belief.gain[run], belief.rest[run], belief.predictions[run], turned.T, rest, product)
         belief.predictions[run] += 1
         find_slope(mean, covariance, belief.slope[run])
@@ -130,6 +120,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
     def estimate(run: int, belief: Chain, nodes: Nodes, row: int, memory: ForwardMemory) -> None:
         mean, covariance = belief.mean[run], belief.covariance[run]
         copy_gaussian(mean, covariance, nodes.mean[row], nodes.covariance[row])
+        to_covariance(nodes.covariance[row])
         still = belief.predictions[run] == 0
         for i in range(len(mean)):
             nodes.predicted[row, i] = belief.predicted[run, i]
@@ -146,7 +137,7 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
         return ForwardMemory(steps.memory(sets), *(np.empty((t, t)) for _ in range(4)))
 
     updates = tuple(_with_memory(update) for update in steps.updates)
-    return Steps(memory, predict, updates, estimate, steps.sampled, steps.resumes_after_gap)
+    return steps._replace(memory=memory, predict=predict, updates=updates, estimate=estimate)
 
 
 def _with_memory(update: Function) -> Function:
@@ -191,37 +182,6 @@ def compose(
         for column in range(t):
             rest[row, column] += next_rest[row, column]
             gain[row, column] = product[row, column]
-
-
-def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
-    """Solve A X = B in place, by Cholesky's factor of A, which goes into `factor`.
-
-    A pivot of zero, but for round-off, is what A knows exactly: its row of X is zero, a solution where B
-    is in the range of A. False where A is not positive semidefinite.
-
-    Args:
-        matrix: A (n, n), symmetric.
-        right: B (n, m), which becomes X.
-        factor: (n, n) to work in.
-    """
-    size, columns = len(matrix), right.shape[1]
-    if not semidefinite_cholesky(factor, matrix, size):
-        return False
-    for row in range(size):
-        scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
-        for k in range(row):
-            for column in range(columns):
-                right[row, column] -= factor[row, k] * right[k, column]
-        for column in range(columns):
-            right[row, column] *= scale
-    for row in range(size - 1, -1, -1):
-        scale = 1.0 / factor[row, row] if factor[row, row] > 0.0 else 0.0
-        for k in range(row + 1, size):
-            for column in range(columns):
-                right[row, column] -= factor[k, row] * right[k, column]
-        for column in range(columns):
-            right[row, column] *= scale
-    return True
 
 
 # The backward pass

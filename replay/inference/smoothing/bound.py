@@ -25,12 +25,9 @@ from replay.engine.streams.results import named
 from replay.engine.vectors.components import match_components
 from replay.engine.vectors.tangent import truth_at
 from replay.inference.kalman.methods import FILTERS, Method, MethodParameters
-from replay.inference.linear_algebra.gaussian import (
-    propagate_covariance,
-)
+from replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
 from replay.inference.run.filtering import Filter, FilterState
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, RecursionState
-from replay.inference.smoothing.backward_pass import solve_semidefinite
 from replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_steps
 
 

@@ -305,6 +305,7 @@ def delayed(source: MemorySource, seed: int, *topics: str) -> MemorySource:
         (VEHICLE_A, "ukf", {"gate_probability": 0.9}),
         (VEHICLE_A, "lrkf", {"sampling": "s2kf-11"}),
         (SWITCHING_A, "imm", {"filter": "ekf"}),
+        (SWITCHING_A, "imm", {"filter": "sqrt:ekf"}),
     ],
 )
 def test_angles_maps_gates_and_missing_components(

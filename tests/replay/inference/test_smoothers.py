@@ -19,11 +19,11 @@ from recorders.models.orientation import compose, conjugate
 from recorders.recording import Recording, import_run
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import rotation_vector
+from replay.inference.linear_algebra.gaussian import solve_semidefinite
 from replay.inference.linear_algebra.manifold import by_right_jacobian
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.smoothing import smoothers
-from replay.inference.smoothing.backward_pass import solve_semidefinite
 from tests.replay.inference import attitude, vehicle_a, wheel
 from tests.replay.inference.attitude import ATTITUDE
 from tests.replay.inference.replays import bound, outputs

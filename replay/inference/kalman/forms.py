@@ -1,0 +1,83 @@
+"""Puts the extended filter and those of samples together of the parts of one form.
+
+What a filter carries is a mean and what stands for its covariance, see `Form`. Plain filters carry the
+covariance itself; the parts of square-root forms are in `replay.inference.kalman.square_root`.
+"""
+
+from typing import Any, NamedTuple
+
+from replay.engine.arrays import Function
+from replay.inference.kalman.predict import linear_motion
+from replay.inference.kalman.regression import sample_memory, sampled_motion, sampled_sensor
+from replay.inference.kalman.steps import Steps, Workspace, gaussian_filter, keeping, workspace
+from replay.inference.kalman.update import kalman_update, linear_sensor
+from replay.inference.linear_algebra.covariances import COVARIANCES, Form
+from replay.inference.model.stage import Stage
+
+
+class Parts(NamedTuple):
+    """Holds what the filters of one form are put together of; each part makes a function for a stage.
+
+    Attributes:
+        form: what stands for a covariance.
+        linear_motion, sampled_motion: (stage), (stage, samples) -> `predict`, see `gaussian_filter`.
+        linear_update, sampled_update: (stage, number), (stage, number, samples) -> a sensor's update.
+        gap_motion: (stage) -> the prediction in a gap of the control.
+    """
+
+    form: Form
+    linear_motion: Function
+    sampled_motion: Function
+    linear_update: Function
+    sampled_update: Function
+    gap_motion: Function
+
+
+def _linear_update(stage: Stage, number: int) -> Function:
+    return kalman_update(stage, number, linear_sensor(stage, number))
+
+
+def _sampled_update(stage: Stage, number: int, samples: int) -> Function:
+    return kalman_update(stage, number, sampled_sensor(stage, number, samples))
+
+
+PLAIN = Parts(COVARIANCES, linear_motion, sampled_motion, _linear_update, _sampled_update, keeping)
+
+
+def extended(stage: Stage, parts: Parts = PLAIN) -> Steps:
+    """Make the steps of an extended Kalman filter."""
+    updates = tuple(parts.linear_update(stage, number) for number in range(len(stage.sensors)))
+    return gaussian_filter(
+        stage, parts.linear_motion(stage), updates, form=parts.form, gap_motion=parts.gap_motion
+    )
+
+
+def sampled(stage: Stage, parts: Parts = PLAIN) -> Steps:
+    """Make steps by regression at samples; what is linear is passed on exactly."""
+    model, motion = stage.model, stage.motion
+    dimensions: list[int] = []
+    shapes: list[tuple[int, tuple[str, ...]]] = []
+    if motion.linear:
+        predict = parts.linear_motion(stage)
+    else:
+        predict = parts.sampled_motion(stage, 0)
+        dimensions.append(model.tangent + motion.noises)
+        shapes.append((motion.noises, model.kinds))
+    updates = []
+    for number, sensor in enumerate(stage.sensors):
+        if sensor.linear:
+            updates.append(parts.linear_update(stage, number))
+        else:
+            updates.append(parts.sampled_update(stage, number, len(shapes)))
+            dimensions.append(model.tangent + sensor.noises)
+            shapes.append((sensor.noises, tuple(sensor.measured.values())))
+
+    def memory(sets: tuple[Any, ...]) -> Workspace:
+        made = (
+            sample_memory(each, model.kinds, noises, outputs)
+            for each, (noises, outputs) in zip(sets, shapes, strict=True)
+        )
+        return workspace(stage, tuple(made))
+
+    of_form = parts.form, parts.gap_motion
+    return gaussian_filter(stage, predict, tuple(updates), memory, tuple(dimensions), *of_form)

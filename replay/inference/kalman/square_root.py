@@ -1,0 +1,264 @@
+"""Makes the parts of square-root filters, extended and unscented: they carry factors of covariances.
+
+Of the columns X of the state's factor, or its weighted samples, of Y, what a function makes of them, and
+of a factor N of its noise, one factorisation makes a prediction or an update:
+
+    [Y  N]     [L  0]    of a motion, L is the factor of P-, and W = G L with the smoother's gain G;
+    [X  0]  =  [W  V]    of a sensor, L is that of S, W = K L with Kalman's gain, and V that of P+.
+
+Kaminski, Bryson and Schmidt, IEEE TAC 16(6), 1971; Van der Merwe and Wan, ICASSP 2001.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.engine.streams.results import ALL_WELL
+from replay.inference.kalman.forms import Parts
+from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
+from replay.inference.kalman.regression import (
+    measured_with_noise,
+    moved_with_noise,
+    no_variances,
+    sampling,
+)
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Workspace,
+)
+from replay.inference.kalman.update import (
+    reading,
+    sensor_derivative,
+    sensor_noise,
+    write_numbers,
+    writing_innovation,
+)
+from replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
+from replay.inference.linear_algebra.gaussian import inflation, whiten_by, wrap
+from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
+from replay.inference.model.corrections import correcting, sloping
+from replay.inference.model.stage import Stage
+
+Into = tuple[Floats, Floats]  # rows, and the weights of their columns
+
+
+def _linear(linearise: Function, slopes: str) -> Function:
+    """Make `spread(state, factor, given, index, work, into)`: it fills in Y and X of a factor.
+
+    By the derivative that `linearise(state, *given, work)` puts into the workspace's `slopes`.
+    """
+
+    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+        rows, weights = into
+        t, m = len(factor), len(rows) - len(factor)
+        linearise(state, *given, work)
+        for k in range(t):
+            weights[k] = 1.0
+            for row in range(t):
+                rows[m + row, k] = factor[row, k]
+            for i in range(m):
+                for row in range(k, t):
+                    rows[i, k] += getattr(work, slopes)[i, row] * factor[row, k]
+
+    return spread
+
+
+def _sampled(
+    sample: Function, variances_of: Function, mean_of: str, size: int, samples: int
+) -> Function:
+    """Make the same of samples, whose mean goes into the workspace's `mean_of`."""
+    fill = filling(size)
+
+    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+        (rows, weights), memory = into, work.samples[samples]
+        t, m = len(factor), len(rows) - len(factor)
+        memory.factor[:t, :t] = factor
+        drawn = sample(state, given, variances_of(state, given), index, memory)
+        fill(getattr(work, mean_of), memory.centre)
+        for k in range(len(memory.offsets)):
+            weights[k] = drawn[k]
+            for i in range(m):
+                rows[i, k] = memory.values[k, i] - memory.shift[i]
+            for row in range(t):
+                rows[m + row, k] = memory.offsets[k, row]
+
+    return spread
+
+
+def _factorise(rows: Floats, weights: Floats, noise: Floats, found: Floats) -> bool:
+    """Fill in N of a noise, which it uses up, and find the factor; False where there is none."""
+    first = len(weights) - len(noise)
+    for k in range(len(noise)):
+        weights[first + k] = 1.0
+    return fill_root(rows[:, first:], noise) and orthogonalise(rows, weights, found)
+
+
+def _predicting(stage: Stage, spread: Function, add_noise: Function, samples: int = -1) -> Function:
+    """Make the prediction by what `spread` makes of the factor, or of these samples."""
+    t, read_control = stage.model.tangent, tuple_of(stage.model.controls)
+    read_state, fill = tuple_of(stage.model.size), filling(stage.model.size)
+
+    def predict(
+        mean: Floats,
+        factor: Floats,
+        control: Floats,
+        duration_s: float,
+        parameters: Any,
+        sample_index: int,
+        work: Workspace,
+    ) -> bool:
+        count = len(work.samples[samples].offsets) if samples >= 0 else t
+        rows, weights = np.zeros((2 * t, count + t)), np.zeros(count + t)
+        noise, found = np.zeros((t, t)), np.zeros((2 * t, 2 * t))
+        state, given = read_state(mean), (read_control(control), duration_s, parameters)
+        spread(state, factor, given, sample_index, work, (rows, weights))
+        fill(mean, work.state)
+        add_noise(state, noise, duration_s, parameters, work)
+        if not _factorise(rows, weights, noise, found):
+            return False
+        factor[:, :], work.product[:, :] = found[:t, :t], found[t:, :t]
+        work.rest[:, :] = found[t:, t:]
+        return True
+
+    return predict
+
+
+def _linear_motion(stage: Stage) -> Function:
+    linearise = motion_derivative(stage.model, stage.motion, by_state=True)
+    return _predicting(stage, _linear(linearise, "transition"), motion_noise(stage.model, stage.motion))
+
+
+def _gap_motion(stage: Stage) -> Function:
+    gap_noise, add, t = stage.motion.gap_noise, adding_noise(stage.model.tangent), stage.model.tangent
+    fill = filling(stage.model.size)
+    assert gap_noise is not None
+
+    def stand(state: Any, control: Any, duration_s: float, parameters: Any, work: Workspace) -> None:
+        fill(work.state, state)
+        for row in range(t):
+            for column in range(t):
+                work.transition[row, column] = 1.0 if row == column else 0.0
+
+    def add_noise(state: Any, noise: Floats, duration_s: float, parameters: Any, work: Any) -> None:
+        add(noise, gap_noise(state, duration_s, parameters))
+
+    return _predicting(stage, _linear(stand, "transition"), add_noise)
+
+
+def _sampled_motion(stage: Stage, samples: int) -> Function:
+    """Noise of the control enters by the derivative at the mean, noise of the motion as a sample."""
+    model, motion = stage.model, stage.motion
+    linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
+    variances = (motion.noise if motion.noises else None) or no_variances
+
+    def variances_of(state: Any, given: Any) -> Any:
+        return variances(state, given[1], given[2])
+
+    sample = sampling(moved_with_noise(motion), model.kinds, motion.noises, model.kinds)
+    spread_samples = _sampled(sample, variances_of, "state", model.size, samples)
+
+    def spread(state: Any, factor: Floats, given: Any, index: int, work: Workspace, into: Into) -> None:
+        linearise(state, *given, work)
+        spread_samples(state, factor, given, index, work, into)
+
+    add_noise = nothing if motion.noises else motion_noise(model, motion)
+    return _predicting(stage, spread, add_noise, samples)
+
+
+def _updating(
+    stage: Stage, number: int, spread: Function, add_noise: Function, samples: int = -1
+) -> Function:
+    """Make the update by sensor `number`; see `replay.inference.kalman.update.kalman_update`.
+
+    A component that is missing counts as one of a noise of its own, which is as predicted.
+    """
+    model, sensor = stage.model, stage.sensors[number]
+    t, m, read_reference = model.tangent, len(sensor.measured), reading(sensor).reference
+    read_state, to_covariance = tuple_of(model.size), FACTORS.to_covariance
+    angular = tuple(kind == "angle" for kind in sensor.measured.values())
+    write_innovation, find_slope = (
+        writing_innovation(stage, number),
+        sloping(model.kinds, model.correct, FACTORS),
+    )
+    correct = correcting(model.kinds, model.correct, form=FACTORS)
+
+    def update(
+        mean: Floats,
+        factor: Floats,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        sample_index: int,
+        work: Workspace,
+        record: InnovationRecord,
+    ) -> int:
+        count = len(work.samples[samples].offsets) if samples >= 0 else t
+        rows, weights = np.zeros((m + t, count + m)), np.zeros(count + m)
+        noise, found = np.zeros((m, m)), np.zeros((m + t, m + t))
+        innovation, size, present = work.innovations[number], 0, 0
+        difference, own_spread, _ = innovation
+        for i in range(m):
+            present += not np.isnan(data[i])
+        if present == 0:
+            return NOTHING_MEASURED
+        state, given = read_state(mean), (read_reference(data), parameters)
+        spread(state, factor, given, sample_index, work, (rows, weights))
+        add_noise(noise, data, parameters, work)
+        for i in range(m):
+            difference[i] = wrap(data[i] - work.predicted[i], angular[i])
+            if np.isnan(difference[i]):
+                rows[i, :] = noise[i, :] = noise[:, i] = 0.0
+                noise[i, i] = 1.0
+            else:
+                size += 1
+        if not _factorise(rows, weights, noise, found):
+            return NOT_POSITIVE_DEFINITE
+        own_spread[:, :] = found[:m, :m]
+        to_covariance(own_spread)
+        write_innovation(innovation, record)
+        for i in range(m):
+            if not found[i, i] > 0.0:
+                return NOT_POSITIVE_DEFINITE
+            if np.isnan(difference[i]):
+                difference[i] = 0.0
+        squared, determinant = whiten_by(found, difference, m)
+        accepted, wider = size > 0 and squared <= gate[size], inflation(squared, size, parameters)
+        if accepted:
+            for row in range(t):
+                work.step[row] = 0.0
+                for i in range(m):
+                    work.step[row] += found[m + row, i] * difference[i] / wider
+            for k in range(m + t):
+                weights[k] = 1.0 if k >= m else 1.0 - 1.0 / wider
+            orthogonalise(found[m:], weights[: m + t], factor)
+            find_slope(mean, factor, work.slope)
+            correct(mean, factor, work)
+        write_numbers(record, squared, determinant, size, accepted, wider)
+        return ALL_WELL
+
+    return update
+
+
+def _linear_update(stage: Stage, number: int) -> Function:
+    sensor = stage.sensors[number]
+    spread = _linear(sensor_derivative(stage.model, sensor), "rows")
+    return _updating(stage, number, spread, sensor_noise(sensor))
+
+
+def _sampled_update(stage: Stage, number: int, samples: int) -> Function:
+    sensor = stage.sensors[number]
+    kinds, noises = tuple(sensor.measured.values()), sensor.noises
+    variances = (sensor.noise if noises else None) or no_variances
+
+    def variances_of(state: Any, given: Any) -> Any:
+        return variances(given[1])
+
+    sample = sampling(measured_with_noise(sensor), stage.model.kinds, noises, kinds)
+    spread = _sampled(sample, variances_of, "predicted", len(kinds), samples)
+    return _updating(stage, number, spread, nothing if noises else sensor_noise(sensor), samples)
+
+
+FACTORED = Parts(FACTORS, _linear_motion, _sampled_motion, _linear_update, _sampled_update, _gap_motion)

@@ -1,0 +1,81 @@
+"""Says what a filter can carry for a covariance: the contract of beliefs between methods.
+
+A belief is a mean (n,) and a matrix (t, t) that stands for its covariance P: P itself (`COVARIANCES`),
+or its lower Cholesky factor (`replay.inference.linear_algebra.factors.FACTORS`). A filter's own steps
+predict and update it; all others, such as an IMM or a smoother, know no more of it than its `Form`.
+"""
+
+from typing import Any, NamedTuple
+
+from replay.engine.arrays import Floats, Function
+from replay.inference.linear_algebra.gaussian import propagate_covariance, solve_semidefinite
+
+
+class Form(NamedTuple):
+    """Holds what can be done with a matrix (t, t) that stands for a covariance P; all in place.
+
+    Attributes:
+        start: (covariances (..., t, t)) -> the matrices that stand for them.
+        to_covariance: (matrix) makes P of it.
+        times: (matrix, vector, product) fills the product (t,) with P v.
+        propagate: (matrix, transition, product): P becomes F P F'; the product (t, t) is to work in.
+        turn: (turning, vector, matrix): the same by `manifold.by_right_jacobian`, which is `turning`.
+        mix: (weights, away, shift, carried, matrix) fills it with the mixture's of matrices (M, t, t)
+            whose means are `away` (M, t), and the mixture's `shift` (t,).
+        retrace: (before, after, work, turned, factor) -> whether P- is positive semidefinite. Of the
+            matrices before and after a prediction, and what it left in the workspace, it fills `turned`
+            with G', and `before` with P - G D', see `replay.inference.smoothing.backward_pass`.
+    """
+
+    start: Function
+    to_covariance: Function
+    times: Function
+    propagate: Function
+    turn: Function
+    mix: Function
+    retrace: Function
+
+
+def _as_it_is(matrix: Floats) -> Floats:
+    return matrix
+
+
+def _times(covariance: Floats, vector: Any, product: Floats) -> None:
+    for row in range(len(covariance)):
+        product[row] = 0.0
+        for column in range(len(covariance)):
+            product[row] += covariance[row, column] * vector[column]
+
+
+def _turn(turning: Function, vector: Floats, covariance: Floats) -> None:
+    turning(vector, covariance)
+    turning(vector, covariance.T)
+
+
+def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, covariance: Floats) -> None:
+    for row in range(len(covariance)):
+        for column in range(row + 1):
+            entry = 0.0
+            for mode in range(len(weights)):
+                spread = (away[mode, row] - shift[row]) * (away[mode, column] - shift[column])
+                entry += weights[mode] * (carried[mode, row, column] + spread)
+            covariance[row, column] = covariance[column, row] = entry
+
+
+def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, factor: Floats) -> bool:
+    cross, t = work.product, len(before)
+    for row in range(t):
+        for column in range(t):
+            turned[row, column] = cross[row, column]
+    if not solve_semidefinite(after, turned, factor):
+        return False
+    for row in range(t):
+        for column in range(row + 1):
+            entry = before[row, column]
+            for k in range(t):
+                entry -= turned[k, row] * cross[k, column]
+            before[row, column] = before[column, row] = entry
+    return True
+
+
+COVARIANCES = Form(_as_it_is, _as_it_is, _times, propagate_covariance, _turn, _mix, _retrace)

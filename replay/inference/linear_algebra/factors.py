@@ -1,0 +1,157 @@
+"""Carries lower factors S in place of covariances P = S S', by weighted Gram-Schmidt.
+
+Thornton, JPL Technical Memorandum 33-798, 1976; Bierman, Factorization Methods for Discrete Sequential
+Estimation, 1977, VI.4.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.engine.vectors.covariances import is_positive_definite
+from replay.inference.linear_algebra.covariances import Form
+from replay.inference.linear_algebra.gaussian import multiply
+
+ROUNDING = 1e-15  # of a variance, for each component that others determine
+NOTHING_LEFT = 1e-28  # a row's square beside what it was: rounding, of a row that others determine
+
+
+def orthogonalise(rows: Floats, weights: Floats, factor: Floats) -> bool:
+    """Fill the lower factor L (r, r) of A diag(w) A' = L L', of rows A (r, c), which it uses up.
+
+    Modified Gram-Schmidt, so that no product of A with itself is made; a weight may be negative. The
+    diagonal is positive, and zero with all below where a row depends on those before it. False, and the
+    pivot NaN, where the product is not positive semidefinite.
+    """
+    size, count = len(rows), len(weights)
+    for i in range(size):
+        squared, whole = 0.0, 0.0
+        for k in range(count):
+            squared += rows[i, k] * weights[k] * rows[i, k]
+        for k in range(i):
+            whole += factor[i, k] * factor[i, k]
+        least = NOTHING_LEFT * (whole + abs(squared))
+        if not squared >= -least:
+            factor[i, i] = np.nan
+            return False
+        pivot = np.sqrt(squared) if squared > least else 0.0
+        factor[i, i] = pivot
+        for j in range(i + 1, size):
+            entry = 0.0
+            if pivot > 0.0:
+                for k in range(count):
+                    entry += rows[j, k] * weights[k] * rows[i, k]
+                for k in range(count):
+                    rows[j, k] -= entry / squared * rows[i, k]
+                entry /= pivot
+            factor[j, i] = entry
+            factor[i, j] = 0.0
+    return True
+
+
+def fill_root(rows: Floats, covariance: Floats) -> bool:
+    """Fill the first rows with a factor N (n, n) of N N', which it uses up; False where it is none.
+
+    By Cholesky, with that pivot next which is the largest beside what it was: a covariance may be
+    singular.
+    """
+    size, whole = len(covariance), np.empty(len(covariance))
+    for i in range(size):
+        whole[i] = covariance[i, i]
+    for k in range(size):
+        best, largest = -1, ROUNDING * size
+        for i in range(size):
+            if not covariance[i, i] >= -ROUNDING * size * whole[i]:
+                return False
+            if covariance[i, i] > largest * whole[i]:
+                best, largest = i, covariance[i, i] / whole[i]
+        if best >= 0:
+            pivot = np.sqrt(covariance[best, best])
+            for i in range(size):
+                rows[i, k] = covariance[i, best] / pivot
+            for i in range(size):
+                for j in range(size):
+                    covariance[i, j] -= rows[i, k] * rows[j, k]
+    return True
+
+
+def retriangulate(rows: Floats, factor: Floats) -> None:
+    """Fill the lower factor of A A', of rows A (t, t), which may be the factor itself."""
+    array, weights = np.empty(rows.shape), np.empty(len(rows))
+    for row in range(len(rows)):
+        weights[row] = 1.0
+        for column in range(len(rows)):
+            array[row, column] = rows[row, column]
+    orthogonalise(array, weights, factor)
+
+
+def _start(covariances: Floats) -> Floats:
+    """NaN where a covariance is not positive definite: such a run does not start."""
+    factors, whole = np.full_like(covariances, np.nan), is_positive_definite(covariances)
+    factors[whole] = np.linalg.cholesky(covariances[whole])
+    return factors
+
+
+def _to_covariance(factor: Floats) -> None:
+    for row in range(len(factor) - 1, -1, -1):
+        for column in range(row, -1, -1):
+            entry = 0.0
+            for k in range(column + 1):
+                entry += factor[row, k] * factor[column, k]
+            factor[row, column] = factor[column, row] = entry
+
+
+def _times(factor: Floats, vector: Any, product: Floats) -> None:
+    for row in range(len(factor)):
+        product[row] = 0.0
+    for k in range(len(factor)):
+        entry = 0.0
+        for row in range(k, len(factor)):
+            entry += factor[row, k] * vector[row]
+        for row in range(k, len(factor)):
+            product[row] += factor[row, k] * entry
+
+
+def _propagate(factor: Floats, transition: Floats, product: Floats) -> None:
+    multiply(transition, factor, product)
+    retriangulate(product, factor)
+
+
+def _turn(turning: Function, vector: Floats, factor: Floats) -> None:
+    turning(vector, factor)
+    retriangulate(factor, factor)
+
+
+def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, factor: Floats) -> None:
+    t = len(factor)
+    array, scales = np.empty((t, 2 * t + 1)), np.empty(2 * t + 1)
+    for row in range(t):
+        for column in range(t):
+            factor[row, column] = 0.0
+    for mode in range(len(weights)):
+        for k in range(2 * t + 1):
+            scales[k] = 1.0 if k < t else weights[mode]
+        for row in range(t):
+            for k in range(t):
+                array[row, k], array[row, t + k] = factor[row, k], carried[mode, row, k]
+            array[row, 2 * t] = away[mode, row] - shift[row]
+        orthogonalise(array, scales, factor)
+
+
+def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, _: Floats) -> bool:
+    """Of what a prediction leaves: G S- in `work.product`, the factor of P - G D' in `work.rest`."""
+    t = len(before)
+    for row in range(t):
+        for column in range(t - 1, -1, -1):
+            entry, pivot = work.product[row, column], after[column, column]
+            for k in range(column + 1, t):
+                entry -= turned[k, row] * after[k, column]
+            turned[column, row] = entry / pivot if pivot > 0.0 else 0.0
+        for column in range(t):
+            before[row, column] = work.rest[row, column]
+    _to_covariance(before)
+    return True
+
+
+FACTORS = Form(_start, _to_covariance, _times, _propagate, _turn, _mix, _retrace)
