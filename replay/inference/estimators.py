@@ -47,7 +47,7 @@ from replay.inference.run.out_of_sequence import OutOfSequenceFilter
 
 @lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
-    """The parameters of a model and of a method, in one type."""
+    """Return the parameters of a model and of a method, in one type."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
     return _created(name, (method.parameters, model.parameters))
 
@@ -55,11 +55,12 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
 ) -> type[Any]:
+    """Make a type of parameters that has the meanings of its bases."""
     return create_model(name, __base__=bases, **(fields or {}))
 
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
-    """A type of parameters with other defaults for some of them."""
+    """Make a type of parameters with other defaults for some of them."""
     fields: Any = {}
     for name, value in defaults.items():
         field = kind.model_fields[name]
@@ -68,7 +69,7 @@ def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> 
 
 
 def _accepted(field: FieldInfo) -> Any:
-    """What a parameter accepts: its type with its bounds."""
+    """Return what a parameter accepts: its type with its bounds."""
     bounds = tuple(field.metadata)
     return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
 
@@ -76,7 +77,7 @@ def _accepted(field: FieldInfo) -> Any:
 def modelled_by(
     model: Model, method: Method, name: str, settings: Mapping[str, Any] | None = None
 ) -> Estimator[Any]:
-    """The estimator of one model by a method of that name; `settings` are its own defaults.
+    """Make the estimator of one model by a method of that name; `settings` are its own defaults.
 
     Raises BadInput where the method cannot be set so, or the model lacks what it needs then.
     """
@@ -99,12 +100,12 @@ def modelled_by(
 
 
 def of_any_model(method: Method) -> Estimator[Any]:
-    """The estimator that estimates, by one method, the state of the registered model that fits a log."""
+    """Make the estimator that estimates, by one method, the registered model that fits a log."""
     return _OfAnyModel(method)
 
 
 class _OfAnyModel(Estimator[Any]):
-    """What it needs and its parameters follow from all models; they are made when they are asked for."""
+    """Makes its requirements and parameters from all models when they are asked for."""
 
     def __init__(self, method: Method) -> None:
         vars(self).update(
@@ -116,22 +117,22 @@ class _OfAnyModel(Estimator[Any]):
 
     @cached_property
     def requirements(self) -> str:
-        """What a log must have."""
+        """Return what a log must have."""
         return " or ".join(
             f"({name}) {requirements_of(model)}" for name, model in registered_models().items()
         )
 
     @cached_property
     def parameters(self) -> type[Parameters]:
-        """Those of all models, and of the method."""
+        """Return those of all models, and of the method."""
         return _any_parameters(vars(self)["_method"])
 
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:
-        """Those of all models, and of the method that the variant of a name chooses."""
+        """Return those of all models, and of the method that the variant of a name chooses."""
         return _any_parameters(self._made(name, variant))
 
     def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:
-        """Those of each model that the method can estimate, and of the method."""
+        """Return those of each model that the method can estimate, and of the method."""
         method = self._made(name, variant)
         models = registered_models().items()
         return {each: combined(model, method) for each, model in models if not method.lacks(model)}
@@ -142,7 +143,7 @@ class _OfAnyModel(Estimator[Any]):
 
 
 def registered_models() -> dict[str, Model]:
-    """The models by name; one that does not load is left out, and says why where it is named."""
+    """Return the models by name; one that does not load is left out, and says why where it is named."""
     found = {}
     for name in available("models"):
         with suppress(BadInput):
@@ -152,9 +153,9 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """All parameters of all models, none of them set, with those of a method and the model's name.
+    """Collect all parameters of all models, none of them set, with a method's and the model's name.
 
-    What one model wants of a parameter is checked when the log has told which model it is.
+    What one model wants of a parameter is checked when it is known which model fits the log.
     """
     fields: dict[str, Any] = {"model": (str | None, Field(None, description=_MODEL))}
     told: dict[str, dict[str, list[str]]] = {}
@@ -236,7 +237,7 @@ def _bind_fitting(
 def bind_model(
     label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
 ) -> list[Bound]:
-    """A filter for everything in the log that is of this model."""
+    """Return a filter for everything in the log that is of this model."""
     method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
@@ -297,7 +298,7 @@ def _check_topics(
 
 
 def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Floats | None:
-    """The origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
+    """Return the origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
 
     Raises BadInput where channels state different ones, or the first fix would have to be the origin
     though another sensor says where the thing is in a frame of its own.
@@ -321,7 +322,7 @@ def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topi
 def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """The estimator that goes back for late messages; raises BadInput where the filter cannot."""
+    """Make the estimator that reprocesses late messages; raises BadInput where the filter cannot."""
     reason = filtering.why_in_sequence
     if reason:
         raise BadInput(
@@ -332,7 +333,10 @@ def _reprocessing(
 
 
 def _made_for(where: str, method: Method, parameters: Any) -> Method:
-    """The method that the parameters choose; BadInput that begins with `where`, if they choose none."""
+    """Choose the method that the parameters name.
+
+    BadInput that begins with `where`, if there is none.
+    """
     try:
         return method.made_for(parameters) if method.made_for else method
     except BadInput as error:
@@ -340,7 +344,7 @@ def _made_for(where: str, method: Method, parameters: Any) -> Method:
 
 
 def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
-    """The motion of this name, the model's own where none is given; BadInput for an unknown one."""
+    """Find the motion of this name, the model's own where none is given; BadInput for an unknown one."""
     if mode is None:
         return model.motion
     if not model.modes:

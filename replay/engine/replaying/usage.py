@@ -22,15 +22,15 @@ LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
 
 
 class Row(NamedTuple):
-    """A line of the table `coverage`.
+    """Holds a line of the table `coverage`.
 
     Attributes:
         estimator: its label.
-        topic: the measurements; several where innovations do not say which of them they are of.
+        topic: the measurements; several where innovations do not name theirs.
         messages: how many there were.
         used, gated: how many gave an innovation that was taken, and one that was refused; None where
             the estimator states no innovations.
-        skipped: how many of them the estimator says that it left out.
+        skipped: how many of them the estimator reports as left out.
         why: of those that were not used, in words.
     """
 
@@ -44,12 +44,12 @@ class Row(NamedTuple):
 
     @property
     def unused(self) -> int:
-        """How many came to nothing, though they were not gated."""
+        """Count how many came to nothing, though they were not gated."""
         return 0 if self.used is None else self.messages - self.used - (self.gated or 0)
 
     @property
     def sentence(self) -> str:
-        """What is said of them; empty where all came to something, or the estimator says why not."""
+        """Write a sentence on them; empty where all had an effect, or the estimator says why not."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -64,11 +64,11 @@ class Usage:
         name: the bound estimator's.
         given: messages by topic.
         measured: the topics of measurements among these.
-        facts: by topic, how many messages there is something to say of.
+        facts: by topic, how many messages a fact is about.
         used, gated: innovations.
         skipped: what was left out, by reason.
         speaks: whether it gives innovations.
-        doubtful: what to say of a topic that it begins with.
+        doubtful: a sentence on a topic that it begins with.
     """
 
     name: str
@@ -89,7 +89,7 @@ class Usage:
                     self._note_map(topic, ragged.of_run(run))
 
     def _note_map(self, topic: str, stream: Stream) -> None:
-        """Say where a landmark is at two places."""
+        """Report landmarks that are at two places."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
         apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1) * (np.diff(number) == 0)
@@ -141,7 +141,7 @@ class Usage:
         self.doubtful = other.doubtful | self.doubtful
 
     def rows(self) -> Iterator[Row]:
-        """What became of its measurements: of each topic, or of all where innovations are of several."""
+        """Count what became of measurements: by topic, or all where innovations are of several."""
         label, topics = self.name.partition("/")[0], sorted(self.measured)
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
@@ -171,7 +171,7 @@ def _infinite(stream: Stream) -> np.ndarray:
 
 
 def _repeated(stream: Stream) -> np.ndarray:
-    """The messages that are in all the same as the one before; NaN is as good as NaN."""
+    """Return the messages that are in all the same as the one before; NaN is as good as NaN."""
     found = np.zeros(len(stream), bool)
     if len(stream) > 1:
         same = np.diff(stream.publish_time_ns) == 0

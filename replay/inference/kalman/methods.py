@@ -66,15 +66,12 @@ class MethodParameters(Parameters):
     Attributes:
         every_s: estimates are given at this interval too, besides those at the sensors' stamps.
         mode: the motion to use of a model that has several.
-        estimate: names of parameters that become part of the state; each starts from its value, and is
-            constant unless `estimate_drift` or `estimate_time_s` has it.
+        estimate: names of parameters that become part of the state; each starts from its value.
         estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
-        estimate_drift: random walk of such a parameter, in its unit per square root of a second, by
-            name.
-        estimate_time_s: time within about which such a parameter returns to its value, as a first-order
-            Gauss-Markov process, in s, by name.
-        topics: which topic of the log stands for one that the model asks for, such as {pose =
-            "/amcl_pose/pose"}; an empty name leaves a sensor out.
+        estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
+        estimate_time_s: time within about which it returns to its value (Gauss-Markov), in s, by name.
+        topics: which topic stands for one that the model asks for, such as {pose = "/amcl_pose/pose"};
+            an empty name leaves a sensor out.
     """
 
     every_s: PositiveFloat | None = None
@@ -155,6 +152,10 @@ def iterated_update(stage: Stage, number: int) -> Function:
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
     gate is tested at the prediction, and so is how much the measurement counts; innovation and
     likelihood are those of the last iterate.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
@@ -332,7 +333,7 @@ def _lacks_slopes(model: Model) -> str:
             try:
                 own = traced_sensor(model, sensor, number_fields(model.parameters))
                 sensor_derivative(model, own)(trial_state(model.kinds), reference, parameters, work)
-            except Exception:  # is said when the model is bound, see `model.check_sensor`
+            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
                 return f"a regular linearisation of its sensor {sensor.topic}"
@@ -381,6 +382,11 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
     """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that rests on it.
 
     Raises BadInput where there is no such filter; `use` says what for.
+
+    Args:
+        text: as it is given.
+        method: the method that rests on the filter.
+        use: in words, for the error.
     """
     name, _, variant = text.partition(":")
     if name not in FILTERS:

@@ -79,7 +79,12 @@ def sensor_noise(sensor: Sensor) -> Function:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> Function:
-    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`."""
+    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`.
+
+    Args:
+        model: the model, for the kinds of its state.
+        sensor: with n components of the state and m measured ones: `rows` (m, t).
+    """
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
 
@@ -100,6 +105,10 @@ def linear_sensor(stage: Stage, number: int) -> Function:
 
     Returns `innovate(mean, covariance, data, parameters, sample_index, work)`, which fills that of the
     sensor in `work.innovations`.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
     """
     sensor = stage.sensors[number]
     read_state, read = tuple_of(stage.model.size), reading(sensor)

@@ -17,7 +17,7 @@ KNOWN = 64  # sizes up to this are part of a kernel
 
 
 class KnownArray(NamedTuple):
-    """How an array lies in memory: NumPy's letter of its numbers, its sizes (None where they vary)."""
+    """Describes how an array lies in memory: NumPy's letter of its numbers, and its sizes or None."""
 
     letter: str
     shape: tuple[int | None, ...]
@@ -56,7 +56,7 @@ def describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> N
 
 
 def with_types(value: Any, kinds: Iterator[Any]) -> Any:
-    """An argument in full, as `value_of` takes it: from what it is and its part of the key."""
+    """Return an argument in full, as `value_of` takes it: from what it is and its part of the key."""
     kind = next(kinds)
     if isinstance(value, tuple):
         return type(value), tuple(with_types(each, kinds) for each in value)
@@ -82,7 +82,7 @@ _SCALARS: tuple[tuple[Any, str], ...] = (
 
 
 def letters(kind: Any) -> str:
-    """How the numbers of an argument are packed into words."""
+    """Describe how the numbers of an argument are packed into words."""
     if isinstance(kind, KnownArray):
         return "q"
     if isinstance(kind, tuple):
@@ -91,7 +91,7 @@ def letters(kind: Any) -> str:
 
 
 def value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
-    """The value that a described argument is in the kernel: loaded from its words."""
+    """Return the value that a described argument is in the kernel: loaded from its words."""
     if isinstance(kind, KnownArray):
         return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
     if isinstance(kind, tuple):
@@ -114,7 +114,7 @@ def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
 
 
 def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
-    """An array of NumPy's: where its numbers are, and the sizes that are not known."""
+    """Return an array of NumPy's: where its numbers are, and the sizes that are not known."""
     dtype = _LETTERS[kind.letter]
     sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
     shape: list[Any] = [
