@@ -195,11 +195,11 @@ def _bind_fitting(
     if named is not None:
         models = {named: load("models", named, Model)}
     renamed = given.get("topics") or {}
-    asked = {name: roles_of(model) for name, model in models.items()}
+    asked = {name: roles_of(model) for name, model in models.items()} if renamed else {}
     for role in renamed:
         _check_role(label, role, {each for roles in asked.values() for each in roles})
     found = {
-        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked[name]) else []
+        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked.get(name, ())) else []
         for name, model in models.items()
     }
     fitting = [name for name, model in models.items() if found[name] and (named or not model.by_name)]

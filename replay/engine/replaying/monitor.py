@@ -84,7 +84,7 @@ class RunMonitor:
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
-        self.usage.note_given(streams, self.static)
+        self.usage.note_given(streams, self.static, self._order)
         began = time.perf_counter()
         try:
             try:
@@ -119,6 +119,7 @@ class RunMonitor:
 
     def finish(self) -> list[Ragged]:
         """Return all failures of all runs: those found here beside the estimator's own."""
+        self.usage.shares.end()
         told = {topic: join(parts) for topic, parts in self._told.items()}
         for run, reason in self._unable.items():
             if self._last_ns[run] >= 0:

@@ -21,7 +21,7 @@ from replay.engine.streams.blocks import Block, Ragged, gather, join, merge_even
 from replay.engine.streams.priors import start_of_runs
 from replay.engine.streams.sources import Ensemble, Source, ensemble_of
 
-BLOCK_MESSAGES = 1 << 18
+BLOCK_MESSAGES = 1 << 16
 # Of a run, those that an initialization looks at.
 FIRST_MESSAGES = 1 << 15
 # Of the product of two standard deviations: rounding is far below.

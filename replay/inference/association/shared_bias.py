@@ -17,7 +17,7 @@ import numpy as np
 
 from replay.engine.arrays import Booleans, Floats, varying
 from replay.inference.association.tracks import Tracks
-from replay.inference.linear_algebra.small_matrices import invert
+from replay.inference.linear_algebra.gaussian import invert
 
 
 @varying(0, is_updated=1)
