@@ -55,7 +55,7 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
 ) -> type[Any]:
-    """Make a type of parameters with further fields."""
+    """Make a type of parameters that has the meanings of its bases."""
     return create_model(name, __base__=bases, **(fields or {}))
 
 
@@ -128,11 +128,11 @@ class _OfAnyModel(Estimator[Any]):
         return _any_parameters(vars(self)["_method"])
 
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:
-        """Those of all models, and of the method that the variant of a name chooses."""
+        """Return those of all models, and of the method that the variant of a name chooses."""
         return _any_parameters(self._made(name, variant))
 
     def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:
-        """Those of each model that the method can estimate, and of the method."""
+        """Return those of each model that the method can estimate, and of the method."""
         method = self._made(name, variant)
         models = registered_models().items()
         return {each: combined(model, method) for each, model in models if not method.lacks(model)}

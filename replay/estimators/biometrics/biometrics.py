@@ -102,8 +102,7 @@ class MixtureParameters(LearnerParameters):
     """HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
 
     Attributes:
-        topology: how states follow one another; joint takes all scores as one vector of one state: a
-            Gaussian mixture.
+        topology: how states follow one another; joint is one state, with all scores as its vector.
         genuine_components: Gaussians per state of genuine pairs.
         impostor_components: Gaussians per state of impostor pairs.
         components_of: Gaussians per state of both, by the name of a subset.
