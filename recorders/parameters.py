@@ -1,6 +1,7 @@
 """Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from inspect import cleandoc
@@ -8,7 +9,9 @@ from textwrap import shorten
 from tomllib import TOMLDecodeError
 from typing import Any, NamedTuple, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from recorders.errors import BadInput, choices
 from recorders.parsing import DEEPEST, parse_toml
@@ -17,12 +20,26 @@ from recorders.parsing import DEEPEST, parse_toml
 class Parameters(BaseModel):
     """Base of all parameter types: immutable, no unknown names, no NaN and no infinity.
 
-    The text below a parameter says what it means and its unit; `describe` has it.
+    What a parameter means stands in one place, under `Attributes:` in the docstring of its type; its
+    unit is the end of its name, or stands there too. `describe` has both.
     """
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def __get_pydantic_json_schema__(
+        cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        """The JSON schema, with what every parameter means and its unit."""
+        schema = handler(core_schema)
+        table = handler.resolve_ref_schema(schema)
+        table["description"] = _prose(cls)
+        meaning_of, entries = meanings(cls), table.setdefault("properties", {})
+        for name, field in cls.model_fields.items():
+            entry = entries[field.alias or name]
+            entry.setdefault("description", meaning_of.get(name, ""))
+            entry["unit"] = unit_of(name)
+        return schema
 
 
 ParametersType = TypeVar("ParametersType", bound=Parameters)
@@ -78,76 +95,163 @@ def _table_in(annotation: Any) -> type[BaseModel] | None:
     return next(filter(None, map(_table_in, get_args(annotation))), None)
 
 
-class Described(NamedTuple):
-    """One parameter as a person reads it: its full name, default, what it accepts, and what it means.
+# What the end of a parameter's name says of its unit.
+_UNITS = {
+    "s": "s", "h": "h", "hz": "Hz", "m": "m", "m2": "m^2", "mps": "m/s", "mps2": "m/s^2", "ut": "uT",
+    "rad": "rad", "mrad": "mrad", "deg": "deg", "radps": "rad/s", "degps": "deg/s", "db": "dB",
+    "per_s": "1/s", "per_minute": "1/min", "per_m2": "1/m^2", "per_rad": "1/rad",
+    "per_km2_h": "1/(km^2 h)",
+}  # fmt: skip
+_UNIT = re.compile(f"_({'|'.join(sorted(_UNITS, key=len, reverse=True))})$")
+_ATTRIBUTES = re.compile(r"^Attributes:\n(?P<entries>(?: .*(?:\n|$)|\n)*)", re.MULTILINE)
+_ENTRY = re.compile(r"^    (?P<names>\w+(?:, \w+)*): (?P<meaning>\S.*(?:\n {5,}\S.*)*)", re.MULTILINE)
 
-    The meaning is empty where the type does not say it.
+
+def unit_of(name: str) -> str:
+    """The unit of a parameter, as the end of its name says it; empty where it says none.
+
+    >>> unit_of("turn_bias_radps"), unit_of("clutter_per_m2"), unit_of("gate_probability")
+    ('rad/s', '1/m^2', '')
+    """
+    found = _UNIT.search(name)
+    return _UNITS[found[1]] if found else ""
+
+
+@cache
+def meanings(kind: type[BaseModel]) -> dict[str, str]:
+    """What the parameters of a type mean, by name: its `Attributes:`, over those of its bases.
+
+    An entry is `name: meaning`, or `name, name: meaning` where several mean alike. Raises BadInput where
+    one names no parameter.
+    """
+    told: dict[str, str] = {}
+    for base in reversed(kind.__mro__):
+        own = base.__doc__ if issubclass(base, Parameters) else None
+        section = _ATTRIBUTES.search(cleandoc(own or ""))
+        for entry in _ENTRY.finditer(section["entries"]) if section else ():
+            for name in entry["names"].split(", "):
+                if name not in kind.model_fields:
+                    raise BadInput(
+                        f"{base.__name__}: its docstring says what '{name}' means, and it has no such "
+                        f"parameter; {choices(name, kind.model_fields)}"
+                    )
+                told[name] = " ".join(entry["meaning"].split())
+    return told
+
+
+def _prose(kind: type[BaseModel]) -> str:
+    """What a type and its bases say of their parameters as a whole."""
+    told = [
+        _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
+        for each in reversed(kind.__mro__)
+        if issubclass(each, Parameters) and each is not Parameters
+    ]
+    return "\n\n".join(filter(None, dict.fromkeys(told)))
+
+
+class Described(NamedTuple):
+    """One parameter as a person reads it: full name, default, unit, what it accepts, what it means.
+
+    Unit and meaning are empty where the type does not say them.
     """
 
     name: str
     default: Any
+    unit: str
     accepts: str
     meaning: str
 
 
 def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> list[Described]:
-    """All parameters of a type, those of nested tables by full names; `values` stand for defaults."""
+    """All parameters of a type, those of nested tables by full names; `values` stand for defaults.
+
+    In a list of tables names are such as `nodes[].sigma_m`, in tables by name `cases.NAME.sigma_m`.
+    """
     schema = kind.model_json_schema()
     return list(_described(schema, schema.get("$defs", {}), "", values or {}))
 
 
 def explain(kind: type[BaseModel]) -> dict[str, str]:
-    """What a type and those of its nested tables say of their parameters, by where these are.
+    """What a type and those of its nested tables say as a whole, by where these are.
 
-    A place is the full name of a table and a dot, such as `range_bearing.`, empty for the type's own
-    parameters; several tables of one type stand together. What a type inherits comes first.
+    A place is how the names in a table begin, such as `range_bearing.`, empty for the type itself;
+    several tables that say the same stand together. What a type inherits comes first.
     """
+    schema = kind.model_json_schema()
     places: dict[str, list[str]] = {}
-    for place, table in _tables(kind, ""):
-        told = [
-            cleandoc(each.__doc__)
-            for each in reversed(table.__mro__)
-            if issubclass(each, BaseModel) and each not in (BaseModel, Parameters) and each.__doc__
-        ]
-        if told:
-            places.setdefault("\n\n".join(dict.fromkeys(told)), []).append(place)
+    for place, table in _tables("", schema, schema.get("$defs", {})):
+        if told := table.get("description"):
+            places.setdefault(told, []).append(place)
     return {", ".join(names): text for text, names in places.items()}
 
 
-def _tables(kind: type[BaseModel], prefix: str) -> Iterator[tuple[str, type[BaseModel]]]:
-    yield prefix, kind
-    for name, entry in kind.model_fields.items():
-        if table := _table_in(entry.annotation):
-            yield from _tables(table, f"{prefix}{entry.alias or name}.")
+def _tables(
+    prefix: str, table: Mapping[str, Any], definitions: Mapping[str, Any]
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    yield prefix, table
+    for name, entry in table["properties"].items():
+        for below in _below(entry, definitions, f"{prefix}{name}"):
+            yield from _tables(*below, definitions)
 
 
 def _described(
     table: Mapping[str, Any], definitions: Mapping[str, Any], prefix: str, given: Mapping[str, Any]
 ) -> Iterator[Described]:
     """Walk a JSON schema; `given` are defaults that the table above states for this one."""
-    for name, entry in table.get("properties", {}).items():
-        default = entry.get("default")
-        options = [
-            definitions[each["$ref"].rpartition("/")[2]] if "$ref" in each else each
-            for each in entry.get("anyOf", [entry])
-        ]
-        below = next((each for each in options if "properties" in each), None)
-        if below is None:
-            value = given.get(name, default)
-            meaning = " ".join(entry.get("description", "").split())
-            yield Described(prefix + name, value, " or ".join(map(_accepts, options)), meaning)
-        else:
-            values = merge(default or {}, given.get(name) or {})
-            yield from _described(below, definitions, f"{prefix}{name}.", values)
+    for name, entry in table["properties"].items():
+        value = given.get(name, entry.get("default"))
+        below = next(_below(entry, definitions, f"{prefix}{name}"), None)
+        is_table = below is not None and below[0] == f"{prefix}{name}."
+        accepts = _accepts(entry, definitions)
+        shown = None if is_table else value
+        yield Described(f"{prefix}{name}", shown, entry["unit"], accepts, entry["description"])
+        if below is not None:
+            values = merge(entry.get("default") or {}, given.get(name) or {}) if is_table else {}
+            yield from _described(below[1], definitions, below[0], values)
 
 
-def _accepts(schema: Mapping[str, Any]) -> str:
+def _below(
+    schema: Mapping[str, Any], definitions: Mapping[str, Any], name: str
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The schemas of the tables in a value, with how the names in them begin."""
+    schema = _resolved(schema, definitions)
+    if "properties" in schema:
+        yield f"{name}.", schema
+    for option in schema.get("anyOf", []):
+        yield from _below(option, definitions, name)
+    for key, inside in (("items", f"{name}[]"), (_OTHERS, f"{name}.NAME")):
+        if isinstance(schema.get(key), dict):
+            yield from _below(schema[key], definitions, inside)
+
+
+def _resolved(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> Mapping[str, Any]:
+    return definitions[schema["$ref"].rpartition("/")[2]] if "$ref" in schema else schema
+
+
+def _accepts(schema: Mapping[str, Any], definitions: Mapping[str, Any]) -> str:
     """What a schema of one value accepts: its type and bounds, or its choices."""
+    schema = _resolved(schema, definitions)
+    if "anyOf" in schema:
+        return " or ".join(_accepts(each, definitions) for each in schema["anyOf"])
     if "enum" in schema:
         return ", ".join(map(str, schema["enum"]))
-    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-    bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
-    return " ".join([schema.get("type", "anything").replace("null", "none"), *bounds])
+    if "const" in schema:
+        return str(schema["const"])
+    kind = schema.get("type", "anything").replace("null", "none").replace("object", "table")
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in _SIGNS.items() if key in schema]
+    inside = schema.get("prefixItems") or [
+        each for each in (schema.get("items"), schema.get(_OTHERS)) if isinstance(each, dict)
+    ]
+    least, most = schema.get("minItems"), schema.get("maxItems")
+    if least or most:
+        above = f"at least {least}" if most is None else f"{least or 0} to {most}"
+        bounds.append(f"({least})" if least == most else f"({above})")
+    if inside:
+        bounds.append("of " + ", ".join(dict.fromkeys(_accepts(each, definitions) for each in inside)))
+    return " ".join([kind, *bounds])
+
+
+_SIGNS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 
 
 def bounds_of(kind: type[BaseModel], name: str) -> tuple[float, float]:

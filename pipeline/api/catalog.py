@@ -9,13 +9,13 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.output.terminal import print_json, print_table, say
-from pipeline.runs.experiment import Experiment, load_scenario, shipped
+from pipeline.runs.experiment import Experiment, Study, load_scenario, shipped
 from recorders.errors import BadInput, choices
 from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml
 from recorders.recording import Importer, Recorder
 from recorders.registry import available, load
-from replay.engine.replaying.estimator import Estimator
+from replay.engine.replaying.estimator import Estimator, find_estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import registered_models
 from replay.inference.formulas import formulas, formulas_by_function
@@ -30,7 +30,8 @@ from replay.judging.metrics.measuring import Metric
 class Entry:
     """One thing to choose: what it is in a line, more facts, its parameters, and values it sets.
 
-    `stated` are the parameters that a log's channels state where they are not given.
+    `stated` are the parameters that a log's channels state where they are not given; the names of all
+    begin with `prefix` where they are set.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Entry:
     parameters: type[BaseModel] | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
     stated: Collection[str] = ()
+    prefix: str = ""
 
 
 def scenarios() -> list[Entry]:
@@ -72,6 +74,8 @@ def show(entries: list[Entry], kind: str, name: str | None, *, as_json: bool) ->
     """Print a list, or all about one of its entries."""
     if name is not None:
         known = {entry.name: entry for entry in entries}
+        if kind == "estimator" and name.partition(":")[0] in known:
+            known[name] = _estimator(name, *find_estimator(name))
         if name not in known:
             raise BadInput(f"no {kind} '{name}'; {choices(name, known)}")
         entries = [known[name]]
@@ -139,8 +143,10 @@ def _recorder(name: str, recorder: Recorder[Any]) -> Entry:
     return Entry(name, recorder.summary, {"record with": command}, recorder.parameters)
 
 
-def _estimator(name: str, estimator: Estimator[Any]) -> Entry:
+def _estimator(name: str, estimator: Estimator[Any], variant: Mapping[str, Any] | None = None) -> Entry:
     facts = {"needs": estimator.requirements}
+    if variant:
+        return Entry(name, estimator.summary, facts, estimator.parameters_with(name, variant), variant)
     if estimator.variant:
         facts["variants"] = f"{name}:VALUE sets {estimator.variant}"
     return Entry(name, estimator.summary, facts, estimator.parameters)
@@ -160,9 +166,13 @@ def _model(name: str, model: Model) -> Entry:
         facts["estimable"] = _listed(model.augmentable)
     facts["needs"] = requirements_of(model)
     facts |= {f"by {method}": answer for method, answer in _methods_of(model).items()}
+    return Entry(name, model.summary, facts, model.parameters, stated=stated_of(model))
+
+
+def stated_of(model: Model) -> set[str]:
+    """The parameters of a model that a log's channels state where they are not given."""
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
-    stated = own & {*number_fields(model.parameters)}
-    return Entry(name, model.summary, facts, model.parameters, stated=stated)
+    return own & {*number_fields(model.parameters)}
 
 
 def _listed(components: Mapping[str, str]) -> str:
@@ -183,7 +193,8 @@ def _experiment(name: str, path: Path) -> Entry:
         facts["records"] = f"{experiment.record.scenario}, {experiment.runs} runs"
     if experiment.import_:
         facts["imports"] = f"{experiment.import_.source}; give its place with --data"
-    return Entry(name, experiment.title, facts)
+    options = load("studies", experiment.study, Study).options
+    return Entry(name, experiment.title, facts, options, experiment.options, prefix="options.")
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:
@@ -201,18 +212,26 @@ def _print_details(entry: Entry) -> None:
     say(f"{entry.name}: {entry.what}")
     for key, fact in entry.facts.items():
         say(f"{key}: {fact}")
-    if entry.parameters:
-        described = describe(entry.parameters, entry.values)
-        table = [
-            [each.name, _default(each.default, is_stated=each.name in entry.stated), *each[2:]]
-            for each in described
+    rows = rows_of(entry)
+    if rows and entry.parameters:
+        print_table(["parameter", "default", "unit", "accepts", "meaning"], rows)
+        for place, text in explain(entry.parameters).items():
+            for line in ("", *([place] if place else []), *text.splitlines()):
+                say(line)
+
+
+def rows_of(entry: Entry) -> list[list[object]]:
+    """Of every parameter its name, its default, its unit, what it accepts and what it means."""
+    if entry.parameters is None:
+        return []
+    return [
+        [
+            f"{entry.prefix}{each.name}",
+            _default(each.default, is_stated=each.name in entry.stated),
+            *each[2:],
         ]
-        if any(each.meaning for each in described):
-            print_table(["parameter", "default", "accepts", "meaning"], table)
-        elif table:
-            print_table(["parameter", "default", "accepts"], [row[:-1] for row in table])
-        for place, text in explain(entry.parameters).items() if table else ():
-            say(f"\n{place}\n{text}" if place else f"\n{text}")
+        for each in describe(entry.parameters, entry.values)
+    ]
 
 
 def _default(value: object, *, is_stated: bool) -> object:

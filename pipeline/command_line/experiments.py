@@ -47,7 +47,7 @@ from recorders.errors import printable
 @parameters_option
 @json_option
 @settings_option
-@set_option
+@set_option("experiment")
 def run(
     experiment: tuple[str, ...],
     labels: tuple[str, ...],
@@ -100,7 +100,7 @@ def run(
 @scheduler_option
 @json_option
 @settings_option
-@set_option
+@set_option("experiment")
 def sweep(
     experiment: tuple[str, ...],
     labels: tuple[str, ...],

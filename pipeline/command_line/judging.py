@@ -146,7 +146,7 @@ def evaluate(
 @gap_option
 @json_option
 @settings_option
-@set_option
+@set_option("estimators")
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
 
@@ -172,7 +172,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 @gap_option
 @json_option
 @settings_option
-@set_option
+@set_option("estimators")
 def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     """Say what is likely wrong with LOG or the settings of an estimator, and what to try.
 
@@ -206,7 +206,7 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 @click.option("--end", "end_s", type=Seconds(), help="End this many seconds into the run.")
 @recover_option
 @json_option
-@set_option
+@set_option("observability")
 def observability(logs: tuple[Path, ...], **options: Any) -> None:
     """Say how well the measurements of LOGS determine the state, and which direction least.
 

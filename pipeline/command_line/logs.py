@@ -166,7 +166,7 @@ def merge(logs: tuple[Path, ...], offsets: tuple[str, ...], **options: Any) -> N
 @click.argument("path", type=ANY_PATH)
 @out_log_option
 @click.option("--unit", metavar="TOPIC", help="The inertial samples [default: the only unit].")
-@set_option
+@set_option("constraints")
 @recover_option
 def constrain(path: Path, settings: tuple[str, ...], **options: Any) -> None:
     """Write PATH with topics that say when its body stands and, with --set rolling_hz=10, that it rolls.

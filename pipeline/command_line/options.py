@@ -1,6 +1,8 @@
 """Types of options, and the options that several commands have."""
 
 import os
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +75,6 @@ settings_option = click.option(
     metavar="FILE",
     help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides it.",
 )
-set_option = click.option(
-    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="Set a parameter (repeatable)."
-)
 errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
@@ -119,3 +118,31 @@ foxglove_option = click.option(
     is_flag=True,
     help="Also write the messages that Foxglove's viewer shows.",
 )
+
+
+def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """The option --set of a command whose settings this takes, see `pipeline.api.asking.TAKERS`.
+
+    Where it asks, NAME=?, the command prints what that parameter means, and does nothing else.
+    """
+
+    def added(function: Callable[..., None]) -> Callable[..., None]:
+        @click.option(
+            "--set",
+            "settings",
+            multiple=True,
+            metavar="KEY=VALUE",
+            help="Set a parameter (repeatable); KEY=? says what it means.",
+        )
+        @wraps(function)
+        def asked_first(*arguments: Any, **options: Any) -> None:
+            if any(text.endswith("=?") for text in options["settings"]):
+                from pipeline.api.asking import show_meanings
+
+                show_meanings(options["settings"], takes, options)
+            else:
+                function(*arguments, **options)
+
+        return asked_first
+
+    return added

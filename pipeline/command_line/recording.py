@@ -29,7 +29,7 @@ from recorders.errors import BadInput, printable
     help="Of the log's chunks.",
 )
 @foxglove_option
-@set_option
+@set_option("recorder")
 def record(
     scenario: str | None,
     out: Path | None,
@@ -91,7 +91,7 @@ def record(
 @click.option(
     "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
 )
-@set_option
+@set_option("recorder")
 def import_(
     source: str,
     paths: tuple[Path, ...],

@@ -79,7 +79,7 @@ from pipeline.command_line.options import (
 @parameters_option
 @json_option
 @settings_option
-@set_option
+@set_option("estimators")
 def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> None:
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
 
@@ -142,7 +142,7 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 @gap_option
 @json_option
 @settings_option
-@set_option
+@set_option("estimators")
 def tune(logs: tuple[Path, ...], **options: Any) -> None:
     """Search the parameters of an estimator that explain LOGS best, with their 95 % intervals.
 
@@ -193,7 +193,7 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 )
 @json_option
 @settings_option
-@set_option
+@set_option("estimators")
 def check(path: Path, golden: Path, **options: Any) -> None:
     """Replay PATH, a log, a folder of logs or a result, and compare with a golden field by field.
 

@@ -15,10 +15,15 @@ from recorders.parameters import Parameters
 class ConstraintParameters(Parameters):
     """What is told of a body, and how it is known that it stands.
 
-    `standing_hz` times a second it is told whether the body stands: whether during the last `window_s`
-    the standard deviation of the specific force was below `still_mps2`, and the root mean square of the
-    turn rate below `still_radps`. `rolling_hz` times a second it is told that the body moves neither to
-    the side nor up, as on wheels. A rate of zero leaves it out.
+    Attributes:
+        standing_hz: how many times a second it is told whether the body stands; 0 leaves it out.
+        rolling_hz: how many times a second it is told that the body moves neither to the side nor up, as
+            on wheels; 0 leaves it out.
+        window_s: a body is judged by so long before.
+        still_mps2: it stands where the standard deviation of the specific force was below this, and the
+            turn rate below `still_radps`.
+        still_radps: it stands where the root mean square of the turn rate was below this, and the force
+            below `still_mps2`.
     """
 
     standing_hz: NonNegativeFloat = 5.0

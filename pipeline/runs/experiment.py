@@ -16,7 +16,7 @@ from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import Crew
 from pipeline.runs.settings import parameters_by_label
 from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build, describe, merge
+from recorders.parameters import Parameters, build, merge
 from recorders.parsing import read_toml
 from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
@@ -28,23 +28,35 @@ SHIPPED = resources.files("fuselog_data")
 
 
 class Record(Parameters):
-    """What to simulate: a scenario by name or TOML file, and what differs from its defaults."""
+    """What to simulate.
+
+    Attributes:
+        scenario: a scenario by name or TOML file.
+        parameters: what differs from its defaults, by name.
+    """
 
     scenario: str
     parameters: dict[str, Any] = {}
 
 
 class Import(Parameters):
-    """What to import; the data's place comes from --data."""
+    """What to import; the data's place comes from --data.
+
+    Attributes:
+        source: name of the importer.
+        parameters: what differs from its defaults, by name.
+    """
 
     source: str
     parameters: dict[str, Any] = {}
 
 
 class Logs(Parameters):
-    """Logs to replay, one run each: files or patterns such as `drive-*.mcap`.
+    """Logs to replay, one run each.
 
-    They count from the folder of the experiment's file; estimates that lie beside the logs are left out.
+    Attributes:
+        files: files or patterns such as `drive-*.mcap`, from the folder of the experiment's file on;
+            estimates that lie beside the logs are left out.
     """
 
     files: list[str] = []
@@ -53,10 +65,23 @@ class Logs(Parameters):
 class Experiment(Parameters):
     """One experiment as its TOML file says it.
 
-    The runs are recorded from a scenario, imported, or logs that are there. `estimators` maps a label to
-    parameters; a parameter `kind` names the estimator where the label is not its name. `metrics` are all
-    registered ones where none is named. `arrival_order` and `late` are as in `fuselog replay`. `options`
-    are the study's own.
+    The runs are recorded from a scenario, imported, or logs that are there.
+
+    Attributes:
+        title: what it is, in a line.
+        study: name of the study that does its work.
+        seed: seed of the recorded runs.
+        runs: number of recorded runs.
+        record: what to simulate.
+        import_: what to import.
+        logs: logs to replay.
+        estimators: parameters by label; one that is `kind` names the estimator where the label is not
+            its name.
+        metrics: names of the metrics; without any, all that are registered.
+        gap_limit_s: longest gap over which truth is interpolated.
+        arrival_order: whether messages are processed in the order in which they arrived.
+        late: what becomes of late measurements, as `--late` of `fuselog replay` has it.
+        options: the study's own.
     """
 
     title: str
@@ -271,8 +296,8 @@ def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
         part, recorder = "record", load_scenario(experiment.record.scenario)[0]
     else:
         return "", set()
-    described = describe(load("recorders", recorder, Recorder).parameters)
-    return part, {each.name.partition(".")[0] for each in described}
+    fields = load("recorders", recorder, Recorder).parameters.model_fields
+    return part, {field.alias or name for name, field in fields.items()}
 
 
 def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:

@@ -20,7 +20,13 @@ from replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
-    """What is searched for, and by the first word of their topics which vehicles tune and judge it."""
+    """What is searched for, and which vehicles tune and judge it.
+
+    Attributes:
+        free: names of the parameters that are searched for.
+        tuned_by: vehicles that tune, by the first word of their topics.
+        held_out: vehicles that judge, by the first word of their topics.
+    """
 
     free: tuple[str, ...] = ()
     tuned_by: tuple[str, ...] = ()

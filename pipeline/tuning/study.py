@@ -26,7 +26,12 @@ COVERAGE = 0.95
 
 
 class TuningOptions(Parameters):
-    """How long logs are, and what is searched for, by name, with the value that it was recorded with."""
+    """How long logs are, and what is searched for.
+
+    Attributes:
+        durations_s: lengths of the logs, in s.
+        true: the value that each parameter was recorded with, by name; these are searched for.
+    """
 
     durations_s: tuple[PositiveFloat, ...] = (20.0, 60.0, 300.0)
     true: dict[str, PositiveFloat] = {}

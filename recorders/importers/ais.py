@@ -37,10 +37,13 @@ NO_LATITUDE, NO_LONGITUDE, NO_COURSE, NO_SPEED = 91.0, 181.0, 360.0, 102.3
 
 
 class AisParameters(Parameters):
-    """The origin of the tangent plane (latitude, longitude), and what is reported as unlikely.
+    """Where the tangent plane is, and what is reported as unlikely.
 
-    Without an origin it is the median of the positions, rounded to 0.01 deg. Speeds above
-    `top_speed_mps` and gaps above `gap_s` are counted in the notes.
+    Attributes:
+        origin_deg: latitude and longitude of the tangent plane's origin; without one the median of the
+            positions, rounded to 0.01 deg.
+        top_speed_mps: speeds above this are counted in the notes.
+        gap_s: gaps above this between a vessel's reports are counted in the notes.
     """
 
     origin_deg: (

@@ -39,11 +39,18 @@ PLANE = ("x_m", "y_m")
 class PlaceSensor(Parameters):
     """What is assumed of a sensor that measures positions; its channels state it to trackers.
 
-    The error has the standard deviation `sigma_m` along the line of sight; across it `sigma_across_rad`
-    times the range is added. Detections are where a target was `lag_s` ago. The probability of a
-    detection holds up to `near_range_m`, falls linearly to `far_detection_probability` at
-    `far_range_m`, and keeps that beyond. Detections within `joined_within_m` of each other count as one
-    target.
+    Attributes:
+        sigma_m: standard deviation of a position along the line of sight.
+        sigma_across_rad: standard deviation across the line of sight, per m of range, that is added
+            there.
+        lag_s: detections are where a target was so long ago.
+        detection_probability: probability that a near target is detected.
+        near_range_m: up to this range a target is near; beyond it the probability falls linearly.
+        far_range_m: from this range on the probability falls no further.
+        far_detection_probability: probability that a target is detected from `far_range_m` on.
+        clutter_per_m2: mean number of false detections in a scan, per area.
+        joined_within_m: detections within this of each other count as one target.
+        gate_probability: probability that a target's detection is inside its gate.
     """
 
     sigma_m: PositiveFloat
@@ -61,9 +68,14 @@ class PlaceSensor(Parameters):
 class Camera(Parameters):
     """What is assumed of a camera's bearings; its channels state it to trackers.
 
-    The variance of a bearing is `sigma_rad` squared plus the square of `sigma_across_m` over the range,
-    since a box may lie anywhere on a hull. Errors last for seconds, so that a track uses one bearing
-    every `interval_s`.
+    Attributes:
+        sigma_rad: standard deviation of a bearing.
+        sigma_across_m: standard deviation across the line of sight that is added, since a box may lie
+            anywhere on a hull.
+        detection_probability: probability that a target is detected.
+        clutter_per_rad: mean number of false detections in a scan, per angle.
+        gate_probability: probability that a target's detection is inside its gate.
+        interval_s: a track uses one bearing in this time, since errors last for seconds.
     """
 
     sigma_rad: PositiveFloat = 0.04
@@ -75,7 +87,12 @@ class Camera(Parameters):
 
 
 class AutoferryParameters(Parameters):
-    """What the files do not state: the sensors' properties, the same in all scenarios."""
+    """What the files do not state: the sensors' properties, the same in all scenarios.
+
+    Attributes:
+        lidar, radar: what is assumed of this sensor's detections.
+        infrared, electro_optical: what is assumed of these cameras' bearings.
+    """
 
     lidar: PlaceSensor = PlaceSensor(
         sigma_m=2.0,

@@ -26,7 +26,11 @@ from recorders.recording import Importer, Recording, simulation_stamps_ns
 
 
 class Matchers(Parameters):
-    """What matchers.toml says."""
+    """What matchers.toml says.
+
+    Attributes:
+        matchers: the matchers, in the order of their files.
+    """
 
     matchers: list[Matcher] = []
 
@@ -39,7 +43,11 @@ class Matchers(Parameters):
 
 
 class ScoreMatricesParameters(Matchers):
-    """The matchers, and when probes arrive: the data say no times."""
+    """The matchers, and when probes arrive: the data say no times.
+
+    Attributes:
+        probe_interval_s: time between probes.
+    """
 
     probe_interval_s: PositiveFloat = 1.0
 

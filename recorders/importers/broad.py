@@ -27,7 +27,12 @@ DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement":
 
 
 class BroadParameters(Parameters):
-    """How far a quaternion's length may be from 1, and which gaps of inertial samples are reported."""
+    """What is refused, and what is reported.
+
+    Attributes:
+        unit_tolerance: how far the length of a true quaternion may be from 1.
+        gap_s: longer gaps of inertial samples and of truth are counted in the notes.
+    """
 
     unit_tolerance: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     gap_s: PositiveFloat = 0.1

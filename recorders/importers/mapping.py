@@ -52,7 +52,12 @@ _IN_BODY = {
 
 
 class Inflation(Parameters):
-    """Where a source has one of some values, standard deviations are multiplied `by` this."""
+    """Where standard deviations are larger than they say.
+
+    Attributes:
+        where: for each source the values with which they are.
+        by: what standard deviations are multiplied by there.
+    """
 
     where: dict[str, OneOrMore[Source]] = Field(min_length=1)
     by: PositiveFloat
@@ -62,20 +67,22 @@ class StreamMapping(Parameters):
     """What becomes one of fuselog's messages.
 
     Attributes:
-        becomes: the name of the message.
+        becomes: name of the message.
         fields: for each of its fields a source, or a list of them for a vector; numbers are constants.
-        factors, offsets: what sources are multiplied by, and what is added then.
-        units: what sources (with factors and offsets) are in; without one, in fuselog's unit.
+        factors: what sources are multiplied by, by field.
+        offsets: what is added to sources then, by field.
+        units: what sources (with factors and offsets) are in, by field; without one, in fuselog's unit.
         deviations: for a covariance the standard deviations, as `fields`.
-        cross_deviations: the roots of its other entries with their signs: those of 1 and 2, 1 and 3,
-            2 and 3.
+        cross_deviations: for a covariance the roots of its other entries with their signs: those of 1
+            and 2, 1 and 3, 2 and 3.
         inflated: where standard deviations are larger than they say.
-        where: the values that sources must have for a row to be taken.
+        where: for each source the values that it must have for a row to be taken.
         missing: numbers that stand for a value that is missing.
         each: of every row one message for each of these, with further fields.
         mounting_deg: roll, pitch, yaw that turn the sensor's axes into the body's (Rz Ry Rx); vectors
             are turned, and orientations become the body's.
-        components, kinds: those of a vector that states them, with commas; kinds are linear else.
+        components: components of a vector that states them, with commas.
+        kinds: kinds of these components, with commas; linear without any.
         states: numbers that the channel states, for parameters of models: noise densities, say.
     """
 

@@ -24,10 +24,18 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 class MrclamParameters(Parameters):
     """What the data do not state: noise of odometry and sensor, and the uncertainty of the start.
 
-    They are the same for all sets and robots. The densities of the odometry (m and rad per square root
-    of a second) are those of its errors over 1 to 20 s, rounded up. Errors of successive ranges and
-    bearings are correlated (by 0.5 to 0.7 from one to the next), while a filter assumes them
-    independent: so their standard deviations are a few times the scatter.
+    They are the same for all sets and robots. The densities of the odometry are those of its errors
+    over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to 0.7
+    from one to the next), while a filter assumes them independent: so their standard deviations are a
+    few times the scatter.
+
+    Attributes:
+        forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
+        turn_noise_density: noise of the odometry's turn rate, in rad/s/sqrt(Hz).
+        sigma_range_m: standard deviation of a range.
+        sigma_bearing_rad: standard deviation of a bearing.
+        prior_sigma_m: standard deviation of the position in the prior, per axis.
+        prior_sigma_rad: standard deviation of the heading in the prior.
     """
 
     forward_noise_density: PositiveFloat = 0.05

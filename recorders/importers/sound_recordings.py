@@ -36,10 +36,17 @@ AXES = ("x", "y", "z")
 
 
 class SoundRecordingsParameters(Parameters):
-    """What the files do not state: the air, the band that is used, and true positions of sounds by name.
+    """What the files do not state: the air, the band that is used, and true positions of sounds.
 
-    Without `band_hz` the band is from 200 Hz to nine tenths of half the sampling rate. A file is
-    reported as clipped if more than `clipped_share` of its samples have the greatest value.
+    Attributes:
+        speed_of_sound_mps: speed of sound in the air.
+        band_hz: lowest and highest frequency that is used, in Hz; without them from 200 Hz to nine
+            tenths of half the sampling rate.
+        weighting: of frequencies when two recordings are correlated: all alike (phat), or by their
+            strength (none).
+        clipped_share: a file is reported as clipped if a larger share of its samples have the greatest
+            value.
+        truth_m: true positions of sounds (x, y or x, y, z), by name.
     """
 
     speed_of_sound_mps: PositiveFloat = 343.0

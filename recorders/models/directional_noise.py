@@ -79,9 +79,10 @@ def sample_projected_gaussian(
 class DirectionalNoise(Parameters):
     """A distribution of unit vectors, along the components of a complex number or quaternion.
 
-    `diagonal` are the concentrations of a Bingham distribution: 0 for its mode, at most 0 for the
-    others. For a Gaussian they are variances about the identity (1, 0, ...), and its samples are scaled
-    to unit length.
+    Attributes:
+        distribution: of which kind it is; samples of a Gaussian are scaled to unit length.
+        diagonal: of a Bingham distribution the concentrations: 0 for its mode, at most 0 for the others;
+            of a Gaussian the variances about the identity (1, 0, ...).
     """
 
     distribution: Literal["bingham", "gaussian"] = "bingham"

@@ -21,7 +21,14 @@ Name = Annotated[str, Field(pattern=r"^[^/,\s]+$")]
 
 
 class Matcher(Parameters):
-    """A matcher: its name, what it looks at, the sense of its scores, and its score of a failure."""
+    """A matcher of biometric samples.
+
+    Attributes:
+        name: its name.
+        modality: what it looks at, such as face.
+        score: whether a larger score says that two are alike, or that they differ.
+        failure: the score that stands for a failure; without one there are no failures.
+    """
 
     name: Name
     modality: Name

@@ -32,9 +32,19 @@ Place = tuple[float, float]
 class AcousticParameters(Parameters):
     """Shooter, sensors and air.
 
-    `trajectory_deg` is the direction of the shot, anticlockwise from the x axis. Standard deviations
-    are of a sensor's two angles, of the time between shockwave and muzzle blast, and of its own
-    position. A detection is lost with `dropout_probability`; `interval_s` is the time between shots.
+    Attributes:
+        shooter_position_m: where the shooter stands (x, y).
+        trajectory_deg: direction of the shot, anticlockwise from the x axis.
+        sensor_position_m: where the sensors stand (x, y).
+        mach_number: speed of the bullet, in speeds of sound.
+        speed_of_sound_mps: speed of sound in the air.
+        sigma_muzzle_blast_deg: standard deviation of the angle at which a sensor hears the muzzle blast.
+        sigma_shockwave_deg: standard deviation of the angle at which a sensor hears the shockwave.
+        sigma_time_difference_s: standard deviation of the time between shockwave and muzzle blast.
+        sigma_position_m: standard deviation of a sensor's own position, per axis.
+        shots: number of shots.
+        interval_s: time between shots.
+        dropout_probability: probability that a sensor's detection of a shot is lost.
     """
 
     shooter_position_m: Place = (50, 50)

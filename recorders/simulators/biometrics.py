@@ -74,10 +74,13 @@ LOWEST = 0.1
 class BiometricScoresParameters(Parameters):
     """Users and the special ones among them, whose numbers are those of the real 517.
 
-    Probes come `probe_interval_s` apart on average. The first face matcher fails to enrol
-    `failures_to_enrol` users of the gallery, and the second has low scores for `low_galleries` of them.
-    `poor_fingers_share` is the share of users with poor fingers, and `broken_probes` fingers match
-    nobody.
+    Attributes:
+        users: number of users.
+        probe_interval_s: mean time between probes (exponential).
+        failures_to_enrol: how many users of the gallery the first face matcher fails to enrol.
+        low_galleries: for how many users of the gallery the second face matcher has low scores.
+        poor_fingers_share: share of the users with poor fingers.
+        broken_probes: how many probes have fingers that match nobody.
     """
 
     users: Annotated[int, Field(ge=20, le=5000)] = 517

@@ -25,11 +25,19 @@ STRAIGHT_S, TURN_RAD = 15.0, np.pi / 2
 
 
 class CrossingParameters(Parameters):
-    """The scenario.
+    """Five targets in a square, and the radar in its middle that scans it.
 
-    The radar stands in the middle of a square and scans it every `period_s`. Each target is detected
-    with a probability, with an error of `sigma_m` in either axis; false detections are spread over the
-    square, and Poisson in number. `crossing_rad` is the angle at which two targets cross.
+    Attributes:
+        duration_s: length of the run.
+        period_s: time between scans.
+        side_m: side of the square.
+        speed_mps: speed of every target.
+        crossing_rad: angle at which two targets cross.
+        gap_m: distance between the two targets that go side by side.
+        turn_radps: turn rate of the target that turns left and right.
+        sigma_m: standard deviation of a detection, per axis.
+        detection_probability: probability that a scan detects a target.
+        clutter_per_scan: mean number of false detections in a scan (Poisson), spread over the square.
     """
 
     duration_s: PositiveFloat = 90.0

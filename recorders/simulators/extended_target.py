@@ -24,8 +24,16 @@ Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 class ExtendedTargetParameters(Parameters):
     """A rectangle, the points that are measured of it, and what a filter assumes.
 
-    `target` is (half_x_m, half_y_m, x_m, y_m), and so is the prior. The drifts are variances that a
-    filter adds per step; the true rectangle has none.
+    Attributes:
+        points: number of points, one per time step.
+        step_s: length of a time step.
+        target: the true rectangle (half_x_m, half_y_m, x_m, y_m).
+        point_variance_m2: variance of a measured point, per axis.
+        size_drift_m2: variance that a filter adds to half sides per step; the true rectangle has none.
+        position_drift_m2: variance that a filter adds to the position per step; the true rectangle has
+            none.
+        prior_mean: mean of the prior (half_x_m, half_y_m, x_m, y_m).
+        prior_variance_m2: variance of each component in the prior.
     """
 
     points: PositiveInt = 150

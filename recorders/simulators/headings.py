@@ -21,9 +21,18 @@ HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
 class HeadingsParameters(Parameters):
     """Two headings that turn each other.
 
-    Per step the first turns by `drift1_rad` + `coupling_rad` times the cosine of the second, the second
-    by `drift2_rad` + `coupling_rad` times the sine of the first. Standard deviations hold for both
-    headings, correlations are between them.
+    Attributes:
+        steps: number of time steps.
+        step_s: length of a time step.
+        coupling_rad: per step the first heading turns by this times the cosine of the second, the second
+            by this times the sine of the first.
+        drift1_rad: by how much the first heading turns per step besides.
+        drift2_rad: by how much the second heading turns per step besides.
+        system_sigma_rad: standard deviation of a heading's noise per step.
+        system_correlation: correlation of the two headings' noises.
+        measurement_sigma_rad: standard deviation of a measured heading.
+        measurement_correlation: correlation of the two measured headings' errors.
+        prior_sigma_rad: standard deviation of a heading at the start.
     """
 
     steps: PositiveInt = 50

@@ -24,11 +24,14 @@ Index = Annotated[int, Field(ge=1)]
 
 
 class Node(Parameters):
-    """The sensor of a node: what it measures, how accurately, and how often.
+    """The sensor of a node.
 
-    `components` are those of the state that it measures, `sigmas` their standard deviations in the
-    components' units. It measures at the first step and then at every `every_steps`-th.
-    `acceleration_density` is what the node's own motion model assumes; none means the true one.
+    Attributes:
+        components: those of the state that it measures.
+        sigmas: standard deviations of these components, in their units.
+        every_steps: it measures at the first step and then at every so many.
+        acceleration_density: power spectral density of the acceleration that the node's own motion model
+            assumes, in m^2/s^3; without one, the true one.
     """
 
     components: tuple[str, ...] = ("x_m", "y_m")
@@ -46,7 +49,13 @@ ROOM = (
 
 
 class NodeOutage(Parameters):
-    """A span in which a node neither measures nor sends nor receives."""
+    """A span in which a node neither measures nor sends nor receives.
+
+    Attributes:
+        node: number of the node, from 1.
+        start_s: when the span begins, since the run's epoch.
+        end_s: when the span ends, since the run's epoch.
+    """
 
     node: Index
     start_s: NonNegativeFloat
@@ -56,11 +65,22 @@ class NodeOutage(Parameters):
 class IspaceParameters(Parameters):
     """A room with sensor nodes, the links between them, and the target that moves there.
 
-    Links work in both directions. With `random_nodes` above 0 every run has another graph: a ring of so
-    many nodes with `random_chords` further links, whose nodes have the sensors of `nodes` in turn.
-    `acceleration_density` is the power spectral density of the acceleration in m^2/s^3. A message over
-    a link is lost or doubled with these probabilities, and arrives after `delay_s` and a random time of
-    mean `delay_jitter_s`.
+    Attributes:
+        steps: number of time steps.
+        step_s: length of a time step.
+        acceleration_density: power spectral density of the target's acceleration, in m^2/s^3.
+        start: mean of the target's start (x, y, vx, vy), in m and m/s.
+        start_sigma: standard deviations of the start, in m and m/s.
+        nodes: the sensor of each node.
+        links: pairs of nodes, by number from 1, that are linked in both directions.
+        random_nodes: above 0 every run has another graph instead: a ring of so many nodes, which have
+            the sensors of `nodes` in turn.
+        random_chords: number of further links in a random graph.
+        loss_probability: probability that a message over a link is lost.
+        duplicate_probability: probability that a message over a link arrives twice.
+        delay_s: least time that a message takes over a link.
+        delay_jitter_s: mean of the random time that a message takes beyond this (exponential).
+        outages: spans in which a node is out of work.
     """
 
     steps: PositiveInt = 100

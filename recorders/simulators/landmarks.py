@@ -38,10 +38,22 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 class Sensor(Parameters):
     """What the sensors of a robot have in common.
 
-    A rate of zero switches a sensor off. It sees targets up to `maximum_range_m` within its field of
-    view. An outlier is any value that the sensor can have. An outage lasts for `outage_s`. A message
-    reaches the recorder after `latency_s` and a random time of mean `latency_jitter_s`;
-    `clock_offset_s` is how far the sensor's clock is ahead, `stamp_offset_s` how far its stamps are.
+    Attributes:
+        rate_hz: measurements per second; 0 switches the sensor off.
+        maximum_range_m: it sees targets up to this range.
+        field_of_view_deg: it sees targets within this angle about straight ahead.
+        outlier_probability: probability that a value is any that the sensor can have.
+        dropout_probability: probability that a measurement is lost.
+        outages_per_minute: mean number of outages per minute.
+        outage_s: length of an outage.
+        latency_s: least time from measurement to arrival at the recorder.
+        latency_jitter_s: mean of the random time beyond this (exponential).
+        clock_offset_s: the sensor's clock is ahead by so much.
+        stamp_offset_s: the stamps of its messages are ahead by so much.
+        sigma_range_m: standard deviation of a range.
+        sigma_bearing_rad: standard deviation of a bearing.
+        bias_range_m: ranges are too long by so much.
+        bias_bearing_rad: bearings are too large by so much.
     """
 
     rate_hz: NonNegativeFloat = 0.0
@@ -62,10 +74,15 @@ class Sensor(Parameters):
 
 
 class Fixes(Parameters):
-    """A receiver of positions; a rate of zero switches it off.
+    """A receiver of positions.
 
-    With `origin_deg`, latitude and longitude of the plane's origin, it gives latitudes and longitudes,
-    otherwise positions in the plane. An outage lasts for `outage_s`.
+    Attributes:
+        rate_hz: fixes per second; 0 switches it off.
+        sigma_m: standard deviation of a fix, per axis.
+        outages_per_minute: mean number of outages per minute.
+        outage_s: length of an outage.
+        origin_deg: latitude and longitude of the plane's origin, with which fixes are latitudes and
+            longitudes; without it they are positions in the plane.
     """
 
     rate_hz: NonNegativeFloat = 0.0
@@ -78,9 +95,26 @@ class Fixes(Parameters):
 class LandmarksParameters(Parameters):
     """Robots in a square arena with landmarks, their odometry and their sensors.
 
-    Noise densities of the odometry are per square root of a second: `forward_noise_density` in m,
-    `turn_noise_density` in rad. `forward_scale_error` is the share by which it reports too much, and
-    `turn_bias_radps` is added to its turn rate.
+    Attributes:
+        duration_s: length of the run.
+        robots: number of robots.
+        landmarks: number of landmarks, placed at random.
+        arena_m: side of the arena.
+        speed_mps: speed of every robot.
+        odometry_rate_hz: odometry readings per second.
+        odometry_latency_s: time from a reading of the odometry to its arrival at the recorder.
+        forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
+        turn_noise_density: noise of the odometry's turn rate, in rad/s/sqrt(Hz).
+        forward_scale_error: the odometry reports this share too much of the forward speed.
+        turn_bias_radps: the odometry's turn rate is too large by so much.
+        prior_sigma_m: standard deviation of the position in the prior, per axis.
+        prior_sigma_rad: standard deviation of the heading in the prior.
+        robots_see_each_other: whether robots are targets of the sensors too, beside landmarks.
+        range_bearing: the sensor of ranges and bearings.
+        range: the sensor of ranges.
+        bearing: the sensor of bearings.
+        relative_bearing: the sensor of angles between pairs of targets.
+        fix: the receiver of positions.
     """
 
     duration_s: PositiveFloat = 60.0

@@ -22,10 +22,22 @@ Floats = NDArray[np.float64]
 class ManoeuvresParameters(Parameters):
     """A vehicle that drives straight, turns, stops and starts, and its position fixes.
 
-    The lengths of straight parts and of stops are exponentially distributed with the means `straight_s`
-    and `standing_s`. A turn is by a sixth to five twelfths of a circle to either side.
-    `acceleration_sigma_mps2` is what the prior's channel states for driving straight; the truth has no
-    such acceleration.
+    A turn is by a sixth to five twelfths of a circle to either side.
+
+    Attributes:
+        duration_s: length of the run.
+        speed_mps: speed where it does not brake, stand or start.
+        straight_s: mean time of a straight part (exponential).
+        turn_radps: turn rate in a turn.
+        brake_mps2: deceleration when it stops.
+        start_mps2: acceleration when it starts again.
+        standing_s: mean time of a stop (exponential).
+        acceleration_sigma_mps2: standard deviation of the acceleration that the prior's channel states
+            for driving straight; the truth has none.
+        fix_rate_hz: position fixes per second.
+        fix_sigma_m: standard deviation of a fix, per axis.
+        prior_sigma_m: standard deviation of the position in the prior, per axis.
+        prior_sigma_mps: standard deviation of the velocity in the prior, per axis.
     """
 
     duration_s: PositiveFloat = 120.0

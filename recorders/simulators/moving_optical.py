@@ -40,12 +40,24 @@ FIRST_S = 0.5  # before the first sighting, and so before any clock that is off
 class MovingOpticalParameters(Parameters):
     """Sensors on aircraft, targets, and the errors of attitudes and clocks.
 
-    Every sensor sees a target `sightings_hz` times a second, one after the other. It weaves by
-    `weave_m` to both sides and turns with its course. True biases of attitude have the standard
-    deviation `bias_sigma_rad` and drift by `bias_drift` (rad per square root of a second); the true
-    clock of every sensor but the first is off by a time of standard deviation `clock_sigma_s`.
-    `acceleration_density` is in m/s^2 per square root of hertz. With `known_sigma_m` the first target
-    reports its position once a second.
+    Attributes:
+        duration_s: length of the run.
+        sensor_position_m: where the sensors start (x, y, z).
+        velocity_mps: mean velocity of all sensors (x, y, z).
+        weave_m: by how much each sensor weaves to both sides; it turns with its course.
+        weave_period_s: time of one weave.
+        target_position_m: where the targets are expected to start (x, y, z).
+        target_velocity_mps: velocities of the targets that are expected at the start (x, y, z).
+        prior_sigma_m: standard deviation of a target's position in the prior, per axis.
+        prior_sigma_mps: standard deviation of a target's velocity in the prior, per axis.
+        acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
+        sightings_hz: how many times a second every sensor sees a target, one after the other.
+        sigma_rad: standard deviation of azimuth and elevation.
+        bias_sigma_rad: standard deviation of the true biases of attitude, per axis.
+        bias_drift: random walk of these biases, in rad/sqrt(s).
+        clock_sigma_s: standard deviation of the true offset of every sensor's clock but the first's.
+        known_sigma_m: the first target reports its position once a second with this standard deviation
+            per axis; without one it does not.
     """
 
     duration_s: Annotated[float, Field(gt=1)] = 60.0

@@ -30,11 +30,19 @@ GRID_S = 0.05  # between the knots of the path
 class Unit(Parameters):
     """The errors of an inertial unit; without settings those of a telephone's.
 
-    Noise densities are per square root of hertz, in m/s^2 and rad/s; the densities of the biases'
-    random walks are per square root of a second, in the same units. The biases at the start, the errors
-    of scale (a share) and the misalignments of the axes are drawn with their standard deviations.
-    Values are rounded to multiples of the quantum, where it is above zero. Samples are stamped
-    `delay_s` late.
+    Attributes:
+        rate_hz: samples per second.
+        force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz).
+        gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz).
+        force_bias_density: random walk of the accelerometer's bias, in m/s^2/sqrt(s).
+        gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
+        force_bias_sigma_mps2: standard deviation of the accelerometer's bias at the start, per axis.
+        gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
+        scale_sigma: standard deviation of the errors of scale, as a share.
+        misalignment_sigma_rad: standard deviation of the misalignments of the axes.
+        force_quantum_mps2: specific forces are rounded to multiples of this; 0 does not round.
+        gyro_quantum_radps: turn rates are rounded to multiples of this; 0 does not round.
+        delay_s: samples are stamped so late.
     """
 
     rate_hz: PositiveFloat = 100.0
@@ -52,13 +60,24 @@ class Unit(Parameters):
 
 
 class Receiver(Parameters):
-    """A GNSS receiver: rates, standard deviations (horizontal and up), and its weak times.
+    """A GNSS receiver and its weak times; spans are [begin, end] in s since the run's epoch.
 
-    It is silent during `outages_s`, a list of [begin, end] in s, and has float solutions during
-    `floats_s`: their errors are `float_factor` times larger, as their covariance states. During
-    `multipath_s` positions are off by `multipath_m` (east, north, up), which the covariance does not
-    state. `lever_m` is the antenna's position in the body. Positions and velocities are stamped late by
-    their delays. A velocity rate of zero leaves velocities out.
+    Attributes:
+        rate_hz: positions per second.
+        velocity_rate_hz: velocities per second; 0 leaves them out.
+        sigma_m: standard deviation of a position, per horizontal axis.
+        sigma_up_m: standard deviation of a height.
+        sigma_mps: standard deviation of a velocity, per horizontal axis.
+        sigma_up_mps: standard deviation of a vertical velocity.
+        lever_m: position of the antenna in the body (forward, left, up).
+        delay_s: positions are stamped so late.
+        velocity_delay_s: velocities are stamped so late.
+        outages_s: spans in which it is silent.
+        floats_s: spans in which it has float solutions.
+        float_factor: errors of float solutions are so many times larger, as their covariance states.
+        multipath_s: spans in which positions are off by `multipath_m`, which their covariance does not
+            state.
+        multipath_m: by how much positions are off then (east, north, up).
     """
 
     rate_hz: PositiveFloat = 5.0
@@ -78,11 +97,17 @@ class Receiver(Parameters):
 
 
 class Carried(Parameters):
-    """Further sensors on board, with their rates and standard deviations; a rate of zero leaves one out.
+    """Further sensors on board.
 
-    Wheels measure the forward speed at the axle (`axle_m` in the body), times 1 plus an error of scale
-    that is drawn with `wheel_scale_sigma`. A compass measures the orientation with an error of heading,
-    a barometer the height.
+    Attributes:
+        wheel_rate_hz: forward speeds of the wheels per second; 0 leaves them out.
+        wheel_sigma_mps: standard deviation of a forward speed.
+        wheel_scale_sigma: standard deviation of the wheels' error of scale, as a share.
+        axle_m: where wheels measure the speed, in the body (forward, left, up).
+        compass_rate_hz: orientations of the compass per second; 0 leaves it out.
+        compass_sigma_rad: standard deviation of the compass's heading.
+        barometer_rate_hz: heights of the barometer per second; 0 leaves it out.
+        barometer_sigma_m: standard deviation of a height.
     """
 
     wheel_rate_hz: NonNegativeFloat = 0.0
@@ -96,9 +121,14 @@ class Carried(Parameters):
 
 
 class Prior(Parameters):
-    """The prior of the log: standard deviations of position, velocity, tilt and heading at the start.
+    """The prior of the log; the standard deviations of the biases are the unit's.
 
-    Those of the biases are the unit's. With `is_told = false` the log has no prior.
+    Attributes:
+        is_told: whether the log has a prior.
+        sigma_m: standard deviation of the position at the start, per axis.
+        sigma_mps: standard deviation of the velocity at the start, per axis.
+        tilt_sigma_rad: standard deviation of roll and pitch at the start.
+        heading_sigma_rad: standard deviation of the heading at the start.
     """
 
     is_told: bool = True
@@ -111,10 +141,23 @@ class Prior(Parameters):
 class NavigationParameters(Parameters):
     """What moves, where, and its sensors.
 
-    `way_points_m` (east, north, up) are the path; without any they are drawn at random, `leg_s` seconds
-    apart. The body rests for `rest_s` first. A person sways, bobs with each step and turns to both
-    sides of the path; a quadrotor leans into its acceleration and may look in any direction. The origin
-    is that of the plane, on the WGS 84 ellipsoid.
+    A person sways, bobs with each step and turns to both sides of the path; a quadrotor leans into its
+    acceleration and may look in any direction.
+
+    Attributes:
+        carrier: what moves.
+        duration_s: length of the run.
+        rest_s: the body rests for so long first.
+        leg_s: time between way points that are drawn at random.
+        speed_mps: speed along the path.
+        way_points_m: the path (east, north, up); without any it is drawn at random.
+        origin_latitude_deg: latitude of the local plane's origin.
+        origin_longitude_deg: longitude of the local plane's origin.
+        origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
+        unit: errors of the inertial unit.
+        gnss: the GNSS receiver.
+        carried: further sensors on board.
+        prior: what the log states of the start.
     """
 
     carrier: Literal["vehicle", "pedestrian", "quadrotor"] = "vehicle"

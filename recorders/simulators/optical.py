@@ -28,9 +28,19 @@ Triples = Annotated[list[Triple], Field(min_length=1)]
 class OpticalParameters(Parameters):
     """Sensors, targets and what is seen.
 
-    Attitudes and biases are yaw, pitch and roll of each sensor, in deg. The targets are seen one after
-    the other, `interval_s` apart, or all at once with `all_at_once`; that is one of `passes`. A sensor
-    sees what is inside a cone of `field_of_view_deg` about the middle of the targets.
+    Attributes:
+        sensor_position_m: where the sensors are (x, y, z).
+        target_position_m: where the targets are (x, y, z).
+        nominal_attitude_deg: yaw, pitch and roll that each sensor states; without any all are 0.
+        bias_deg: yaw, pitch and roll by which each sensor's true attitude differs; without any all are
+            0.
+        sigma_rad: standard deviation of azimuth and elevation.
+        interval_s: time between sightings.
+        passes: number of passes over all targets.
+        all_at_once: whether all targets are seen at once; else one after the other.
+        field_of_view_deg: a sensor sees what is inside a cone of this angle about the middle of the
+            targets.
+        dropout_probability: probability that a sighting is lost.
     """
 
     sensor_position_m: Triples = [(-5500, 950, 15), (-230, 2720, 45), (5900, 50, 20)]

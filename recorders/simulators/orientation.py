@@ -20,7 +20,16 @@ from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 
 class AxisParameters(Parameters):
-    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode."""
+    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode.
+
+    Attributes:
+        steps: number of time steps.
+        step_s: length of a time step.
+        start: true orientation at the start, a unit vector.
+        prior: distribution of the orientation at the start, as filters assume it.
+        system: distribution of what a step turns by.
+        measurement: distribution of what a measurement is turned by.
+    """
 
     steps: PositiveInt = 100
     step_s: PositiveFloat = 0.1

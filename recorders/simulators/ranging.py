@@ -25,9 +25,13 @@ POSE = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "turn_radps")
 
 
 class Blocked(Parameters):
-    """Blocked lines of sight: how often, how long on average, and by how much ranges become longer.
+    """Blocked lines of sight; an anchor is blocked for all tags at once.
 
-    An anchor is blocked for all tags at once. The excess is uniform between `least_m` and `most_m`.
+    Attributes:
+        times_per_minute: mean number of times per minute that an anchor is blocked.
+        duration_s: mean time for which it is.
+        least_m: by how much ranges are then too long at least.
+        most_m: by how much ranges are then too long at most; uniformly between.
     """
 
     times_per_minute: NonNegativeFloat = 0.0
@@ -39,10 +43,26 @@ class Blocked(Parameters):
 class RangingParameters(Parameters):
     """Anchors, the tags on a trolley, its motion, and the errors of ranges.
 
-    Anchors and tags are numbered from 0; all tags measure ranges to all anchors at once. The densities
-    of the accelerations are in m/s^2 and rad/s^2 per square root of hertz. A range has white noise
-    (`sigma_range_m`), a common bias, and for every pair an error of standard deviation `error_sigma_m`
-    that lasts for about `error_time_s`. Channels state the white noise alone.
+    Anchors and tags are numbered from 0; all tags measure ranges to all anchors at once. Channels state
+    the white noise of ranges alone.
+
+    Attributes:
+        duration_s: length of the run.
+        rate_hz: measurements per second.
+        anchors_m: where the anchors are (x, y, z).
+        tags_m: where the tags are on the trolley (forward, left, up).
+        height_m: height of the trolley.
+        acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
+        turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
+        sigma_range_m: standard deviation of a range's white noise.
+        bias_range_m: all ranges are too long by so much.
+        error_sigma_m: standard deviation of a lasting error of every pair of anchor and tag.
+        error_time_s: for about how long such an error lasts.
+        blocked: blocked lines of sight.
+        start_sigma_m: standard deviation of the position at the start, per axis.
+        start_sigma_rad: standard deviation of the heading at the start.
+        start_sigma_mps: standard deviation of the velocity at the start, per axis.
+        start_sigma_radps: standard deviation of the turn rate at the start.
     """
 
     duration_s: Annotated[float, Field(gt=0)] = 60.0

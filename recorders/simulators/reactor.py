@@ -20,7 +20,17 @@ Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
 
 
 class ReactorParameters(Parameters):
-    """Partial pressures of a gas reaction; variances are per time step."""
+    """Partial pressures of a gas reaction, in the paper's units.
+
+    Attributes:
+        steps: number of time steps.
+        step_s: length of a time step.
+        start: true partial pressures of the two gases at the start.
+        process_variance: variance that a step adds to each partial pressure.
+        pressure_variance: variance of a measured total pressure.
+        prior_mean: mean of the two partial pressures in the prior.
+        prior_variance: variance of each partial pressure in the prior.
+    """
 
     steps: PositiveInt = 50
     step_s: PositiveFloat = 0.1

@@ -23,9 +23,20 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 class RelativeBearingsParameters(Parameters):
     """The scene of section V of the paper (without noise, its first pairs), or random scenes.
 
-    In a random scene landmarks are within `spread_m` of the middle in x and in y, and the robot within
-    `robot_spread_m`. An error is uniform within `error_share` of `bound_deg`. A misidentified pair has
-    another landmark in place of its first one.
+    Attributes:
+        scene: which of the two.
+        paper_pairs: how many of the paper's pairs of landmarks are measured in its scene.
+        bound_deg: bound of the error of a relative bearing; the channel states it.
+        error_share: an error is uniform within this share of the bound.
+        landmarks: number of landmarks of a random scene.
+        arena_m: side of the square arena about the middle that the log states.
+        spread_m: landmarks of a random scene are within this of the middle in x and in y.
+        robot_spread_m: the robot of a random scene is within this of the middle in x and in y.
+        looks: how many times all pairs are measured.
+        rate_hz: looks per second.
+        misidentified_probability: probability that a pair has another landmark in place of its first
+            one.
+        start_s: time of the first look, since the run's epoch.
     """
 
     scene: Literal["section-v", "random"] = "section-v"

@@ -39,8 +39,19 @@ PATH_S = 0.1
 class ShotSequenceParameters(AcousticParameters):
     """The scenario of a shot, and how the shooter moves and sensors err.
 
-    The shooter begins near `shooter_position_m`, aiming near `trajectory_deg`. Densities are per square
-    root of hertz and of second.
+    The shooter begins near `shooter_position_m`, aiming near `trajectory_deg`.
+
+    Attributes:
+        start_sigma_m: standard deviation of the true start's position, per axis.
+        start_sigma_mps: standard deviation of the true start's velocity, per axis.
+        start_sigma_deg: standard deviation of the direction of the first shot.
+        acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).
+        trajectory_density: random walk of the direction of shots, in rad/sqrt(s).
+        echo_probability: probability that a sensor takes an echo for the muzzle blast.
+        echo_delay_s: mean time by which an echo is later (exponential).
+        wrong_association_probability: probability that a sensor joins another shockwave to the muzzle
+            blast.
+        wrong_delay_s: longest time between such a shockwave and the muzzle blast.
     """
 
     shots: PositiveInt = 20

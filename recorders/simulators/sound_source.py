@@ -25,9 +25,15 @@ Point = tuple[float, float, float]
 class SoundSourceParameters(Parameters):
     """Microphones and a sound.
 
-    The signal-to-noise ratio is that at the nearest microphone, in the band. The source is in a box
-    about the middle of the microphones, `reach_m` to each side; if all microphones have one height, it
-    has that height too.
+    Attributes:
+        microphones_m: where the microphones are (x, y, z).
+        reach_m: the source is in a box about the microphones' middle, so far to each side; where all
+            microphones have one height, it has that too.
+        sound_s: length of the sound.
+        rate_hz: sampling rate.
+        band_hz: lowest and highest frequency of the sound, in Hz.
+        snr_db: signal-to-noise ratio at the nearest microphone, in the band.
+        speed_of_sound_mps: speed of sound in the air.
     """
 
     microphones_m: Annotated[list[Point], Field(min_length=3)] = [

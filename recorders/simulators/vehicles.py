@@ -39,14 +39,25 @@ POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Delayed(Parameters):
-    """How late messages arrive: by `latency_s` and a random time of mean `latency_jitter_s`."""
+    """How late messages arrive.
+
+    Attributes:
+        latency_s: least time from measurement to arrival.
+        latency_jitter_s: mean of the random time beyond this (exponential).
+    """
 
     latency_s: NonNegativeFloat = 0.0
     latency_jitter_s: NonNegativeFloat = 0.0
 
 
 class Fixes(Delayed):
-    """The position fixes of the vehicles; the variance is that of each axis."""
+    """The position fixes of the vehicles.
+
+    Attributes:
+        rate_hz: fixes per second of each vehicle.
+        variance_m2: variance of a fix, per axis.
+        dropout_probability: probability that a fix is lost.
+    """
 
     rate_hz: PositiveFloat = 1.0
     variance_m2: PositiveFloat = 0.5
@@ -54,14 +65,25 @@ class Fixes(Delayed):
 
 
 class Scans(Delayed):
-    """Unordered scans; false detections are uniform over the field, with this mean number per scan."""
+    """Unordered scans.
+
+    Attributes:
+        detection_probability: probability that a scan detects a vehicle.
+        clutter_per_scan: mean number of false detections in a scan (Poisson), spread over the field.
+    """
 
     detection_probability: Detected = 1.0
     clutter_per_scan: NonNegativeFloat = 0.0
 
 
 class Infrastructure(Scans):
-    """The sensor by the road; a rate of zero has it never report."""
+    """The sensor by the road.
+
+    Attributes:
+        rate_hz: scans per second; 0 has it never report.
+        variance_m2: variance of a detection, per axis.
+        pose: true pose of the sensor (x, y, heading), in m and rad.
+    """
 
     rate_hz: NonNegativeFloat = 1.0
     variance_m2: PositiveFloat = 0.1
@@ -71,10 +93,22 @@ class Infrastructure(Scans):
 class VehiclesParameters(Parameters):
     """Vehicles in the plane, and who detects them.
 
-    `start` are the states (x, vx, y, vy) of the vehicles in m and m/s; if `vehicles` is not zero, so
-    many start anywhere in the field instead. The truth has no noise unless `stochastic` is set: then
-    starts are drawn from the prior, and an acceleration of `acceleration_sigma_mps2` holds for each
-    `step_s`. Filters assume both in any case. `field_m` is (least x, greatest x, least y, greatest y).
+    Attributes:
+        duration_s: length of the run.
+        step_s: length of a time step, during which an acceleration holds.
+        stochastic: whether starts are drawn from the prior and accelerations act; filters assume both in
+            any case.
+        start: states (x, vx, y, vy) of the vehicles at the start, in m and m/s.
+        vehicles: above 0, so many start anywhere in the field instead.
+        speed_mps: speed of vehicles that start anywhere.
+        turn_rate_radps: turn rate of each vehicle; without any they go straight.
+        acceleration_sigma_mps2: standard deviation of the acceleration of a time step, per axis.
+        prior_variance: variances of the prior (x, vx, y, vy), in m^2 and m^2/s^2.
+        field_m: the field (least x, greatest x, least y, greatest y).
+        origin_deg: latitude and longitude of the plane's origin.
+        fix: position fixes of the vehicles.
+        network: scans of the fixes, without names, as the network has them.
+        infrastructure: the sensor by the road.
     """
 
     duration_s: PositiveFloat = 100.0

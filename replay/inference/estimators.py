@@ -1,6 +1,6 @@
 """Makes estimators of a model and a method, and binds them to the topics of a log."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 
 from recorders.errors import BadInput, choices
 from recorders.log import Topic
-from recorders.parameters import Parameters, build
+from recorders.parameters import Parameters, build, meanings
 from recorders.registry import available, load
 from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
@@ -55,9 +55,8 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
 ) -> type[Any]:
-    """Make a type of parameters, without a text of its own in which meanings could be looked for."""
-    says_nothing = {"use_attribute_docstrings": False}
-    return create_model(name, __base__=bases, __cls_kwargs__=says_nothing, **(fields or {}))
+    """Make a type of parameters with further fields."""
+    return create_model(name, __base__=bases, **(fields or {}))
 
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
@@ -128,6 +127,20 @@ class _OfAnyModel(Estimator[Any]):
         """Return those of all models, and of the method."""
         return _any_parameters(vars(self)["_method"])
 
+    def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:
+        """Those of all models, and of the method that the variant of a name chooses."""
+        return _any_parameters(self._made(name, variant))
+
+    def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:
+        """Those of each model that the method can estimate, and of the method."""
+        method = self._made(name, variant)
+        models = registered_models().items()
+        return {each: combined(model, method) for each, model in models if not method.lacks(model)}
+
+    def _made(self, name: str, variant: Mapping[str, Any]) -> Method:
+        where, method = f"estimator {name}", vars(self)["_method"]
+        return _made_for(where, method, build(method.parameters, variant, where))
+
 
 def registered_models() -> dict[str, Model]:
     """Return the models by name; one that does not load is left out, and says why where it is named."""
@@ -144,15 +157,28 @@ def _any_parameters(method: Method) -> type[Parameters]:
 
     What one model wants of a parameter is checked when it is known which model fits the log.
     """
-    fields: dict[str, Any] = {"model": (str | None, None)}
-    for model in registered_models().values():
+    fields: dict[str, Any] = {"model": (str | None, Field(None, description=_MODEL))}
+    told: dict[str, dict[str, list[str]]] = {}
+    for model_name, model in registered_models().items():
+        meaning_of = meanings(model.parameters)
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
+                told.setdefault(name, {}).setdefault(meaning_of.get(name, ""), []).append(model_name)
                 kind = _accepted(field)
-                other, said = fields.get(name, (kind, field))
-                meaning = field.description if field.description == said.description else None
+                other = fields.get(name, (kind,))[0]
+                meaning = _of_models(told[name])
                 fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
+
+
+_MODEL = "name of the model to estimate; without one, that which fits the log."
+
+
+def _of_models(meanings_of: Mapping[str, Sequence[str]]) -> str:
+    """What a parameter means to the models that have it, where it is not the same to all."""
+    if len(meanings_of) == 1:
+        return next(iter(meanings_of))
+    return " ".join(f"{', '.join(models)}: {meaning}" for meaning, models in meanings_of.items())
 
 
 def _bind_fitting(
@@ -169,11 +195,11 @@ def _bind_fitting(
     if named is not None:
         models = {named: load("models", named, Model)}
     renamed = given.get("topics") or {}
-    asked = {name: roles_of(model) for name, model in models.items()}
+    asked = {name: roles_of(model) for name, model in models.items()} if renamed else {}
     for role in renamed:
         _check_role(label, role, {each for roles in asked.values() for each in roles})
     found = {
-        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked[name]) else []
+        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked.get(name, ())) else []
         for name, model in models.items()
     }
     fitting = [name for name, model in models.items() if found[name] and (named or not model.by_name)]

@@ -50,7 +50,12 @@ WEAK = 10.0  # priors
 
 
 class ObservabilityParameters(MethodParameters):
-    """The length of a window, none for the whole run, and scales in place of the prior's."""
+    """Windows and scales of the Gramian.
+
+    Attributes:
+        window_s: length of a window; without one, the whole run.
+        scales: standard deviation that counts as one in place of the prior's, by component, in its unit.
+    """
 
     window_s: PositiveFloat | None = None
     scales: dict[str, PositiveFloat] = {}

@@ -154,9 +154,10 @@ def _section(entry: Entry) -> Iterator[str]:
     parameters = describe(entry.parameters, entry.values) if entry.parameters else []
     if parameters:
         rows = [
-            [f"`{each.name}`", _value(each.default), each.accepts, each.meaning] for each in parameters
+            [f"`{each.name}`", _value(each.default), each.unit, each.accepts, each.meaning]
+            for each in parameters
         ]
-        lines = table(["parameter", "default", "accepts", "meaning"], rows)
+        lines = table(["parameter", "default", "unit", "accepts", "meaning"], rows)
         for place, text in explain(entry.parameters).items() if entry.parameters else ():
             lines += [*([f"**`{place}`**", ""] if place else []), *text.splitlines(), ""]
         yield from ["", f'??? note "{len(rows)} parameters"', "", *(f"    {line}" for line in lines)]

@@ -10,9 +10,16 @@ from hypothesis import strategies as st
 from pydantic import Field, PositiveFloat, model_validator
 
 from recorders.errors import BadInput, choices
-from recorders.parameters import Parameters, build, describe, explain, merge, parse_settings
+from recorders.parameters import (
+    Parameters,
+    build,
+    describe,
+    explain,
+    meanings,
+    merge,
+    parse_settings,
+)
 from recorders.parsing import parse_json, read_toml
-from replay.estimators.models.landmarks import ROBOT
 
 
 class Inner(Parameters):
@@ -70,25 +77,77 @@ def test_descriptions_have_full_names_defaults_and_bounds() -> None:
     assert described == {
         "count": (None, "integer"),
         "sigma_m": (None, "number > 0 or none"),
+        "inner": (None, "table"),
         "inner.rate_hz": (7.0, "number >= 0 < 100"),
         "inner.name": ("c", "string"),
-        "others": (None, "array or none"),
+        "others": (None, "array of table or none"),
+        "others[].rate_hz": (5.0, "number >= 0 < 100"),
+        "others[].name": ("a", "string"),
     }
 
 
-def test_the_text_below_a_parameter_is_its_meaning() -> None:
-    """In `fuselog models robot` every row has one, with the unit of a noise density."""
+def test_what_lists_and_tables_accept_is_said() -> None:
+    class Lists(Parameters):
+        four: Annotated[tuple[PositiveFloat, ...], Field(min_length=4, max_length=4)] = (1, 1, 1, 1)
+        some: Annotated[list[str], Field(min_length=2)] = ["a", "b"]
+        by_name: dict[str, Inner] = {}
 
-    class Stated(Parameters):
+    assert [(each.name, each.accepts) for each in describe(Lists)] == [
+        ("four", "array (4) of number > 0"),
+        ("some", "array (at least 2) of string"),
+        ("by_name", "table of table"),
+        ("by_name.NAME.rate_hz", "number >= 0 < 100"),
+        ("by_name.NAME.name", "string"),
+    ]
+
+
+class Stated(Parameters):
+    """What is stated.
+
+    Attributes:
+        sigma_m: standard deviation of a range,
+            per axis: x and y.
+        low, high: a bound.
+    """
+
+    sigma_m: float = 1.0
+    low: float = 0.0
+    high: float = 1.0
+    count: int = 2
+
+
+class StatedAgain(Stated):
+    """It says one anew.
+
+    Attributes:
+        low: the least.
+    """
+
+
+def test_the_docstring_says_what_parameters_mean() -> None:
+    told = [(each.unit, each.meaning) for each in describe(Stated)]
+    assert told == [
+        ("m", "standard deviation of a range, per axis: x and y."),
+        ("", "a bound."),
+        ("", "a bound."),
+        ("", ""),
+    ]
+    assert meanings(StatedAgain) == {**meanings(Stated), "low": "the least."}
+    assert explain(StatedAgain) == {"": "What is stated.\n\nIt says one anew."}
+
+
+def test_a_meaning_of_no_parameter_is_refused() -> None:
+    class Wrong(Parameters):
+        """Of a range.
+
+        Attributes:
+            sigma: standard deviation.
+        """
+
         sigma_m: float = 1.0
-        """Of a range,
-        in m."""
-        count: int = 2
 
-    assert [each.meaning for each in describe(Stated)] == ["Of a range, in m.", ""]
-    meanings = {each.name: each.meaning for each in describe(ROBOT.parameters)}
-    assert all(meanings.values())
-    assert "m/s/sqrt(Hz)" in meanings["forward_noise_density"]
+    with pytest.raises(BadInput, match=r"Wrong: its docstring .* 'sigma' .*did you mean 'sigma_m'"):
+        describe(Wrong)
 
 
 def test_settings_are_toml_and_else_text() -> None:
@@ -179,5 +238,5 @@ def test_what_types_say_of_their_parameters() -> None:
 
     assert explain(Robot) == {
         "left., right.": "Of all sensors.\n\nOf this one.",
-        "more.": "Of all sensors.",
+        "more[].": "Of all sensors.",
     }

@@ -31,7 +31,15 @@ Place = tuple[float, float]
 
 
 class Maps(Parameters):
-    """Figures 22 and 23: the sensors' scenario, each mode's aim, and the grid of shooters."""
+    """Figures 22 and 23.
+
+    Attributes:
+        scenario: scenario with the sensors.
+        aims: what is aimed at (x, y), in m, by the label of an estimator.
+        low_m: least x and y of the grid of shooters.
+        high_m: greatest x and y of the grid of shooters.
+        step_m: distance of the grid's points.
+    """
 
     scenario: str
     aims: dict[str, Place]
@@ -41,9 +49,13 @@ class Maps(Parameters):
 
 
 class AcousticOptions(Parameters):
-    """The paper's three scenarios as files, multiples of the angular noise, maps.
+    """The paper's scenarios, how noisy they are, and the maps.
 
-    `modes` are the estimators that go at all multiples.
+    Attributes:
+        scenarios: the paper's three scenarios, as files.
+        multipliers: multiples of the angular noise.
+        modes: estimators that go at all multiples.
+        maps: Figures 22 and 23.
     """
 
     scenarios: Annotated[list[str], Field(min_length=3, max_length=3)]

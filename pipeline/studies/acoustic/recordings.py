@@ -29,9 +29,11 @@ OWN = "(own limit)"
 
 
 class Published(Parameters):
-    """Differences (s) that were published of a sound, of microphones in their numbers' order.
+    """Differences that were published of a sound.
 
-    They are later than at the first one. `within_s` is what ours are held to.
+    Attributes:
+        delay_s: how much later than the first microphone the others heard it, in their numbers' order.
+        within_s: what ours are held to.
     """
 
     delay_s: Annotated[list[float], Field(min_length=2)]
@@ -39,9 +41,13 @@ class Published(Parameters):
 
 
 class Simulated(Parameters):
-    """Simulated recordings: the scenario `sound-source` with these parameters, at each of the noises.
+    """Simulated recordings of the scenario `sound-source`.
 
-    Where there are no noises, nothing is simulated.
+    Attributes:
+        runs: number of runs at each noise.
+        seed: seed of the runs.
+        snr_db: signal-to-noise ratios; without any nothing is simulated.
+        parameters: what differs from the scenario's defaults, by name.
     """
 
     runs: PositiveInt = 100
@@ -51,7 +57,14 @@ class Simulated(Parameters):
 
 
 class Options(Parameters):
-    """What is known of sounds by name, the error (m) allowed where truth is known, what is simulated."""
+    """What is known of sounds, and what is simulated.
+
+    Attributes:
+        published: differences that were published, by the name of a sound.
+        same: pairs of sounds that are one, the second in files that begin later.
+        error_m: error that is allowed where truth is known.
+        simulated: simulated recordings.
+    """
 
     published: dict[str, Published] = {}
     same: list[tuple[str, str]] = []

@@ -28,7 +28,11 @@ SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 
 
 class Options(Parameters):
-    """What differs in the scenario, by the name of a case; the first has no faults."""
+    """The cases.
+
+    Attributes:
+        cases: what differs in the scenario, by the name of a case; the first has no faults.
+    """
 
     cases: Annotated[dict[str, dict[str, float]], Field(min_length=1)] = {"clean": {}}
 

@@ -49,7 +49,12 @@ TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
 
 
 class BiometricsOptions(Parameters):
-    """How often the cross validations are repeated, and users are drawn again."""
+    """How often what is random is repeated.
+
+    Attributes:
+        seeds: how often the cross validations are repeated.
+        replicates: how often users are drawn again.
+    """
 
     seeds: PositiveInt = 5
     replicates: PositiveInt = 100

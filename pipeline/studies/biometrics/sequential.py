@@ -59,10 +59,18 @@ DRIFT_SIGMA = 1.0
 class Options(Parameters):
     """What is stated, and how it is tried.
 
-    `rates` are pairs of false accepts and false rejects, `alike` is the correlation of the normal scores
-    of one person's probes. A matcher is watched by probes for which the other matchers' ratio is beyond
-    `label_ratio`; `run_length` is the stated mean number of these until a false alarm, and
-    `noticed_probes` that until the alarm of each fault.
+    Attributes:
+        rates: pairs of stated rates of false accepts and false rejects.
+        alike: correlation of the normal scores of one person's probes.
+        sequences: number of sequences of probes that are drawn.
+        replicates: how often users are drawn again.
+        most_probes: a sequence ends undecided after so many probes.
+        label_ratio: a matcher is watched by probes for which the other matchers' ratio is beyond this.
+        run_length: stated mean number of these until a false alarm.
+        watched: number of stretches of probes over which a matcher is watched.
+        watched_probes: probes in a stretch without a fault.
+        fault_probes: probes in a stretch with a fault.
+        noticed_probes: stated mean number of probes until the alarm, by fault.
     """
 
     rates: list[tuple[Share, Share]] = [(0.01, 0.01), (0.001, 0.01)]

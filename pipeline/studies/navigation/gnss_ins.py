@@ -49,7 +49,16 @@ RUNS_AT_ONCE = 2  # in memory, with their estimates
 
 
 class Bridged(Parameters):
-    """What an independent implementation has for outages of one length, in m; see the columns' names."""
+    """What an independent implementation has for outages of one length, in m.
+
+    Attributes:
+        filter_end: the filter's error at the end of an outage.
+        filter_over: the filter's error over an outage.
+        smoother_over: the smoother's error over an outage.
+        coasted_end: error at the end where the last velocity is kept.
+        coasted_over: error over an outage where the last velocity is kept.
+        hermite_over: error over an outage of a Hermite spline between its ends.
+    """
 
     filter_end: PositiveFloat
     filter_over: PositiveFloat
@@ -60,9 +69,18 @@ class Bridged(Parameters):
 
 
 class Sheet(Parameters):
-    """Numbers of an independent implementation, for one recording, by the lengths of outages (s).
+    """Numbers of an independent implementation, for one recording.
 
-    Accepted is at most `factor` times the errors of its filter and smoother.
+    Attributes:
+        recording: name of the recording.
+        outages: errors by the length of outages in s.
+        factor: accepted is at most so many times the errors of its filter and smoother.
+        position_nis: mean NIS of positions.
+        velocity_nis: mean NIS of velocities.
+        ignored_delay_over: the smoother's error over an outage where the velocity's delay is ignored, in
+            m.
+        gyro_bias_degps: bias of the gyro at the end (x, y, z).
+        force_bias_z_mps2: bias of the accelerometer's z axis at the end.
     """
 
     recording: str
@@ -76,15 +94,18 @@ class Sheet(Parameters):
 
 
 class GnssInsOptions(Parameters):
-    """The protocol of the outages; `filter` and `smoother` are the labels of what is compared.
+    """The protocol of the outages.
 
     Attributes:
-        lengths_s: how long outages are.
-        first_s, every_s: when windows begin, in seconds since the receiver's first row.
+        filter: label of the filter that is compared.
+        smoother: label of the smoother that is compared.
+        delayed: label of a smoother that takes back the mapping's delay of the velocity, if any.
+        lengths_s: lengths of the outages, in s.
+        first_s: when the first window begins, since the receiver's first row.
+        every_s: time from one window's beginning to the next one's.
         apart: windows share a run that are so many times `every_s` apart.
         settle_s: fixes are used from so long after the first inertial sample on.
         innovations_from_s: from when on innovations count.
-        delayed: the label of a smoother that takes back the mapping's delay of the velocity, if any.
         sheet: what claims about one recording are held to; others have none of them.
     """
 

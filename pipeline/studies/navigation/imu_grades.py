@@ -28,7 +28,13 @@ SHARE = 0.95
 
 
 class Limit(Parameters):
-    """How far off the first estimator may be so long after the last fix, for most of the drives."""
+    """How far off the first estimator may be, for most of the drives.
+
+    Attributes:
+        grade: grade of the unit.
+        after_s: so long after the last fix.
+        most_m: largest error of the position then.
+    """
 
     grade: str
     after_s: PositiveFloat
@@ -36,7 +42,12 @@ class Limit(Parameters):
 
 
 class Options(Parameters):
-    """Parameters of the unit by grade, and what is demanded."""
+    """The grades, and what is demanded.
+
+    Attributes:
+        grades: parameters of the scenario's inertial unit, by grade.
+        limits: how far off the first estimator may be.
+    """
 
     grades: dict[str, dict[str, float]]
     limits: list[Limit] = []

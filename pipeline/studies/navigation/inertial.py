@@ -23,7 +23,12 @@ from replay.judging.errors.evaluation import Errors
 
 
 class InertialOptions(Parameters):
-    """What is claimed: the mean error over the trials of which estimator, in degrees."""
+    """What is claimed: a mean error over the trials.
+
+    Attributes:
+        estimator: label of the estimator that is claimed about.
+        target_deg: its mean error over the trials is to be at most this.
+    """
 
     estimator: str = "bingham"
     target_deg: float = 3.5

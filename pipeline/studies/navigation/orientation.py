@@ -40,9 +40,13 @@ AS_RECORDED, WITH_MAGNET = "all", "magnet-added"
 
 
 class OrientationOptions(Parameters):
-    """The magnet that is added: its field in the unit's axes, and when it is near, in s of a trial.
+    """The magnet that is added, and what counts as a disturbance.
 
-    A disturbance is where the field differs by more than `limit_ut` from that of the place.
+    Attributes:
+        magnet_ut: field of the magnet in the unit's axes (x, y, z).
+        magnet_s: when it is near, spans of a trial.
+        limit_ut: a disturbance is where the field differs by more from that of the place.
+        estimator: label of the estimator that is compared with the others.
     """
 
     magnet_ut: tuple[float, float, float] = (20.0, -15.0, 15.0)

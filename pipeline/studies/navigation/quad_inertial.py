@@ -52,7 +52,17 @@ PRIOR_SIGMA = np.concatenate(
 
 
 class Row(Parameters):
-    """RMSE of filter and smoother, and the mean NIS, as an independent implementation has them."""
+    """RMSE of filter and smoother, and the mean NIS, as an independent implementation has them.
+
+    Attributes:
+        recording: name of the recording.
+        offset: which offset of the unit's clock it used.
+        position_m: of the position, by filter and smoother.
+        horizontal_m: of the position in the plane, by filter and smoother.
+        velocity_mps: of the velocity, by filter and smoother.
+        heading_deg: of the heading, by filter and smoother.
+        nis: mean NIS of the filter.
+    """
 
     recording: str
     offset: str = KNOWN
@@ -67,12 +77,14 @@ class QuadInertialOptions(Parameters):
     """What is known of the recordings, and what the claims are held to.
 
     Attributes:
-        filter, smoother: the labels of the estimators.
-        offsets_s: what is to be added to the stamps of the units, by the recording's folder; of others
-            it is what has the greatest likelihood.
-        search_s: the least and the greatest offset that are tried at first, and the step; where one of
+        filter: label of the filter.
+        smoother: label of the smoother.
+        offsets_s: what is to be added to the stamps of the units, in s, by the recording's folder; of
+            others it is what has the greatest likelihood.
+        search_s: least and greatest offset that are tried at first, and the step, in s; where one of
             them is best, others beyond it are.
-        truth_sigma_m: of the truth's positions where they stand for fixes in that search.
+        truth_sigma_m: standard deviation of the truth's positions where they stand for fixes in that
+            search.
         scored_from_s: from when on errors count.
         sheet: rows of an independent implementation, for one unit.
     """

@@ -38,7 +38,14 @@ SEED = 1
 
 
 class CooperativeStressOptions(Parameters):
-    """How often two robots share at most; which leaves for the middle third, and which starts wrong."""
+    """What the robots are put under.
+
+    Attributes:
+        intervals_s: least times between two meetings of two robots at which they share, in s.
+        leaving: number of the robot that is gone for the middle third.
+        liar: number of the robot whose prior is wrong.
+        lie_m: by how much its prior is wrong along x.
+    """
 
     intervals_s: tuple[PositiveFloat, ...] = (2.0, 10.0, 30.0, 100.0, 300.0)
     leaving: PositiveInt = 5

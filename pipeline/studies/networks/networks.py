@@ -34,7 +34,13 @@ CI = "ci-trace"
 
 
 class NetworkOptions(Parameters):
-    """What the study looks at besides the experiment's own runs."""
+    """What the study looks at besides the experiment's own runs.
+
+    Attributes:
+        settle_s: errors count from so long after the beginning on.
+        losses: probabilities of losing a message that are tried.
+        loss_rules: labels of the estimators that are tried at each of them.
+    """
 
     settle_s: NonNegativeFloat = 1.0
     losses: tuple[float, ...] = (0.0, 0.5, 0.9)

@@ -35,9 +35,17 @@ BEYOND = 1.1  # times the number of states: NEES of what is not consistent
 class StressOptions(Parameters):
     """What the network is put under.
 
-    `cases` are parameters of the scenario. A node sends at every chance, once in an interval, or where
-    its estimate differs enough from what it last said. The liar's offset grows; honest nodes refuse
-    nothing, or what lies beyond a gate.
+    Attributes:
+        settle_s: errors count from so long after the beginning on.
+        cases: what differs in the scenario, by the name of a case.
+        intervals_s: least times between two messages of a node that are tried, in s.
+        divergences: differences from its last message, in nats, from which on a node sends, that are
+            tried.
+        liar: number of the node that lies.
+        lie_after_s: from when on it lies.
+        lies_m: what it adds to its estimates, in m; all are tried.
+        great_lie_m: the lie that the claims are about.
+        gate_probability: honest estimates pass the gate with at least this probability.
     """
 
     settle_s: NonNegativeFloat = 1.0

@@ -28,14 +28,34 @@ ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"
 
 
 class Condition(Parameters):
-    """Biases in multiples of those of the scenario files, which have 1 deg, and the noise."""
+    """Biases and noise.
+
+    Attributes:
+        bias_deg: multiple of the biases of the scenario files, which have 1 deg.
+        sigma_rad: standard deviation of azimuth and elevation.
+    """
 
     bias_deg: float
     sigma_rad: PositiveFloat
 
 
 class Printed(Parameters):
-    """What the paper prints; rows are scenarios, columns targets or biases."""
+    """What the paper prints; rows are scenarios, columns targets or biases.
+
+    Attributes:
+        table_of_sensors: number of the table of the sensors' positions.
+        table_of_positions: number of the table of position errors.
+        table_of_biases: number of the table of biases' errors.
+        table_of_means: number of the table of biases' mean errors.
+        position_scenario: number of the scenario that position errors are printed of, from 1.
+        field_of_view_deg: field of view of the sensors that the paper states.
+        runs: number of runs that the paper averages.
+        sensor_position_m: positions of the sensors (x, y, z), by scenario.
+        position_rmse_m: RMSE of the targets' positions, by scheme.
+        bias_rmse_mrad: RMSE of the biases.
+        bias_sigma_mrad: bounds of the biases' standard deviations.
+        bias_mean_mrad: mean errors of the biases.
+    """
 
     table_of_sensors: str
     table_of_positions: str
@@ -52,7 +72,13 @@ class Printed(Parameters):
 
 
 class LosOptions(Parameters):
-    """Scenario files, conditions by name (the first is the paper's), and what the paper prints."""
+    """Scenarios and conditions.
+
+    Attributes:
+        scenarios: scenario files, in the paper's order.
+        conditions: biases and noise, by the name of a condition; the first is the paper's.
+        paper: what the paper prints.
+    """
 
     scenarios: list[str]
     conditions: Annotated[dict[str, Condition], Field(min_length=1)]

@@ -35,7 +35,12 @@ UNTOLD = "straight"
 
 
 class Options(Parameters):
-    """Cases by name, with what differs in the scenario, and of how many runs observability is told."""
+    """Cases, and how observability is told.
+
+    Attributes:
+        cases: what differs in the scenario, by the name of a case.
+        observed_runs: number of runs of which observability is told.
+    """
 
     cases: dict[str, dict[str, Any]]
     observed_runs: PositiveInt = 5

@@ -22,7 +22,12 @@ from replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """How much older than stamped ranges are taken to be, beside an estimator's own `range_delay_s`."""
+    """Delays that the data do not state.
+
+    Attributes:
+        range_delay_s: ranges are taken to be older than stamped by so much, beside an estimator's own
+            `range_delay_s`.
+    """
 
     range_delay_s: float = 0.0
 

@@ -35,7 +35,14 @@ PUBLISHED = ("LS", "ESKF")
 
 
 class Place(Parameters):
-    """Where a window begins or ends: a part of the plane."""
+    """Where a window begins or ends: a part of the plane.
+
+    Attributes:
+        x_above_m: least x.
+        x_below_m: greatest x.
+        y_above_m: least y.
+        y_below_m: greatest y.
+    """
 
     x_above_m: float = -np.inf
     x_below_m: float = np.inf
@@ -50,24 +57,37 @@ class Place(Parameters):
 
 
 class Window(Parameters):
-    """The part of a path that is scored."""
+    """The part of a path that is scored.
+
+    Attributes:
+        begin: where it begins: the first time that the path is there.
+        end: where it ends: the first time after that.
+    """
 
     begin: Place = Place()
     end: Place = Place()
 
 
 class Target(Parameters):
-    """What the best filter and the smoother are held to."""
+    """What the best filter and the smoother are held to.
+
+    Attributes:
+        filter_m: error of the best filter.
+        smoother_m: error of the smoother.
+    """
 
     filter_m: PositiveFloat
     smoother_m: PositiveFloat
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """Windows by the name of a folder that a recording lies in; without one all of it is scored.
+    """Windows, and what errors are held to.
 
-    Targets are those of single recordings, by name. `level_m` is how far from the path's median height
-    a row of the truth may lie.
+    Attributes:
+        windows: the part of a path that is scored, by the name of a folder that a recording lies in;
+            without one all of it is.
+        targets: what errors are held to, by the name of a recording.
+        level_m: how far from the path's median height a row of the truth may lie.
     """
 
     windows: dict[str, Window] = {}

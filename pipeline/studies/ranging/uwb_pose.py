@@ -34,7 +34,12 @@ ASKED = 0.05  # how near the reference's figures ours have to be
 
 
 class UwbPoseOptions(RangingOptions):
-    """When scoring begins, and the yaw of the tags' frame against the truth's body."""
+    """When scoring begins, and how truth is mounted.
+
+    Attributes:
+        skip_s: scoring begins so long after the first estimate.
+        mounting_yaw_deg: yaw of the tags' frame against the truth's body.
+    """
 
     skip_s: NonNegativeFloat = 2.0
     mounting_yaw_deg: float = 0.0

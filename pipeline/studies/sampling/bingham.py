@@ -37,7 +37,14 @@ Floats = NDArray[np.float64]
 
 
 class BinghamOptions(Parameters):
-    """Which estimator is judged beside which, and the cells of the reference filter on a grid."""
+    """Which estimator is judged beside which.
+
+    Attributes:
+        estimator: label of the estimator that is judged.
+        additive: label of the Kalman filter with additive noise.
+        rotated: label of the Kalman filter with noise in the state's frame.
+        grid_cells: cells of the reference filter on a grid.
+    """
 
     estimator: str = "bingham"
     additive: str = "kalman"

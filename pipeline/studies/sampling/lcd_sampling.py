@@ -32,7 +32,14 @@ Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 
 
 class LcdOptions(Parameters):
-    """The (dimension, count) of the sets to optimise, from so many starts, and samplings to draw."""
+    """The sets to optimise, and samplings to draw.
+
+    Attributes:
+        sizes: dimension and count of each set to optimise.
+        starts: number of starts of each optimisation.
+        contained: dimensions in which the sigma points of the UKF are compared with an optimised set.
+        drawn: names of the samplings to draw.
+    """
 
     sizes: Annotated[tuple[Size, ...], Field(min_length=1)] = ((2, 5), (2, 12), (2, 50))
     starts: PositiveInt = 4

@@ -26,7 +26,12 @@ REFERENCE = "analytic"
 
 
 class Options(Parameters):
-    """How many data seeds to average over, and how many rotations of the S2KF's sets to try beside."""
+    """What is averaged over.
+
+    Attributes:
+        data_seeds: number of seeds of the data to average over.
+        rotations: number of rotations of the S2KF's sets to try beside.
+    """
 
     data_seeds: PositiveInt = 4
     rotations: Annotated[int, Field(ge=0)] = 0

@@ -37,14 +37,27 @@ X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
 class Drive(Parameters):
-    """What is recorded; estimates are judged by their positions."""
+    """What is recorded; estimates are judged by their positions.
+
+    Attributes:
+        scenario: name of the scenario.
+        parameters: what differs from its defaults, by name.
+    """
 
     scenario: str
     parameters: dict[str, Any] = {}
 
 
 class Options(Parameters):
-    """Dimensions, functions of each, the standard deviation of k'x, and by which share more must pay."""
+    """Functions of several dimensions, and drives.
+
+    Attributes:
+        dimensions: dimensions of the state.
+        functions: number of functions of each dimension.
+        phase_sigma_rad: standard deviation of k'x, the phase of a function.
+        pays: share by which more samples must lessen an error to pay.
+        drives: what is recorded, by name.
+    """
 
     dimensions: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] = (2, 5, 10, 20)
     functions: Annotated[int, Field(ge=2)] = 60

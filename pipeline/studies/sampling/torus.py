@@ -37,7 +37,15 @@ Floats = NDArray[np.float64]
 
 
 class PropagationOptions(Parameters):
-    """Figure 3's sweep."""
+    """Figure 3's sweep.
+
+    Attributes:
+        sigma_rad: standard deviations of the two angles, in rad.
+        couplings_rad: couplings of the two angles, in rad.
+        correlations: correlations of the two angles.
+        random_samples: number of random samples that are compared.
+        central_weights: weights of the central sample that are compared; the first is ours.
+    """
 
     sigma_rad: tuple[PositiveFloat, PositiveFloat] = (0.8, 1.3)
     couplings_rad: tuple[float, ...] = (0.1, 0.2, 0.5, 1.0)
@@ -198,7 +206,13 @@ def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart
 
 
 class FilterOptions(Parameters):
-    """Cases: what differs in the scenario's parameters. The grid has this many cells per angle."""
+    """Cases, and the filter on a grid.
+
+    Attributes:
+        cases: what differs in the scenario's parameters, by the name of a case.
+        grid_cells: cells of the grid per angle.
+        estimator: label of the estimator that is judged.
+    """
 
     cases: dict[str, dict[str, float]] = {}
     grid_cells: PositiveInt = 48

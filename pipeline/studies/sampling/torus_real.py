@@ -54,7 +54,15 @@ _TURNS = 2.0 * np.pi * np.arange(-5, 6)
 
 
 class Options(Parameters):
-    """How dihedrals are held out, how many components mixtures may have, and the blocks of intervals."""
+    """How dihedrals and wind are judged.
+
+    Attributes:
+        folds: number of parts in which dihedrals are held out.
+        most_components: components that mixtures may have at most.
+        block_residues: residues in a block of the bootstrap that gives intervals.
+        block_hours: hours in such a block of the wind.
+        grid_cells: cells of the grid per angle.
+    """
 
     folds: PositiveInt = 10
     most_components: PositiveInt = 8

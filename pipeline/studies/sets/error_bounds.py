@@ -32,8 +32,10 @@ SPAN_STEP_S = 0.5
 class BoundOptions(Parameters):
     """How bounds follow from errors.
 
-    Odometry's is their largest times `margin`; a bearing's is what a share `bearing_quantile` of them
-    stays below, since a misidentified landmark is off by any angle.
+    Attributes:
+        margin: odometry's bound is its largest error times this.
+        bearing_quantile: a bearing's bound is what this share of errors stays below, since a
+            misidentified landmark is off by any angle.
     """
 
     margin: PositiveFloat = 1.2

@@ -17,7 +17,12 @@ from recorders.parameters import Parameters
 
 
 class ConsistencyOptions(Parameters):
-    """From when on estimators count, in s since a run's epoch, and at which share of stamps at least."""
+    """When estimators count.
+
+    Attributes:
+        aligned_s: estimators count from then on, since a run's epoch.
+        least_share: share of stamps at which an estimator is to be consistent.
+    """
 
     aligned_s: NonNegativeFloat = 0.0
     least_share: Annotated[float, Field(gt=0, le=1)] = 0.9

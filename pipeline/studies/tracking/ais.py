@@ -30,7 +30,15 @@ from replay.judging.tracks.tracks import (
 
 
 class AisOptions(Parameters):
-    """Which estimator is held to the targets, and what these are; how long a track is called live."""
+    """Which estimator is held to what.
+
+    Attributes:
+        estimator: label of the estimator that is held to the targets.
+        kept_share: share of vessels that are to keep one track.
+        mean_share: mean share of a vessel's reports that are to be in its own track.
+        more_reports_than: vessels with more reports than this count.
+        live_s: a track is called live for so long after a report.
+    """
 
     estimator: str = "report-tracker"
     kept_share: PositiveFloat = 0.7

@@ -38,10 +38,14 @@ EQUAL_M = 1e-9
 
 
 class AutoferryOptions(Parameters):
-    """What mean GOSPA (m) is held to, of the best tracker, and of radar and lidar; and late scans.
+    """What trackers are held to, and late scans.
 
-    The estimators `late_estimators` are replayed in the order of arrival too, with late scans taken in
-    each of the ways `late`; those that are not run are left out.
+    Attributes:
+        best_gospa_m: mean GOSPA of the best tracker is to be at most this.
+        radar_lidar_gospa_m: mean GOSPA with radar and lidar is to be at most this.
+        late: ways to treat late scans that are tried in the order of arrival.
+        late_estimators: labels of the estimators that are replayed so; those that are not run are left
+            out.
     """
 
     best_gospa_m: PositiveFloat = 9.3

@@ -21,7 +21,12 @@ from replay.judging.tracks.errors import instants_of
 
 
 class CrossingOptions(Parameters):
-    """The cases: false detections in a scan, and probabilities of detection."""
+    """The cases.
+
+    Attributes:
+        clutter_per_scan: mean numbers of false detections in a scan.
+        detection_probability: probabilities of detection.
+    """
 
     clutter_per_scan: tuple[float, ...] = (10.0, 50.0, 100.0)
     detection_probability: tuple[float, ...] = (0.95, 0.8, 0.65)

@@ -27,9 +27,13 @@ TRACK_BYTES = NUMBER_BYTES * (4 + 10)
 
 
 class VehiclesOptions(Parameters):
-    """Cases: what differs in the scenario's parameters. `reference` is the Kalman filter's label.
+    """The cases, and what they are compared with.
 
-    `few` are estimators that are too slow for all runs; they get the first `few_runs` of the first case.
+    Attributes:
+        cases: what differs in the scenario's parameters, by the name of a case.
+        reference: label of the Kalman filter.
+        few: parameters of estimators that are too slow for all runs, by label.
+        few_runs: number of runs of the first case that these get.
     """
 
     cases: dict[str, dict[str, Any]] = {"deterministic": {}}

@@ -31,7 +31,13 @@ TICKS = (2, 5, 10, 20, 50, 100)
 
 
 class Swept(Parameters):
-    """Up to how many vehicles a method goes, where they start, and how its work should grow."""
+    """Up to how many vehicles a method goes, and how its work should grow.
+
+    Attributes:
+        most: largest number of vehicles.
+        place: whether vehicles start apart, or together in one square.
+        growth: how its work should grow with the number of vehicles.
+    """
 
     most: PositiveInt
     place: Literal["apart", "together"] = "apart"
@@ -39,7 +45,14 @@ class Swept(Parameters):
 
 
 class ScalingOptions(Parameters):
-    """The numbers of vehicles; the area per vehicle, and the side of the square that all share."""
+    """The numbers of vehicles, and where they are.
+
+    Attributes:
+        vehicles: numbers of vehicles.
+        area_per_vehicle_m2: area per vehicle where they start apart.
+        together_m: side of the square where they start together.
+        methods: how far each method goes, by label.
+    """
 
     vehicles: tuple[PositiveInt, ...] = (2, 3, 4, 5, 6, 7, 8, 10, 12, 20, 35, 50)
     area_per_vehicle_m2: PositiveFloat = 2000.0

@@ -25,7 +25,10 @@ from recorders.parsing import read_toml
 class MessageMapping(StreamMapping):
     """What messages of one type become; sources are paths of their fields.
 
-    `name` is the last part of the stream's name, `stamp` where a time or a whole number of ns is.
+    Attributes:
+        name: last part of the stream's name.
+        stamp: path of a time or a whole number of ns that says when it was measured.
+        frame: path of the name of the frame.
     """
 
     name: str = "value"
@@ -38,7 +41,12 @@ class MessageMapping(StreamMapping):
 
 
 class Mapping(Parameters):
-    """The mappings of a file, by the names of the types, such as `my_robot_msgs/msg/Wheels`."""
+    """The mappings of a file.
+
+    Attributes:
+        messages: what becomes of messages, by the name of their type, such as
+            `my_robot_msgs/msg/Wheels`.
+    """
 
     messages: dict[str, MessageMapping] = Field(min_length=1)
 

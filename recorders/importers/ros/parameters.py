@@ -23,14 +23,17 @@ Names = Annotated[list[str], BeforeValidator(_as_list)]
 class RosParameters(Parameters):
     """Which topics are imported, and by which clock.
 
-    `clock` is the one that gives the publish time: that of the message's header, or the bag's. `topics`
-    are those to import; without any, all that can be. `transforms` are pairs of frames such as
-    "map:base_link", whose poses are composed from TF; without any, every transform is imported as it
-    was sent. `names` replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic
-    under /robot1. The poses of the topic `truth` become the stream `truth`, with which estimates are
-    compared. `mapping` is a TOML file for messages of your own. `distribution` has the definitions of
-    messages that the bag does not define. Headers that differ by more than `clock_tolerance_s` are
-    refused as those of several clocks.
+    Attributes:
+        clock: what gives the publish time: the message's header, or the bag.
+        topics: the topics to import; without any, all that can be.
+        transforms: pairs of frames such as "map:base_link", whose poses are composed from TF; without
+            any, every transform is imported as it was sent.
+        names: replaces namespaces: {"/amcl_pose" = "/robot1"} puts the streams of that topic under
+            /robot1.
+        truth: topic whose poses become the stream `truth`, with which estimates are compared.
+        mapping: a TOML file for messages of your own.
+        distribution: which one's definitions hold for messages that the bag does not define.
+        clock_tolerance_s: headers that differ by more are refused as those of several clocks.
     """
 
     clock: Clock = "header"

@@ -28,10 +28,15 @@ from recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """The mapping, by its name (walk) or file (own.toml), and what differs between recordings.
+    """The mapping, and what differs between recordings.
 
-    `more` are further files and folders. `mounting_deg`, and `delays_s` by topic, replace what the
-    mapping states; `seed` is that of the noise that a mapping adds.
+    Attributes:
+        mapping: the mapping, by its name (walk) or file (own.toml).
+        more: further files and folders.
+        mounting_deg: roll, pitch, yaw in place of those that the mapping states.
+        delays_s: how long before its stamp a topic's message was measured, in s, in place of what the
+            mapping states; by topic.
+        seed: seed of the noise that a mapping adds.
     """
 
     mapping: str = ""

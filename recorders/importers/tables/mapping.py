@@ -35,7 +35,13 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 
 
 class Origin(Parameters):
-    """Where the local plane of east, north and up touches, and how high above the WGS 84 ellipsoid."""
+    """Where the local plane of east, north and up touches.
+
+    Attributes:
+        latitude_deg: latitude of the origin.
+        longitude_deg: longitude of the origin.
+        altitude_m: height of the origin above the WGS 84 ellipsoid.
+    """
 
     latitude_deg: Latitude
     longitude_deg: Longitude
@@ -43,7 +49,14 @@ class Origin(Parameters):
 
 
 class Geodetic(Parameters):
-    """Columns with a place, altitudes in m; with them there are columns east_m, north_m and up_m."""
+    """Columns with a place; with them there are columns east_m, north_m and up_m.
+
+    Attributes:
+        latitude: column of the latitude.
+        longitude: column of the longitude.
+        altitude: column of the altitude, in m.
+        unit: what latitude and longitude are in.
+    """
 
     latitude: str
     longitude: str
@@ -54,8 +67,16 @@ class Geodetic(Parameters):
 class Attitude(Parameters):
     """Columns with angles of a body of forward, left, up; with them there are quaternion_w to _z.
 
-    They turn to a frame of east, north, up. `heading` is clockwise from north, `pitch` then nose up and
-    `roll` right side down, as aircraft have them; `yaw` is anticlockwise from east, `pitch` nose down.
+    They turn to a frame of east, north, up.
+
+    Attributes:
+        heading: column of the angle clockwise from north; with it `pitch` is nose up, as aircraft have
+            it.
+        yaw: column of the angle anticlockwise from east, in place of a heading; with it `pitch` is nose
+            down.
+        pitch: column of the pitch.
+        roll: column of the roll, right side down.
+        unit: what angles are in.
     """
 
     heading: str | None = None
@@ -68,9 +89,13 @@ class Attitude(Parameters):
 class TableStream(StreamMapping):
     """A stream of a table's rows.
 
-    What it says was measured `delay_s` before its stamp; with `only_first` the first row alone is taken,
-    as for a prior, else the first of `every` so many. To fields of `noise` white Gaussian noise of these
-    standard deviations is added, such as makes fixes of a path that is known.
+    Attributes:
+        topic: name of the topic.
+        delay_s: a message was measured so long before its stamp.
+        only_first: whether the first row alone is taken, as for a prior.
+        every: of so many rows the first is taken.
+        noise: standard deviation of white Gaussian noise that is added, by field; so fixes are made of a
+            path that is known.
     """
 
     topic: str = Field(pattern=r"^/\S+$")
@@ -99,11 +124,17 @@ class TableMapping(Parameters):
     Attributes:
         files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
             stand for anything, ? for one letter; each name in braces comes once.
-        optional: there may be none.
-        format, columns, header, delimiter, decimal: what the content does not tell; see `open_table`.
+        optional: whether there may be no such file.
+        format: what the files hold; without one the suffix tells, and CSV is what has no other.
+        columns: names of the columns, where the files do not name them.
+        header: whether the first line names the columns; without this its cells tell.
+        delimiter: what is between cells, " " for any white space; without one the first line tells.
+        decimal: the mark before fractions.
         time: when a row was measured.
-        arrival: when it reached the recorder, if that is stated.
-        geodetic, attitude: columns that are made of others.
+        arrival: when a row reached the recorder, if that is stated.
+        geodetic: columns of latitude and longitude, from which positions in the plane are made.
+        attitude: columns of angles, from which quaternions are made.
+        streams: the streams of the rows.
     """
 
     files: Annotated[str, AfterValidator(_once)] = "*"
@@ -121,7 +152,15 @@ class TableMapping(Parameters):
 
 
 class ConstantStream(Parameters):
-    """Messages that stand in the mapping itself, such as anchors; their stamps are the log's first."""
+    """Messages that stand in the mapping itself, such as anchors; their stamps are the log's first.
+
+    Attributes:
+        topic: name of the topic.
+        becomes: name of the message.
+        rows: fields of each message.
+        components: components of a vector that states them, with commas.
+        kinds: kinds of these components, with commas; linear without any.
+    """
 
     topic: str = Field(pattern=r"^/\S+$")
     becomes: str
@@ -139,10 +178,16 @@ class ConstantStream(Parameters):
 
 
 class LogMapping(Parameters):
-    """A mapping: what it is for, where the origin is (else the first fix), tables, and constants.
+    """A mapping: how the tables of a recording become a log.
 
-    The plane is tangent to the ellipsoid, or the map of a `projection` that pyproj knows, from the
-    origin on. Tables that begin further apart than `clock_tolerance_s` are of several clocks.
+    Attributes:
+        summary: what it is for.
+        origin: where the local plane touches; without one, at the first fix.
+        projection: a map that pyproj knows, whose plane is used from the origin on; without one, the
+            plane tangent to the ellipsoid.
+        tables: the tables of a recording.
+        constants: messages that stand in the mapping itself.
+        clock_tolerance_s: tables that begin further apart are refused as those of several clocks.
     """
 
     summary: str = ""

@@ -29,15 +29,16 @@ class TimeMapping(Parameters):
 
     Attributes:
         column: one column, or several whose texts belong together, such as date and time.
-        unit: of numbers; "date" is for dates and times as text.
-        zero: the date that numbers count from.
-        week: the column of GPS weeks; `column` then has the seconds of the week.
-        rate_hz: rows of files without stamps are so many a second, from `zero` on.
+        unit: unit of numbers; "date" is for dates and times as text.
+        zero: date that numbers count from.
+        week: column of GPS weeks; `column` then has the seconds of the week.
+        rate_hz: rows per second of files without stamps, from `zero` on.
         utc_offset_h: how far clocks of this place are ahead of UTC, for dates that do not say it.
-        format: of dates that are not as ISO 8601 has them, in the letters of strptime.
-        leap_seconds: are subtracted; GPS time is otherwise kept as it is written.
-        tag: beside each file, one of its name and this suffix says when its counter started, and how
-            fast it goes (RTKLIB's time tags).
+        format: format of dates that are not as ISO 8601 has them, in the letters of strptime.
+        leap_seconds: leap seconds that are subtracted, in s; GPS time is otherwise kept as it is
+            written.
+        tag: suffix of a file beside each file that says when its counter started, and how fast it goes
+            (RTKLIB's time tags).
     """
 
     column: str | list[str] = []

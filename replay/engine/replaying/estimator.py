@@ -123,6 +123,15 @@ class Estimator(Generic[ParametersType]):
     def __str__(self) -> str:
         return self.summary
 
+    # one of any model has these by what the name says: `_OfAnyModel`
+    def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:  # noqa: ARG002
+        """The parameters that count under a name with this variant, such as `smoother:iterated`."""
+        return self.parameters
+
+    def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:  # noqa: ARG002
+        """The parameters for each model that it may estimate; none where it is of no model."""
+        return {}
+
 
 def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
     """Return the registered estimator of `name`, and the parameter that a `name:variant` sets.

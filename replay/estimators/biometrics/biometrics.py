@@ -42,13 +42,23 @@ LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
 
 
 class Subsets(Parameters):
-    """Which subsets of the matchers to fuse: names of `subsets_of`, all where none is given."""
+    """What is fused.
+
+    Attributes:
+        subsets: names of the subsets of matchers to fuse; without any, all there are.
+    """
 
     subsets: list[str] = []
 
 
 class RuleParameters(Subsets):
-    """A normalisation of the scores over all comparisons (or per gallery entry), and a rule."""
+    """How scores are normalised and fused.
+
+    Attributes:
+        normalisation: how scores are normalised, over all comparisons or, column-min-max, per gallery
+            entry.
+        rule: what of the normalised scores is taken.
+    """
 
     normalisation: Literal["none", "z", "min-max", "tanh", "column-min-max"] = "column-min-max"
     rule: Literal["mean", "sum", "product", "minimum", "maximum", "median"] = "mean"
@@ -57,9 +67,13 @@ class RuleParameters(Subsets):
 class LearnerParameters(Subsets):
     """What a fusion learns from, and what it judges.
 
-    `pairs`: the paper's trimmed database (all genuine, two random impostors per user), or all. Failures
-    to enrol count as scored, as in the paper, or as missing. `logarithmic` names the modalities whose
-    scores go through log(1 + score) first.
+    Attributes:
+        seed: seed of folds and impostors.
+        folds: number of parts of the users for cross validation.
+        pairs: the paper's trimmed database (all genuine, two random impostors per user), or all pairs.
+        failures: whether failures to enrol count as scored, as in the paper, or as missing.
+        logarithmic: modalities whose scores go through log(1 + score) first.
+        impostor_limit: impostor pairs that a fusion learns from at most.
     """
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -71,7 +85,13 @@ class LearnerParameters(Subsets):
 
 
 class ClassifierParameters(LearnerParameters):
-    """A classifier of scikit-learn; `calibrated` puts a logistic curve over its output."""
+    """A classifier of scikit-learn.
+
+    Attributes:
+        classifier: which one.
+        neighbours: number of neighbours of knn.
+        calibrated: whether a logistic curve is put over its output.
+    """
 
     classifier: Literal["qda", "lda", "knn", "svm", "logistic"] = "qda"
     neighbours: PositiveInt = 3
@@ -81,7 +101,15 @@ class ClassifierParameters(LearnerParameters):
 class MixtureParameters(LearnerParameters):
     """HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
 
-    `joint` takes all scores as one vector of one state: a Gaussian mixture.
+    Attributes:
+        topology: how states follow one another; joint takes all scores as one vector of one state: a
+            Gaussian mixture.
+        genuine_components: Gaussians per state of genuine pairs.
+        impostor_components: Gaussians per state of impostor pairs.
+        components_of: Gaussians per state of both, by the name of a subset.
+        covariance_floor: what is added to the diagonal of every covariance, in z units squared.
+        iterations: steps of expectation maximisation at most.
+        tolerance: expectation maximisation ends where a step gains less log-likelihood.
     """
 
     topology: Literal["left-right", "ergodic", "joint"] = "left-right"

@@ -48,7 +48,13 @@ Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
-    """Distributions of prior and noises; one that is none is what the log's channel states."""
+    """Distributions of prior and noises; one that is none is what the log's channel states.
+
+    Attributes:
+        prior: distribution of the orientation at the start.
+        system: distribution of what a step turns by.
+        measurement: distribution of what a measurement is turned by.
+    """
 
     prior: DirectionalNoise | None = None
     system: DirectionalNoise | None = None
@@ -56,13 +62,28 @@ class BinghamParameters(Parameters):
 
 
 class KalmanParameters(BinghamParameters):
-    """Whether the noise is turned into the state's frame; the paper adds it as it is."""
+    """How noise is added.
+
+    Attributes:
+        rotated: whether the noise is turned into the state's frame; the paper adds it as it is.
+    """
 
     rotated: bool = False
 
 
 class HeadingsFilterParameters(Parameters):
-    """The model of the scenario `headings`; a number that is none is what the log's channel states."""
+    """The model of the scenario `headings`; a number that is none is what the log's channel states.
+
+    Attributes:
+        coupling_rad: per step the first heading turns by this times the cosine of the second, the second
+            by this times the sine of the first.
+        drift1_rad: by how much the first heading turns per step besides.
+        drift2_rad: by how much the second heading turns per step besides.
+        system_sigma_rad: standard deviation of a heading's noise per step.
+        system_correlation: correlation of the two headings' noises.
+        measurement_sigma_rad: standard deviation of a measured heading.
+        measurement_correlation: correlation of the two measured headings' errors.
+    """
 
     coupling_rad: float | None = None
     drift1_rad: float | None = None
@@ -74,13 +95,21 @@ class HeadingsFilterParameters(Parameters):
 
 
 class TorusParameters(HeadingsFilterParameters):
-    """`central_weight` is the weight of the central one of the five samples (w5 in the paper)."""
+    """The samples of the filter.
+
+    Attributes:
+        central_weight: weight of the central one of the five samples (w5 in the paper).
+    """
 
     central_weight: Annotated[float, Field(ge=0, le=0.5)] = 0.2
 
 
 class UnscentedTorusParameters(HeadingsFilterParameters):
-    """Whether the innovation is taken the short way round; else all is merely modulo 2 pi."""
+    """How angles are compared.
+
+    Attributes:
+        wrapped: whether the innovation is taken the short way round; else all is merely modulo 2 pi.
+    """
 
     wrapped: bool = True
 

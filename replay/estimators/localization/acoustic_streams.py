@@ -25,7 +25,14 @@ from replay.estimators.localization.solutions import (
 
 
 class ShooterParameters(Parameters):
-    """What the sensors send, and whether their own positions are estimated too."""
+    """What the sensors send, and what is estimated.
+
+    Attributes:
+        mode: what the sensors send to the fusion centre.
+        estimate_sensors: whether the sensors' own positions are estimated too.
+        cross_covariances: whether local estimates keep the covariances of range and angles; the paper
+            leaves them out.
+    """
 
     mode: Mode = Mode.NATIVE_MEASUREMENTS
     estimate_sensors: bool = True

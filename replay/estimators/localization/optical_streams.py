@@ -37,7 +37,12 @@ class PositionsParameters(Parameters):
 
 
 class BiasesParameters(Parameters):
-    """Biases in deg that are known, such as `sensor_2_roll = 0`; all others are estimated."""
+    """What is known of the biases.
+
+    Attributes:
+        known_bias_deg: biases that are known, in deg, such as `sensor_2_roll = 0`; all others are
+            estimated.
+    """
 
     known_bias_deg: dict[str, float] = {}
 

@@ -22,7 +22,13 @@ STATES = 4
 
 
 class ExtendedTargetParameters(ModelParameters):
-    """Variances that are added per step, and that of a point."""
+    """Variances that are added per step, and that of a point.
+
+    Attributes:
+        size_drift_m2: variance that a step adds to half sides.
+        position_drift_m2: variance that a step adds to the position, per axis.
+        point_variance_m2: variance of a measured point, per axis.
+    """
 
     size_drift_m2: NonNegativeFloat | None = None
     position_drift_m2: NonNegativeFloat | None = None

@@ -31,36 +31,39 @@ class DeadReckoningParameters(ModelParameters):
 
     A noise density is the standard deviation of the readings times the root of the step between them:
     0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).
+
+    Attributes:
+        forward_noise_density: noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times
+            the root of the step.
+        turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
+            root of the step.
+        forward_scale: the robot drives so many times what the odometry says.
+        turn_bias_radps: the robot turns faster by so much than the odometry says.
     """
 
     forward_noise_density: NonNegativeFloat | None = None
-    """Noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times the root of the step."""
     turn_noise_density: NonNegativeFloat | None = None
-    """Noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the root of the step."""
     forward_scale: float = 1.0
-    """The robot drives so many times what the odometry says."""
     turn_bias_radps: float = 0.0
-    """The robot turns faster by so much than the odometry says, in rad/s."""
 
 
 class LocalizationParameters(DeadReckoningParameters):
     """Noise and bias of the sensors.
 
-    Poses and headings that do not state their covariance have `sigma_fix_m` and `sigma_heading_rad`.
+    Attributes:
+        sigma_heading_rad: standard deviation of a heading, or of a pose's angle, that does not state it.
+        sigma_range_m: standard deviation of a range.
+        sigma_bearing_rad: standard deviation of a bearing.
+        bias_range_m: ranges are too long by so much.
+        bias_bearing_rad: bearings are too large by so much.
     """
 
     sigma_heading_rad: PositiveFloat | None = None
-    """Standard deviation, in rad, of a pose's or a heading's angle that does not state it."""
     sigma_range_m: PositiveFloat | None = None
-    """Standard deviation of a range, in m."""
     sigma_bearing_rad: PositiveFloat | None = None
-    """Standard deviation of a bearing, in rad."""
     bias_range_m: float = 0.0
-    """Ranges are too long by so much, in m."""
     bias_bearing_rad: float = 0.0
-    """Bearings are too large by so much, in rad."""
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
-    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
 
 
 def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:

@@ -33,8 +33,16 @@ from replay.inference.model.parameters import ModelParameters
 class MovingSightParameters(ModelParameters):
     """Noise of motion and sights, and the errors of attitudes and clocks.
 
-    `acceleration_density` is in m/s^2 per square root of hertz. A sensor's clock is ahead by its
-    parameter.
+    Attributes:
+        acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
+        sigma_azimuth_rad: standard deviation of an azimuth.
+        sigma_elevation_rad: standard deviation of an elevation.
+        sensor_1_yaw_bias_rad, sensor_2_yaw_bias_rad, sensor_3_yaw_bias_rad: bias of this sensor's yaw.
+        sensor_1_pitch_bias_rad, sensor_2_pitch_bias_rad, sensor_3_pitch_bias_rad: bias of this sensor's
+            pitch.
+        sensor_1_roll_bias_rad, sensor_2_roll_bias_rad, sensor_3_roll_bias_rad: bias of this sensor's
+            roll.
+        sensor_1_clock_s, sensor_2_clock_s, sensor_3_clock_s: this sensor's clock is ahead by so much.
     """
 
     acceleration_density: NonNegativeFloat | None = None

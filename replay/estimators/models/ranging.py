@@ -31,10 +31,19 @@ _NS = 1e-9
 class RangingParameters(ModelParameters):
     """Noise, bias and height of the motion, and how the start is found.
 
-    `acceleration_density` is in m/s^2 per square root of hertz. A range was measured `range_delay_s`
-    before its stamp. The start is found by least squares in the ranges of the first `start_s`, from
-    positions `start_reach_m` to all sides of the anchors' middle; its standard deviations are
-    `start_sigma_m` and `start_sigma_mps`.
+    The start is found by least squares in the first ranges, from positions to all sides of the anchors'
+    middle.
+
+    Attributes:
+        acceleration_density: noise of the acceleration, in m/s^2/sqrt(Hz).
+        sigma_range_m: standard deviation of a range.
+        bias_range_m: ranges are too long by so much.
+        height_m: height at which the tag moves.
+        range_delay_s: a range was measured so long before its stamp.
+        start_s: the start is found in the ranges of so long.
+        start_reach_m: the search begins so far to all sides of the anchors' middle.
+        start_sigma_m: standard deviation of the position at the start, per axis.
+        start_sigma_mps: standard deviation of the velocity at the start, per axis.
     """
 
     acceleration_density: NonNegativeFloat | None = None
@@ -49,7 +58,13 @@ class RangingParameters(ModelParameters):
 
 
 class PoseRangingParameters(RangingParameters):
-    """`turn_acceleration_density` is in rad/s^2 per square root of hertz."""
+    """The same, and how the body turns.
+
+    Attributes:
+        turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
+        start_sigma_rad: standard deviation of the heading at the start.
+        start_sigma_radps: standard deviation of the turn rate at the start.
+    """
 
     turn_acceleration_density: NonNegativeFloat | None = None
     start_sigma_m: PositiveFloat = 0.2

@@ -18,7 +18,13 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class ReactorParameters(ModelParameters):
-    """Time step, and variances per step."""
+    """Time step, and variances per step.
+
+    Attributes:
+        step_s: length of a time step.
+        process_variance: variance that a step adds to each partial pressure, in the square of its unit.
+        pressure_variance: variance of a measured total pressure, in the square of its unit.
+    """
 
     step_s: PositiveFloat | None = None
     process_variance: NonNegativeFloat | None = None

@@ -35,11 +35,21 @@ CUT = 3.0
 class MovingShooterParameters(ModelParameters):
     """Noise of motion, sensors and air, and how the start is found.
 
-    `acceleration_density` is in m/s^2 per square root of hertz, `trajectory_density` in rad per square
-    root of a second. The start is found in the reports of the first `start_s`, with the standard
-    deviations `start_sigma_m`, `start_sigma_mps` and `start_sigma_rad`. `outlier_probability` is that
-    of a wrong component of a report, which may then have any value, a lead any up to `longest_s`; only
-    `particles:N` uses it.
+    Attributes:
+        acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).
+        trajectory_density: random walk of the direction of shots, in rad/sqrt(s).
+        sigma_muzzle_blast_rad: standard deviation of the angle at which a sensor hears the muzzle blast.
+        sigma_shockwave_rad: standard deviation of the angle at which a sensor hears the shockwave.
+        sigma_time_difference_s: standard deviation of the time between shockwave and muzzle blast.
+        speed_of_sound_mps: speed of sound in the air.
+        mach_number: speed of the bullet, in speeds of sound.
+        outlier_probability: probability that a component of a report is wrong and may have any value;
+            only `particles:N` uses it.
+        longest_s: longest time between shockwave and muzzle blast that a wrong report may have.
+        start_s: the start is found in the reports of so long.
+        start_sigma_m: standard deviation of the position at the start, per axis.
+        start_sigma_mps: standard deviation of the velocity at the start, per axis.
+        start_sigma_rad: standard deviation of the direction of shots at the start.
     """
 
     acceleration_density: NonNegativeFloat | None = None

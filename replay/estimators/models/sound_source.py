@@ -34,8 +34,13 @@ class SoundSourceParameters(ModelParameters):
     """The air and the start.
 
     The start is found by least squares; its standard deviation is a hundred times what these say, so
-    that it counts little beside the differences, and at most `start_sigma_m`. If all microphones have
-    one height, `height_sigma_m` is the standard deviation of the source's height from it.
+    that it counts little beside the differences.
+
+    Attributes:
+        speed_of_sound_mps: speed of sound in the air.
+        start_sigma_m: largest standard deviation of the start, per axis.
+        height_sigma_m: standard deviation of the source's height from that of the microphones, where all
+            have one.
     """
 
     speed_of_sound_mps: PositiveFloat | None = None

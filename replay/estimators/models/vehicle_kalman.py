@@ -25,9 +25,16 @@ from replay.inference.model.parameters import ModelParameters
 class VehicleParameters(ModelParameters):
     """How the vehicle moves, and the rates of change between its modes.
 
-    A fix without a covariance has `sigma_fix_m` in both directions; without that it is not used. The
-    four rates are per second: `manoeuvres_per_s` from driving to a manoeuvre, `settles_per_s` back,
-    `stops_per_s` from a manoeuvre to standing, `starts_per_s` from there to a manoeuvre.
+    Attributes:
+        turn_rate_radps: turn rate that the vehicle keeps.
+        acceleration_sigma_mps2: standard deviation of the acceleration of a time step, per axis.
+        manoeuvring_sigma_mps2: standard deviation of the acceleration of a time step in a manoeuvre, per
+            axis.
+        standing_sigma_mps: standard deviation of the velocity of a vehicle that stands, per axis.
+        manoeuvres_per_s: rate of changes from driving to a manoeuvre.
+        settles_per_s: rate of changes from a manoeuvre to driving.
+        stops_per_s: rate of changes from a manoeuvre to standing.
+        starts_per_s: rate of changes from standing to a manoeuvre.
     """
 
     turn_rate_radps: float | None = None

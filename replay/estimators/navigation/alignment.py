@@ -45,19 +45,40 @@ PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
 class AlignmentParameters(ModelParameters):
     """How the unit is mounted and delayed, and how the state at the start is found.
 
-    Tilt comes from the first `level_s` seconds. The body is assumed to rest until `rest_margin_s`
-    before it first moves faster than `still_mps`. The heading is the course at the first speed above
-    `course_mps`, less the turn of the gyro until then; without such a speed it is unknown. The standard
-    deviations of the start are `start_sigma_m` of the position, `start_sigma_mps` of a velocity that is
-    measured and `unmeasured_sigma_mps` of one that is not, `tilt_sigma_rad`, `heading_sigma_rad`, and
-    those of the biases. Those that are not given come from the data: position and velocity start so
-    uncertain that their first messages, used like any other, decide; the tilt is as uncertain as the
-    accelerometer's bias and the motion make it; the gyro's bias as its mean over the rest; the heading
-    as much as the course of the first `course_s` differs from the turn of the gyro.
+    Tilt comes from the first samples. The body is assumed to rest until a margin before it first moves.
+    The heading is the course at the first speed that is high enough, less the turn of the gyro until
+    then; without such a speed it is unknown. Standard deviations of the start that are not given come
+    from the data: position and velocity start so uncertain that their first messages, used like any
+    other, decide; the tilt is as uncertain as the accelerometer's bias and the motion make it; the
+    gyro's bias as its mean over the rest; the heading as much as the course differs from the turn of
+    the gyro.
 
     The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
-    then roll about forward. An axis measures (1 + scale) times the true value, plus the bias. A message
-    was measured its topic's delay before its stamp.
+    then roll about forward. An axis measures (1 + scale) times the true value, plus the bias.
+
+    Attributes:
+        mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: this angle of the mounting.
+        force_scale_x, force_scale_y, force_scale_z: share by which this axis measures too much of the
+            specific force.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: share by which this axis measures too much of the turn
+            rate.
+        fix_delay_s: a position was measured so long before its stamp.
+        velocity_delay_s: a velocity was measured so long before its stamp.
+        inertial_delay_s: an inertial sample was measured so long before its stamp.
+        level_s: tilt comes from samples of so long.
+        still_mps: the body first moves where its speed is above this.
+        rest_margin_s: it is assumed to rest until so long before it first moves.
+        course_mps: the heading is the course at the first speed above this.
+        course_s: the heading's standard deviation is how much courses of so long differ from the turn of
+            the gyro.
+        start_sigma_m: standard deviation of the position at the start, per axis.
+        start_sigma_mps: standard deviation of a velocity at the start that is measured, per axis.
+        unmeasured_sigma_mps: standard deviation of a velocity at the start that is not measured, per
+            axis.
+        tilt_sigma_rad: standard deviation of roll and pitch at the start.
+        heading_sigma_rad: standard deviation of the heading at the start.
+        gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
+        force_bias_sigma_mps2: standard deviation of the accelerometer's bias at the start, per axis.
     """
 
     mounting_roll_rad: float = 0.0

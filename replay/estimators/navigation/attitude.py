@@ -37,12 +37,25 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 class AttitudeParameters(ModelParameters):
     """Noise of the unit and of the body's motion, and the uncertainty at the start.
 
-    Noise densities are per square root of hertz (rad/s and m/s^2) and cover errors of scale while the
-    body moves. Densities of random walks are per square root of a second: of the gyro's bias in rad/s,
-    of the magnetic field in uT. That the velocity is about zero and the field about constant is used
-    once a second, with `sigma_velocity_mps` and `sigma_field_ut`, since their errors last about as
-    long. The body rests for its first `rest_s`. If the unit is silent for longer than `inertial_gap_s`,
-    the body may turn at `gap_turn_radps` meanwhile.
+    That the velocity is about zero and the field about constant is used once a second, since their
+    errors last about as long.
+
+    Attributes:
+        gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz); it covers errors of scale
+            while the body moves.
+        force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz); it covers errors of
+            scale while the body moves.
+        gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
+        field_density_ut: random walk of the magnetic field, in uT/sqrt(s).
+        gravity_mps2: acceleration of gravity.
+        sigma_velocity_mps: standard deviation of the velocity about zero.
+        sigma_field_ut: standard deviation of the magnetic field, per axis.
+        inertial_gap_s: a longer silence of the unit is a gap, in which the body may turn.
+        gap_turn_radps: standard deviation of the turn rate in a gap.
+        rest_s: the body rests for so long first.
+        start_sigma_rad: standard deviation of the orientation at the start, per axis.
+        gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
+        start_sigma_mps: standard deviation of the velocity at the start, per axis.
     """
 
     gyro_noise_density: NonNegativeFloat = 0.002

@@ -44,14 +44,39 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 class NavigationParameters(AlignmentParameters):
     """Noise of the inertial unit and the other sensors, where they are mounted, and gaps.
 
-    Noise densities are per square root of hertz (m/s^2 and rad/s), those of the biases' random walks
-    per square root of a second; the biases are those of the body's axes. The lever arm is the position
-    of the antenna, the axle that of the wheels, both from the unit in the body's axes. The magnetic
-    field is that of the place along east, north, up. Gravity and the rotation of the earth are those of
-    the plane's origin.
+    The biases are those of the body's axes. Gravity and the rotation of the earth are those of the
+    plane's origin. If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes
+    unknown: the body may have accelerated, turned and tilted by the standard deviations of a gap.
 
-    If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes unknown: the body
-    may have accelerated and turned by the standard deviations of a gap, and tilted by `gap_tilt_rad`.
+    Attributes:
+        force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz).
+        gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz).
+        force_bias_density: random walk of the accelerometer's bias, in m/s^2/sqrt(s).
+        gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
+        origin_latitude_deg: latitude of the plane's origin.
+        origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
+        inertial_gap_s: a longer silence of the unit is a gap.
+        gap_acceleration_mps2: standard deviation of the acceleration in a gap.
+        gap_turn_radps: standard deviation of the turn rate in a gap.
+        gap_tilt_rad: standard deviation of the tilt after a gap.
+        lever_x_m, lever_y_m, lever_z_m: position of the antenna from the unit along this axis of the
+            body (forward, left, up).
+        axle_x_m, axle_y_m, axle_z_m: position of the wheels' axle from the unit along this axis of the
+            body (forward, left, up).
+        wheel_scale: share by which wheels measure too much.
+        field_east_ut, field_north_ut, field_up_ut: magnetic field of the place in this direction.
+        range_delay_s: a range was measured so long before its stamp.
+        standing_delay_s: that the body stands was told so long before its stamp.
+        sigma_velocity_mps: standard deviation of each component of a velocity that does not state its
+            covariance.
+        sigma_heading_rad: standard deviation of a heading.
+        sigma_height_m: standard deviation of a height.
+        sigma_wheel_mps: standard deviation of the wheels' forward speed.
+        sigma_slip_mps: standard deviation of the wheels' velocity to the side and up, which is about
+            zero.
+        sigma_standing_mps: standard deviation of the velocity of a body that stands, per axis.
+        sigma_field_ut: standard deviation of the magnetic field, per axis.
+        sigma_range_m: standard deviation of a range.
     """
 
     force_noise_density: NonNegativeFloat | None = None

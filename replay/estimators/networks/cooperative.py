@@ -49,9 +49,22 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 class CooperativeParameters(Parameters):
     """How robots use their sightings of each other, and which of them use landmarks.
 
-    `mode` is alone, naive, ci or joint; `anchors` are the numbers of the robots that know the map.
-    `criterion` is what covariance intersection makes least: the trace of a pose's covariance, in m^2 +
-    rad^2, or its determinant. Noise that is none is what the channels state.
+    Noise that is none is what the channels state.
+
+    Attributes:
+        mode: how sightings are fused: not at all (alone), as if independent (naive), by covariance
+            intersection (ci), or in one filter of all robots (joint).
+        criterion: what covariance intersection makes least: the trace of a pose's covariance, in m^2 +
+            rad^2, or its determinant.
+        anchors: numbers of the robots that know the map.
+        forward_noise_density: noise of the forward speed, in m/s/sqrt(Hz): its standard deviation times
+            the root of the step.
+        turn_noise_density: noise of the turn rate, in rad/s/sqrt(Hz): its standard deviation times the
+            root of the step.
+        sigma_range_m: standard deviation of a range.
+        sigma_bearing_rad: standard deviation of a bearing.
+        gate_probability: a measurement whose NIS is beyond this quantile of chi-square is not used; 1
+            uses all.
     """
 
     mode: Mode = "ci"

@@ -48,14 +48,19 @@ FAILURES = ("a covariance is singular or no longer finite",)
 class NetworkParameters(Parameters):
     """The fusion rule, what nodes send, and a node that sends false estimates.
 
-    The rule "alone" fuses nothing, "centralised" is one filter with all sensors and no links, and
-    "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses its measurement a
-    second time. `tolerance` is how exactly weights are optimised.
-
-    A node sends at most once in `send_interval_s`, and only when its estimate differs from its last
-    message by a Kullback-Leibler divergence of `send_divergence` nats. A received estimate is fused if
-    it agrees with the node's own: honest estimates, however correlated, pass that gate with at least
-    `gate_probability`. The node `liar` adds `lie_m` to its estimates after `lie_after_s`.
+    Attributes:
+        rule: the fusion rule; "alone" fuses nothing, "centralised" is one filter with all sensors and no
+            links, and "own-again" is a deliberate mistake: it fuses a node's own estimate and then uses
+            its measurement a second time.
+        tolerance: how exactly weights are optimised.
+        send_interval_s: a node sends at most once in this time.
+        send_divergence: a node sends when its estimate differs from its last message by this
+            Kullback-Leibler divergence, in nats.
+        gate_probability: a received estimate is fused if it agrees with the node's own; honest
+            estimates, however correlated, pass that gate with at least this probability.
+        liar: number of the node that sends false estimates.
+        lie_m: what the liar adds to its estimates.
+        lie_after_s: from when on the liar does so.
     """
 
     rule: Rule = "ci-trace"

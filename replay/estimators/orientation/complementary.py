@@ -27,7 +27,11 @@ HALF = np.sqrt(0.5)
 
 
 class AssumedParameters(Parameters):
-    """The standard deviation about each axis that is assumed, since the method estimates none."""
+    """What is assumed, since the method estimates no covariance.
+
+    Attributes:
+        sigma_deg: standard deviation about each axis that is stated.
+    """
 
     sigma_deg: PositiveFloat = 3.0
 
@@ -38,20 +42,34 @@ class AssumedParameters(Parameters):
 
 
 class MadgwickParameters(AssumedParameters):
-    """The gain in rad/s of the gradient's direction; 0.041 is the author's for such a unit."""
+    """The gain; the default is the author's for such a unit.
+
+    Attributes:
+        gain: gain of the gradient's direction, in rad/s.
+    """
 
     gain: NonNegativeFloat = 0.041
 
 
 class MahonyParameters(AssumedParameters):
-    """The gain of the correction in 1/s, and of the bias in 1/s^2."""
+    """The gains.
+
+    Attributes:
+        gain: gain of the correction, in 1/s.
+        bias_gain: gain of the correction of the bias, in 1/s^2.
+    """
 
     gain: NonNegativeFloat = 1.0
     bias_gain: NonNegativeFloat = 0.3
 
 
 class VqfParameters(AssumedParameters):
-    """The time constants in s of its corrections of inclination and of heading."""
+    """The time constants.
+
+    Attributes:
+        inclination_s: time constant of the correction of inclination.
+        heading_s: time constant of the correction of heading.
+    """
 
     inclination_s: PositiveFloat = 3.0
     heading_s: PositiveFloat = 9.0

@@ -37,9 +37,12 @@ Advance = Callable[
 class InertialParameters(Parameters):
     """Noise and averaging of inertial samples, the same for all logs.
 
-    The body rests for its first `rest_s`. An attitude of accelerometer and magnetometer is averaged
-    over `block_s` and has a standard deviation of `attitude_sigma_deg`; the gyro drifts by
-    `drift_sigma_deg` per square root of a second. Longer silences than `gap_s` are gaps.
+    Attributes:
+        rest_s: the body rests for so long first.
+        block_s: an attitude of accelerometer and magnetometer is averaged over so long.
+        attitude_sigma_deg: standard deviation of such an attitude.
+        drift_sigma_deg: random walk of the gyro's orientation, in deg/sqrt(s).
+        gap_s: a longer silence is a gap.
     """
 
     rest_s: NonNegativeFloat = 20.0
@@ -61,7 +64,11 @@ class InertialParameters(Parameters):
 
 
 class GyroParameters(InertialParameters):
-    """With `unbiased` the gyro's mean over the rest is subtracted."""
+    """How the gyro's bias is treated.
+
+    Attributes:
+        unbiased: whether the gyro's mean over the rest is subtracted.
+    """
 
     unbiased: bool = True
 

@@ -82,10 +82,17 @@ class SetFilterParameters(SetParameters):
 
     Over a span of T s the position of the odometry is off by at most `position_error_m` + T
     `position_error_mps`, seen from the pose at the beginning, and its heading by at most
-    `heading_error_rad` + T `heading_error_radps`. `bearing_bound_rad` is of single bearings, which
-    determine the heading, `bound_deg` of their differences. After `anchor_s` the current set becomes
-    the one that motion is counted from. A part of a set with more than `most_edges` edges is replaced
-    by a larger one of the form L = 8.
+    `heading_error_rad` + T `heading_error_radps`.
+
+    Attributes:
+        bearing_bound_rad: bound of the error of single bearings, which determine the heading;
+            `bound_deg` is that of their differences.
+        position_error_m: bound of the odometry's error of position that does not grow with time.
+        position_error_mps: bound of the odometry's error of position per second.
+        heading_error_rad: bound of the odometry's error of heading that does not grow with time.
+        heading_error_radps: bound of the odometry's error of heading per second.
+        anchor_s: after this time the current set becomes the one that motion is counted from.
+        most_edges: a part of a set with more edges is replaced by a larger one of the form L = 8.
     """
 
     least_landmarks: Annotated[int, Field(ge=2)] = 2

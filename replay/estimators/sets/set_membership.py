@@ -35,9 +35,19 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 class SetParameters(Parameters):
     """The form of the sets, and the bounds they come from; a bound that is none is the log's.
 
-    Bearings of one stamp give all their pairs. The arena is (low x, low y, high x, high y). Without
-    one, a robot is no farther from a landmark that it sees than `maximum_range_m`; without that either,
-    no farther than the longest range that its sensor measured.
+    Bearings of one stamp give all their pairs.
+
+    Attributes:
+        shape: form of the sets: exact, the box around them, or the paper's pseudo-ellipsoids L = 4 and L
+            = 8.
+        bound_deg: bound of the error of a relative bearing.
+        weighting: how pseudo-ellipsoids weigh what they fuse: by the least area of each step, of all at
+            once (batch), by the determinant, or all alike (equal).
+        sweeps: how many times pseudo-ellipsoids fuse all pairs.
+        least_landmarks: so many landmarks must be seen at one stamp for a set.
+        arena_m: where the robot is for sure (low x, low y, high x, high y).
+        maximum_range_m: without an arena, a robot is no farther from a landmark that it sees; without
+            this either, no farther than the longest range that its sensor measured.
     """
 
     shape: Literal["exact", "box", "l4", "l8"] = "exact"

@@ -38,10 +38,19 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 class PhdParameters(Parameters):
     """Motion, births and detections of targets; what is none is what the scans' channel states.
 
-    `sensor` is the one to use, such as `network`; if it is empty each sensor has a filter of its own.
-    Births and clutter are per m^2 and scan. Components whose squared Mahalanobis distance is below
-    `merge_squared` become one, those of less than `prune_weight` are dropped. `gate_probability` is
-    that of a detection of a component being inside its gate.
+    Attributes:
+        sensor: the sensor to use, such as `network`; without one each sensor has a filter of its own.
+        variance_m2: variance of a detection, per axis.
+        detection_probability: probability that a scan detects a target.
+        clutter_per_m2: mean number of false detections in a scan, per area.
+        survival_probability: probability that a target is still there at the next scan.
+        births_per_m2: mean number of new targets in a scan, per area.
+        birth_sigma_mps: standard deviation of a new target's velocity, per axis.
+        acceleration_sigma_mps2: standard deviation of the acceleration between two scans, per axis.
+        gate_probability: probability that the detection of a component is inside its gate.
+        prune_weight: components of less weight are dropped.
+        merge_squared: components whose squared Mahalanobis distance is below this become one.
+        most_components: so many components are kept at most.
     """
 
     sensor: str = ""

@@ -47,11 +47,20 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 class ReportTrackerParameters(Parameters):
     """What is assumed of vessels and their receivers; the same for all.
 
-    There are several levels of noise, the smallest first: densities of the acceleration in m^2/s^3, and
-    standard deviations of positions and velocities. Each track weighs them; `forgetting` is how far a
-    report moves these weights back to equal ones. Of new vessels the share `resting_share` is at rest.
-    A vessel slower than `slow_mps` may be at rest and then often repeats its last course; within
-    `course_width_deg` this distinguishes it from others. A track that is silent for `forget_s` ends.
+    There are several levels of noise, the smallest first, which each track weighs.
+
+    Attributes:
+        acceleration_density: power spectral density of the acceleration by level, in m^2/s^3.
+        sigma_position_m: standard deviation of a position by level, per axis, in m.
+        sigma_velocity_mps: standard deviation of a velocity by level, per axis, in m/s.
+        forgetting: share by which a report moves the weights of the levels back to equal ones.
+        births_per_km2_h: new vessels per area and time.
+        resting_share: share of new vessels that are at rest.
+        top_speed_mps: greatest speed of a vessel.
+        usual_interval_s: time between a vessel's reports that a new track assumes.
+        slow_mps: a vessel that is slower may be at rest, and then often repeats its last course.
+        course_width_deg: a course that is repeated within this tells a vessel at rest from others.
+        forget_s: a track that is silent for so long ends.
     """
 
     acceleration_density: FOUR = (1e-6, 1e-4, 1e-2, 1.0)

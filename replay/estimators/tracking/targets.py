@@ -28,7 +28,11 @@ POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 
 
 class TargetParameters(ModelParameters):
-    """The power spectral density of the acceleration, in m^2/s^3."""
+    """How targets move that keep their velocity.
+
+    Attributes:
+        acceleration_density: power spectral density of the acceleration, in m^2/s^3.
+    """
 
     acceleration_density: PositiveFloat = 0.1
 

@@ -58,29 +58,87 @@ class TrackerParameters(Parameters):
     """How targets move, how tracks begin and end, and what sensors are like.
 
     What is none is what the channel of a sensor's scans states; a value given here holds for all
-    sensors. `sensors` are those to use, such as ["radar", "lidar"]; if it is empty, all are used.
+    sensors.
 
-    `model` is a registered model with a position, whose parameters `motion` gives by name. A model with
-    modes uses all of them, or the one that `mode` names. Without a model targets keep their velocity,
-    but for an acceleration of density `acceleration_density` (m^2/s^3).
+    A track begins with a detection outside all gates that is far enough from all confirmed tracks; with
+    `undetected_per_m2`, with any detection that may be a target that was never detected, by how
+    probable that is. `management` decides which tracks are confirmed: "existence" by the probability
+    that the target exists, "hits" by counting detections, "score" by the log-likelihood ratio of target
+    and clutter.
 
-    A track begins with a detection outside all gates that is `birth_distance_m` from all confirmed
-    tracks. With `undetected_per_m2`, the density of targets that were never detected, it begins with
-    any detection that may be one of these, by how probable that is.
+    A registration error is constant in all that a sensor measures, and all tracks estimate it together;
+    a correlated error is another one for every track, and lasts for a while. Both are components of the
+    tracks' states.
 
-    `management` decides which tracks are confirmed. "existence" uses the probability that the target
-    exists: a track is confirmed from `confirming_existence` on until it falls below
-    `keeping_existence`, and ends below `ending_existence`. "hits" needs `hits_needed` detections in the
-    first `chances`. "score" tests the log-likelihood ratio of target and clutter, so that
-    `false_confirmation` and `missed_confirmation` are the probabilities of its errors. With hits or
-    score the existence is `birth_existence` until a track is confirmed, and then 1. If management is
-    none, jipda and pmbm use existence, the others hits.
-
-    With `registration_sigma_m` or `_rad` a sensor has a constant error in all that it measures, which
-    all tracks estimate together. With `correlated_sigma_m` or `_rad` it has another error for every
-    track, which lasts for about `correlation_s`. Both are components of the tracks' states.
-
-    With `smoothed` the tracks are estimated again at the end of the run from all their detections.
+    Attributes:
+        association: which detection is which target's: the nearest, the best of all maps (hungarian), or
+            all maps by their probabilities (jpda, jipda, pmbm).
+        management: how tracks are confirmed and ended; without one jipda and pmbm use existence, the
+            others hits.
+        sensors: the sensors to use, such as ["radar", "lidar"]; without any, all.
+        model: a registered model with a position, by which targets move; without one they keep their
+            velocity.
+        mode: the mode of such a model to use; without one all of them.
+        motion: parameters of such a model, by name.
+        acceleration_density: power spectral density of the acceleration of targets without a model, in
+            m^2/s^3.
+        birth_sigma_mps: standard deviation of a new track's velocity, per axis.
+        birth_distance_m: a track begins so far from all confirmed tracks.
+        birth_existence: existence of a new track; with hits or score, of a track until it is confirmed.
+        undetected_per_m2: density of targets that were never detected.
+        confirming_existence: with management by existence, a track is confirmed from this existence on.
+        keeping_existence: a track is no longer confirmed below this existence.
+        ending_existence: a track ends below this existence.
+        survival_s: mean time for which a target is there.
+        hits_needed: with management by hits, so many detections in its first `chances` scans confirm a
+            track.
+        chances: with management by hits, a track without `hits_needed` detections in its first so many
+            scans ends.
+        false_confirmation: with management by score, probability that clutter is confirmed as a track.
+        missed_confirmation: with management by score, probability that a target's track is not
+            confirmed.
+        silence_s: a confirmed track ends after so long without a detection.
+        tentative_silence_s: a track that is not confirmed ends after so long without a detection.
+        same_within_m: tracks whose positions are nearer than this are one, if their velocities are near
+            too.
+        same_within_mps: tracks whose velocities are nearer than this are one, if their positions are
+            near too.
+        most_tracks: room for so many tracks at a time.
+        smoothed: whether tracks are estimated again at the end of the run from all their detections.
+        gate_probability: probability that a target's detection is inside its gate.
+        sigma_m: standard deviation of a position along the line of sight, or of a range.
+        sigma_across_rad: standard deviation of a position across the line of sight, per m of range, that
+            is added there.
+        lag_s: detections are where a target was so long ago.
+        bias_x_m: places are too far along x by so much.
+        bias_y_m: places are too far along y by so much.
+        bias_range_m: ranges are too long by so much.
+        near_range_m: up to this range a target is near; beyond it detection and clutter change linearly.
+        far_range_m: from this range on detection and clutter change no further.
+        far_detection_probability: probability that a target is detected from `far_range_m` on.
+        clutter_per_m2: mean number of false detections in a scan, per area, near the sensor.
+        far_clutter_factor: what clutter is multiplied by far from the sensor.
+        sector_from_rad: where a sector begins in which a sensor detects more or less, anticlockwise from
+            the x axis.
+        sector_to_rad: where this sector ends, anticlockwise from the x axis.
+        sector_detection_factor: what the probability of a detection is multiplied by in the sector.
+        sector_clutter_factor: what clutter is multiplied by in the sector.
+        joined_within_m: detections within this of each other count as one target.
+        sigma_rad: standard deviation of a bearing.
+        sigma_across_m: standard deviation of a bearing across the line of sight, in m, that is added
+            there.
+        bias_rad: bearings are too large by so much.
+        clutter_per_rad: mean number of false detections in a scan, per angle.
+        detection_probability: probability that a near target is detected.
+        blind_from_rad: where the sector begins in which a sensor detects nothing, anticlockwise from the
+            x axis.
+        blind_to_rad: where that sector ends, anticlockwise from the x axis.
+        interval_s: a track uses one detection of a sensor in this time.
+        registration_sigma_m: standard deviation of a registration error of places or ranges; 0 is none.
+        registration_sigma_rad: standard deviation of a registration error of bearings; 0 is none.
+        correlated_sigma_m: standard deviation of a correlated error of places or ranges; 0 is none.
+        correlated_sigma_rad: standard deviation of a correlated error of bearings; 0 is none.
+        correlation_s: for about how long a correlated error lasts.
     """
 
     association: Literal["nearest", "hungarian", "jpda", "jipda", "pmbm"] = "jipda"

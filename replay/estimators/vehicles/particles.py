@@ -64,9 +64,12 @@ _choose = compiled(choose_systematically, allocates=False)
 
 
 class ParticlesParameters(Parameters):
-    """The method with its number of particles.
+    """The method and its random numbers, which depend on `seed` and on the run's first fixes.
 
-    Random numbers depend on `seed` and on the run's first fixes.
+    Attributes:
+        method: what particles are of, and their number, as in associations-60; -topology adds the
+            roadside sensor.
+        seed: seed of the random numbers.
     """
 
     method: str = "associations-60"

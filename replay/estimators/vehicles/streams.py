@@ -47,9 +47,14 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """The method, and the scan from which on the sensor's pose may be estimated.
+    """The method, and what it may assume.
 
-    A fix without a covariance has `sigma_fix_m` in both directions; without that it is not used.
+    Attributes:
+        method: `FIXES` or `FIXES-SENSOR`: how fixes are used, and what of the roadside sensor is, as in
+            hungarian-topology.
+        registration_scan: number of the scan from which on the sensor's pose may be estimated.
+        sigma_fix_m: standard deviation of each component of a fix that does not state its covariance;
+            without one such a fix is not used.
     """
 
     method: str = "hungarian"

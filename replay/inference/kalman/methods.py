@@ -63,13 +63,18 @@ SETTLED = 1e-12  # of the iterated update: the largest component of the last ste
 class MethodParameters(Parameters):
     """Defines the options of every method.
 
-    `every_s` asks for estimates at this interval too, besides those at the sensors' stamps. `mode` is
-    the motion to use of a model that has several. `estimate` names parameters that become part of the
-    state: each starts from its value with the standard deviation in `estimate_sigma`. It is constant,
-    or walks at random with the density in `estimate_drift` (its unit per square root of a second), or
-    returns to its value within about the time in `estimate_time_s`, as a first-order Gauss-Markov
-    process. `topics` says which topic of the log stands for one that the model asks for, such as {pose
-    = "/amcl_pose/pose"}; an empty name leaves a sensor out.
+    Attributes:
+        every_s: estimates are given at this interval too, besides those at the sensors' stamps.
+        mode: the motion to use of a model that has several.
+        estimate: names of parameters that become part of the state; each starts from its value, and is
+            constant unless `estimate_drift` or `estimate_time_s` has it.
+        estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
+        estimate_drift: random walk of such a parameter, in its unit per square root of a second, by
+            name.
+        estimate_time_s: time within about which such a parameter returns to its value, as a first-order
+            Gauss-Markov process, in s, by name.
+        topics: which topic of the log stands for one that the model asks for, such as {pose =
+            "/amcl_pose/pose"}; an empty name leaves a sensor out.
     """
 
     every_s: PositiveFloat | None = None
@@ -82,13 +87,22 @@ class MethodParameters(Parameters):
 
 
 class UnscentedParameters(MethodParameters):
-    """`kappa` sets how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter."""
+    """Options of methods that may use the unscented transform.
+
+    Attributes:
+        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter.
+    """
 
     kappa: float = 0.0
 
 
 class RegressionParameters(MethodParameters):
-    """`sampling` is the name of a sampling, such as s2kf-50; `seed` is for random ones."""
+    """Options of methods that may use samples.
+
+    Attributes:
+        sampling: name of the sampling, such as s2kf-50.
+        seed: seed of random samplings.
+    """
 
     sampling: str = "ukf"
     seed: NonNegativeInt = 0

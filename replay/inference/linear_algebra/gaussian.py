@@ -268,6 +268,21 @@ def propagate_covariance(covariance: Floats, transition: Floats, product: Floats
             covariance[row, column] = covariance[column, row] = entry
 
 
+def measured_covariance(covariance: Floats, rows: Floats, cross: Floats, spread: Floats) -> None:
+    """Fill C = P H' and S = H C, with H in `rows`, of which there may be more than are measured."""
+    for i in range(len(spread)):
+        for row in range(len(covariance)):
+            entry = 0.0
+            for k in range(len(covariance)):
+                entry += covariance[row, k] * rows[i, k]
+            cross[row, i] = entry
+        for j in range(i + 1):
+            entry = 0.0
+            for k in range(len(covariance)):
+                entry += rows[j, k] * cross[k, i]
+            spread[i, j] = spread[j, i] = entry
+
+
 def predict_constant_velocity(
     mean: Floats,
     covariance: Floats,

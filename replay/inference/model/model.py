@@ -7,7 +7,7 @@ state of every model that gives what the method needs.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 from recorders.log import Schema, Stream, schemas
@@ -334,7 +334,7 @@ class Model:
     takes_fixes: bool = True
     by_name: bool = False
 
-    @property
+    @cached_property
     def all_sensors(self) -> tuple[Sensor, ...]:
         """List the sensors, with that of position fixes unless the model has one of its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
@@ -350,7 +350,7 @@ class Model:
         """Tell whether the model finds its own start, see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[str, ...]:
         """List the kinds of the state's components."""
         return tuple(self.state.values())
@@ -360,7 +360,7 @@ class Model:
         """Count the components of the state."""
         return len(self.state)
 
-    @property
+    @cached_property
     def tangent(self) -> int:
         """Count those of its tangent space: an orientation has four components and three."""
         return tangent_size(self.kinds)

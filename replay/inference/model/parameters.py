@@ -32,18 +32,23 @@ class ModelParameters(Parameters):
 
     A parameter that is none is what the channels of the log state: the sensor's own first, then those
     of control, prior and the other sensors.
+
+    Attributes:
+        gate_probability: a measurement whose NIS is beyond this quantile of chi-square is not used; 1
+            uses all.
+        gate_reopens_s: the gate is open for a sensor whose last accepted measurement is older, so that a
+            filter that has drifted, as in an outage, accepts what brings it back.
+        inflate_nis: an innovation with a greater NIS counts with a larger covariance, which gives it
+            this NIS.
+        student_freedom: innovations count as if they had Student's distribution with so many degrees of
+            freedom.
+        switch_nis: above this NIS a measurement counts less and less, as in dynamic covariance scaling.
+        sigma_fix_m: standard deviation of each component of a fix that does not state its covariance.
     """
 
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """A measurement whose NIS is beyond this quantile of chi-square is not used; 1 uses all."""
     gate_reopens_s: PositiveFloat | None = None
-    """The gate is open for a sensor whose last accepted measurement is older, so that a filter that has
-    drifted, as in an outage, accepts what brings it back."""
     inflate_nis: PositiveFloat | None = None
-    """An innovation with a greater NIS counts with a larger covariance, which gives it this NIS."""
     student_freedom: PositiveFloat | None = None
-    """Innovations count as if they had Student's distribution with so many degrees of freedom."""
     switch_nis: PositiveFloat | None = None
-    """Above this NIS a measurement counts less and less, as in dynamic covariance scaling."""
     sigma_fix_m: PositiveFloat | None = None
-    """Standard deviation, in m, of each component of a fix that does not state its covariance."""

@@ -45,12 +45,16 @@ AGREED = 0.1  # members become one where their means are on average so near, as 
 
 
 class GaussianSumParameters(UnscentedParameters, RegressionParameters):
-    """The filter of every member, and the number of members for a whole turn.
+    """The filter of every member, and the number of members.
 
     Members lie side by side, and the standard deviation of each is half their distance, so that their
     sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not split.
     The number is odd: of an even one, each member has another opposite, and whether that is half a turn
     to the left or to the right, and so the mean of all, rounding would say.
+
+    Attributes:
+        filter: the filter of every member.
+        members: number of members for a whole turn; odd.
     """
 
     filter: str = "ekf"

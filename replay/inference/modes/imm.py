@@ -54,10 +54,12 @@ from replay.inference.run.recursion import FilterEvents
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):
-    """The filter of every mode.
+    """The filter of every mode, and what is written.
 
-    With `smoothed_modes` the probabilities of the modes given all data are written too, at the end of
-    the run and on a topic of their own; the state is not smoothed.
+    Attributes:
+        filter: the filter of every mode.
+        smoothed_modes: whether the probabilities of the modes given all data are written too, at the end
+            of the run and on a topic of their own; the state is not smoothed.
     """
 
     filter: str = "ekf"

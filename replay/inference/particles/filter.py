@@ -46,9 +46,14 @@ MOST_PARTICLES = 1_000_000
 class ParticleParameters(MethodParameters):
     """The number of particles, and when they are resampled.
 
-    That is where their effective number, 1 / sum w^2, is below the share `resample_below` of all. With
-    `cloud` every estimate comes with all its particles. Random numbers depend on `seed` and on the
-    run's first measurement.
+    Random numbers depend on `seed` and on the run's first measurement.
+
+    Attributes:
+        particles: number of particles.
+        resample_below: particles are resampled where their effective number, 1 / sum w^2, is below this
+            share of all.
+        seed: seed of the random numbers.
+        cloud: whether every estimate comes with all its particles.
     """
 
     particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000

@@ -35,7 +35,12 @@ from replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_
 
 
 class BoundParameters(MethodParameters):
-    """The bound of filters or of smoothers, and the longest gap over which the truth is interpolated."""
+    """Whose bound it is, and how truth is read.
+
+    Attributes:
+        of: whether the bound of filters or that of smoothers.
+        gap_limit_s: longest gap over which truth is interpolated.
+    """
 
     of: Literal["filter", "smoother"] = "filter"
     gap_limit_s: PositiveFloat = 0.2

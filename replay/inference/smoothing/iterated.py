@@ -38,13 +38,16 @@ from replay.inference.smoothing.smoothers import Piece, Smoother, SmootherParame
 
 
 class IteratedParameters(SmootherParameters):
-    """The start of the search, its damping, and the loss of outliers.
+    """Options of smoother:iterated: the start of the search, its damping, and the loss of outliers.
 
-    `start` is smoother (the extended filter, smoothed once), motion (the prior's mean, moved along) or
-    prior (that mean at all stamps). `damping` is that of the first step, in units of the information at
-    the start; with 0, Gauss-Newton is damped only where its cost would rise. With the losses huber and
-    cauchy a measurement whose whitened residual is longer than `loss_scale` counts less. The search
-    ends after `iterations` at most.
+    Attributes:
+        start: where the search starts: smoother (the extended filter, smoothed once), motion (the
+            prior's mean, moved along) or prior (that mean at all stamps).
+        damping: damping of the first step, in units of the information at the start; with 0,
+            Gauss-Newton is damped only where its cost would rise.
+        loss: how residuals count; with huber and cauchy, long ones count less.
+        loss_scale: length of a whitened residual from which on huber and cauchy count it less.
+        iterations: the search ends after so many at most.
     """
 
     start: Literal["smoother", "motion", "prior"] = "smoother"

@@ -50,9 +50,11 @@ IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a te
 
 
 class SmootherParameters(UnscentedParameters, RegressionParameters):
-    """The filter that goes forward, perhaps with a lag, as in `ekf:lag=500ms`.
+    """What goes forward, and how far estimates look ahead.
 
-    Without a lag every estimate uses the whole run; with one, the messages up to so much later.
+    Attributes:
+        forward: the filter, perhaps with a lag, as in `ekf:lag=500ms`; without a lag every estimate uses
+            the whole run, with one the messages up to so much later.
     """
 
     forward: str = "ekf"

@@ -1,0 +1,164 @@
+"""What `--set NAME=?` answers: what a parameter means, its unit, what it accepts, and its default.
+
+Every command names what takes its settings, by a key of `TAKERS`.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.api.catalog import Entry, rows_of, stated_of
+from pipeline.logs.constraints import ConstraintParameters
+from pipeline.output.terminal import print_table
+from pipeline.runs.experiment import (
+    Experiment,
+    Study,
+    experiment_of_logs,
+    load_scenario,
+    read_experiment,
+)
+from pipeline.runs.settings import read_settings
+from recorders.errors import BadInput, choices
+from recorders.log import open_log
+from recorders.parameters import merge, parse_settings
+from recorders.recording import Recorder
+from recorders.registry import load
+from replay.engine.replaying.estimator import Estimator, find_estimator
+from replay.inference.estimators import registered_models
+from replay.inference.observability import OBSERVABILITY
+
+ASKED, OF_MODEL = "=?", " of "
+Entries = Sequence[Entry]  # what takes settings at once
+
+
+def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) -> None:
+    """Print what the parameters mean that `NAME=?` asks for; raises BadInput where there is none.
+
+    Args:
+        texts: the settings, of which those that are no question are passed over.
+        takes: a key of `TAKERS`.
+        options: the command's.
+    """
+    takers = list(TAKERS[takes](options))
+    names = [text.removesuffix(ASKED).strip() for text in texts if text.endswith(ASKED)]
+    table = [row for name in names for row in _answer(name, takers)]
+    print_table(["parameter", "of", "default", "unit", "accepts", "meaning"], table)
+
+
+def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:
+    """Rows of one name, of a table with all that is in it; what is alike of several stands once.
+
+    Of several takers the first has a name.
+    """
+    for entries in takers:
+        alike: dict[str, tuple[list[object], list[str]]] = {}
+        for entry in entries:
+            for row in rows_of(entry):
+                if f"{row[0]}.".startswith((f"{name}.", f"{name}[")):
+                    alike.setdefault(repr(row), (row, []))[1].append(entry.name)
+        if alike:
+            return [[row[0], ", ".join(_whose(of, alike)), *row[1:]] for row, of in alike.values()]
+    known = {str(row[0]) for entries in takers for entry in entries for row in rows_of(entry)}
+    raise BadInput(f"--set {name}{ASKED}: no such parameter; {choices(name, sorted(known))}")
+
+
+def _whose(names: Sequence[str], alike: Collection[Any]) -> Iterable[str]:
+    """Whose a parameter is; it is of no interest by which model where all models have it alike."""
+    return dict.fromkeys(name.partition(OF_MODEL)[0] for name in names) if len(alike) == 1 else names
+
+
+def _recorder(options: Mapping[str, Any]) -> Iterator[Entries]:
+    """That of a scenario, of a log to record again, or of data to import."""
+    name, values = options.get("source"), dict[str, Any]()
+    if name is None and options["again"] is not None:
+        run = open_log(options["again"]).run
+        name = run.scenario if run else None
+    elif name is None and options["scenario"] is not None:
+        name, values, _ = load_scenario(options["scenario"])
+    if name is None:
+        raise BadInput(f"--set NAME{ASKED}: name a scenario, one that fuselog scenarios lists")
+    yield [_of_recorder(name, values)]
+
+
+def _of_recorder(name: str, values: Mapping[str, Any]) -> Entry:
+    recorder = load("recorders", name, Recorder)
+    return Entry(name, recorder.summary, parameters=recorder.parameters, values=values)
+
+
+def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
+    """Those that a command names."""
+    labels = options.get("names") or options.get("labels") or [options.get("label")]
+    if not all(labels):
+        raise BadInput(f"--set NAME{ASKED}: name an estimator, such as -e ekf")
+    tables = read_settings(options["settings_file"], labels)
+    given = parse_settings(text for text in options["settings"] if not text.endswith(ASKED))
+    named = {label: given[label] for label in labels if isinstance(given.get(label), dict)}
+    kinds = {label: {"kind": each["kind"]} for label, each in named.items() if "kind" in each}
+    chosen = {label: merge(tables.get(label, {}), kinds.get(label, {})) for label in labels}
+    yield from _by_label(chosen, options.get("model"))
+
+
+def _by_label(
+    estimators: Mapping[str, Mapping[str, Any]], model: str | None = None
+) -> Iterator[Entries]:
+    """Estimators by label: first what a label begins, then what is set for all."""
+    found = {label: _of_estimator(label, values, model) for label, values in estimators.items()}
+    for label, entries in found.items():
+        yield [replace(entry, prefix=f"{label}.") for entry in entries]
+    yield [entry for entries in found.values() for entry in entries]
+
+
+def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = None) -> list[Entry]:
+    """The parameters of an estimator: for each model that it may estimate, or else all."""
+    own = {key: value for key, value in values.items() if key != "kind"}
+    kind = values.get("kind", label)
+    estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
+    by_model = estimator.parameters_by_model(label, variant)
+    if model is not None and by_model and model not in by_model:
+        raise BadInput(f"estimator {label}: no model '{model}'; {choices(model, by_model)}")
+    if not by_model:
+        parameters = estimator.parameters_with(label, variant)
+        return [Entry(label, estimator.summary, parameters=parameters, values=own | variant)]
+    models = registered_models()
+    return [
+        Entry(f"{label}{OF_MODEL}{each}", "", {}, parameters, own | variant, stated_of(models[each]))
+        for each, parameters in by_model.items()
+        if model in (None, each)
+    ]
+
+
+def _experiment(options: Mapping[str, Any]) -> Iterator[Entries]:
+    """An experiment's own, its study's, its scenario's or importer's, and those of its estimators."""
+    named, labels = options["experiment"], options["labels"]
+    logs = [Path(each) for each in named if each.endswith(".mcap")]
+    stated = experiment_of_logs(logs, labels) if logs else read_experiment(named[0])
+    experiment = stated.with_settings({}, {})
+    study = load("studies", experiment.study, Study)
+    yield [Entry(stated.name, "", parameters=Experiment, values=stated.values)]
+    own, values = study.options, experiment.options
+    yield [Entry(experiment.study, "", parameters=own, values=values, prefix="options.")]
+    if experiment.import_:
+        source = experiment.import_
+        yield [_of_recorder(source.source, source.parameters)]
+    elif experiment.record:
+        name, values, _ = load_scenario(experiment.record.scenario)
+        yield [_of_recorder(name, values | experiment.record.parameters)]
+    yield from _by_label(experiment.estimators)
+
+
+def _constraints(_: Mapping[str, Any]) -> Iterator[Entries]:
+    yield [Entry("constrain", "", parameters=ConstraintParameters)]
+
+
+def _observability(options: Mapping[str, Any]) -> Iterator[Entries]:
+    yield _of_estimator("observability", {"kind": OBSERVABILITY}, options["model"])
+
+
+TAKERS: Mapping[str, Callable[[Mapping[str, Any]], Iterator[Entries]]] = {
+    "recorder": _recorder,
+    "estimators": _estimators,
+    "experiment": _experiment,
+    "constraints": _constraints,
+    "observability": _observability,
+}
