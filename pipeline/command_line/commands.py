@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.output.coverage import sentences
+from pipeline.output.coverage import recounted, sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.output.results import (
     ErrorTables,
@@ -210,6 +210,7 @@ def evaluate_logs(
                 f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
                 "give its log with --log"
             )
+        coverage = recounted([LogSource(each) for each in opened], sources, estimators, judge.doubts)
         if folder is not None:
             settings = {
                 "title": f"estimates of {sources[0].name}",
@@ -220,15 +221,22 @@ def evaluate_logs(
                 "metrics": list(metrics),
                 **comparison,
             }
-            outcome = summarise(judge)
+            outcome = summarise(judge, coverage)
             outcome.metrics.update(compared.metrics)
             outcome.tables["summary"] = summary_table(outcome.metrics)
             outcome.figures.update(compared.figures)
             outcome.input_sha256 = hash_files([*estimates, *places])
             write_outcome(folder, "evaluate", settings, outcome)
     _state_losses([*opened, *(source.log for source in sources)])
-    written = [out] if out else []
-    _print_outcome(judge, estimators, as_json=as_json, written=written, more=compared.metrics)
+    _print_outcome(
+        judge,
+        estimators,
+        as_json=as_json,
+        written=[out] if out else [],
+        told={"coverage": [row._asdict() for row in coverage]},
+        more=compared.metrics,
+        unused=sentences(coverage),
+    )
 
 
 def evaluate_trajectory(
@@ -315,7 +323,7 @@ def _print_outcome(
         )
     for sentence in [*judge.losses, *unused]:
         say(sentence)
-    if told:
+    if told and "seconds" in told:
         print_table(("estimator", "time (s)"), list(told["seconds"].items()))
     for path in written:
         say(str(path))

@@ -66,6 +66,7 @@ def compare_sides(
                 "differences": found.table.replace({np.nan: None}).to_dict("records"),
                 "sentences": found.sentences,
                 "notes": found.notes,
+                "coverage": [row._asdict() for row in found.coverage],
                 "written": [str(path) for path in written],
             }
         )

@@ -15,12 +15,14 @@ from pipeline.api.replays import Kind
 from pipeline.comparing.groups import comparable_groups, runs_of, sides_of, unlike_runs
 from pipeline.comparing.sides import Side
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
+from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.runs.ensemble import Progress, judge_logs, no_progress
 from pipeline.runs.estimates import hash_files
 from recorders.errors import BadInput
 from recorders.log import RunMetadata
+from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.differences import (
     FEWEST_RUNS,
@@ -149,8 +151,10 @@ class Differences:
             raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
         source = sides[0].pairs[first][0]
-        of_sides = (side.estimates(first).streams.items() for side in sides)
-        streams = {topic: stream for streams in of_sides for topic, stream in streams}
+        of_sides = (side.estimates(first) for side in sides)
+        streams = {
+            topic: stream for own in of_sides for topic, stream in own.read([*own.topics]).items()
+        }
         run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
         estimates = MemorySource(streams, run, source.name)
         names = [side.name for side in sides]
@@ -168,6 +172,8 @@ class Differences:
         check_folder(place, {"input": inputs})
         names = [[side.name for side in sides] for sides in self.groups]
         outcome = Outcome(tables={"differences": self.table}, figures=dict(self.charts()))
+        if self.coverage:
+            outcome.tables["coverage"] = coverage_table(self.coverage)
         if len(self.times):
             outcome.tables["times"] = self.times
         for each in self.paired:
@@ -184,6 +190,11 @@ class Differences:
             if self.drawable:
                 self.draw(part / "timeline.rrd")
             return ResultFolder(place, write_outcome(part, "compare", settings, outcome))
+
+    @cached_property
+    def coverage(self) -> list[Row]:
+        """What became of every topic, by side."""
+        return [row for sides in self.groups for side in sides for row in side.coverage]
 
     @property
     def drawable(self) -> list[str]:
@@ -265,6 +276,7 @@ def compare(
             times.append(over_time)
     filled = [each for each in times if len(each)]
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+    notes += sentences([row for group in groups for side in group for row in side.coverage])
     return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table)
 
 

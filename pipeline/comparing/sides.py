@@ -15,6 +15,8 @@ import numpy as np
 import pandas as pd
 
 from pipeline.api.replays import Replay, replay
+from pipeline.comparing.renamed import Renamed
+from pipeline.output.coverage import recounted, rows_of_side, stored_rows
 from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
 from pipeline.runs.ensemble import Progress, judge_logs, parts_of
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
@@ -26,9 +28,12 @@ from recorders.log import RunMetadata, open_log
 from recorders.parameters import build
 from recorders.trajectories import read_trajectory
 from replay.engine.replaying.estimator import configure
+from replay.engine.replaying.replaying import BLOCK_MESSAGES
+from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.errors.evaluation import POSITION, split_topic
 from replay.judging.errors.trajectory_streams import estimates_of
+from replay.judging.errors.truths import Doubt
 from replay.judging.metrics.measuring import find_metrics
 from replay.judging.metrics.metrics import rmse_of
 from replay.judging.tables import joined
@@ -57,6 +62,8 @@ class Side:
         pairs: by run, those that can be drawn: the log, and the estimates.
         notes: sentences on where it comes from.
         replay: what the files of `pairs` go with.
+        doubts: about truths, by topic.
+        coverage: what became of every topic.
     """
 
     name: str
@@ -69,10 +76,12 @@ class Side:
     pairs: Pairs = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     replay: Replay | None = None
+    doubts: Mapping[str, Doubt] = field(default_factory=dict)
+    coverage: Sequence[Row] = ()
 
-    def estimates(self, run: str) -> MemorySource:
+    def estimates(self, run: str) -> Renamed:
         """The estimates of a run that can be drawn, under this side's name."""
-        return renamed(self.pairs[run][1], self.label, self.name)
+        return Renamed(self.pairs[run][1], self.label, self.name)
 
 
 @dataclass(frozen=True)
@@ -101,8 +110,9 @@ def measured(
     times: list[pd.DataFrame] = []
     sizes: dict[tuple[str, str], float] = {}
     truths: dict[str, str] = {}
+    doubts: dict[str, Doubt] = {}
     for run, (source, estimates) in pairs.items():
-        own = renamed(estimates, label, name)
+        own = Renamed(estimates, label, name)
         judge = judge_logs([own], [source], metrics, gap_limit_s=gap_limit_s)
         for key, value in judge.metrics.items():
             _, quantity, case = split_metric(key)
@@ -111,31 +121,23 @@ def measured(
         for errors in judge.judged.values():
             sizes["nees", errors.case] = float(len(errors.components))
             sizes["position_nees", errors.case] = float(len(errors.position))
+        doubts = judge.doubts | doubts
         truths[run] = _hash_of_truth(source, own)
     values = pd.DataFrame(rows, columns=["run", "case", "quantity", "value"])
-    return Side(name, label, values, joined(times), sizes, settings, truths, pairs)
+    return Side(name, label, values, joined(times), sizes, settings, truths, pairs, doubts=doubts)
 
 
-def renamed(estimates: Source, label: str, name: str) -> MemorySource:
-    """The estimates of one label alone, under another name."""
-    before = f"/estimates/{label}/"
-    streams = estimates.read([topic for topic in estimates.topics if topic.startswith(before)])
-    of_name = {
-        f"/estimates/{name}/{topic.removeprefix(before)}": stream for topic, stream in streams.items()
-    }
-    run = estimates.run or RunMetadata("unknown", epoch_ns=estimates.epoch_ns)
-    placed = {topic: replace(stream, topic=topic) for topic, stream in of_name.items()}
-    return MemorySource(placed, run, estimates.name)
-
-
-def _hash_of_truth(source: Source, estimates: MemorySource) -> str:
-    digest = hashlib.sha256()
-    named = {stream.metadata.get("truth", "") for stream in estimates.streams.values()}
+def _hash_of_truth(source: Source, estimates: Source) -> str:
+    """A hash of what estimates are judged by, however it is cut into blocks."""
+    named = {topic.metadata.get("truth", "") for topic in estimates.topics.values()}
+    digests: list[str] = []
     for topic in sorted(named & source.topics.keys()):
-        truth = source.read([topic])[topic]
-        for array in (truth.publish_time_ns, truth["state"]):
-            digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
+        times, states = hashlib.sha256(), hashlib.sha256()
+        for block in source.whole().blocks([topic], "publish_time", BLOCK_MESSAGES):
+            times.update(np.ascontiguousarray(block[topic].publish_time_ns).data)
+            states.update(np.ascontiguousarray(block[topic]["state"]).data)
+        digests += [times.hexdigest(), states.hexdigest()]
+    return "".join(digests)
 
 
 def key_of(source: Source) -> str:
@@ -190,7 +192,8 @@ def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
 
     def side(label: str, name: str) -> Side:
         settings = settings_of(done.logs[0], label, stated.get(label, {}))
-        return replace(measured(name, label, pairs, gap_limit_s, settings), replay=done)
+        found = measured(name, label, pairs, gap_limit_s, settings)
+        return replace(found, replay=done, coverage=rows_of_side(done.done.coverage, label, name))
 
     return Given(name, list(done.settings), side, {run: log for run, (log, _) in pairs.items()})
 
@@ -206,7 +209,7 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
             f"{path}: has no estimates logs (*.mcap), and is not a result of fuselog run; give one of "
             "these"
         )
-    pairs: dict[str, tuple[Source, Source]] = {}
+    pairs: dict[str, tuple[LogSource, LogSource]] = {}
     for file in files:
         log = open_log(file, recover=recover)
         if not labels_of(LogSource(log)):
@@ -224,9 +227,11 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
 
     def side(label: str, name: str) -> Side:
         own = {run: pair for run, pair in pairs.items() if label in labels_of(pair[1])}
-        return measured(
-            name, label, own, gap_limit_s, settings_of(log_of_first, label, stated.get(label, {}))
-        )
+        settings = settings_of(log_of_first, label, stated.get(label, {}))
+        found = measured(name, label, own, gap_limit_s, settings)
+        logs, estimates = zip(*own.values(), strict=True)
+        counted = recounted(estimates, logs, {label: stated.get(label, {})}, found.doubts)
+        return replace(found, coverage=rows_of_side(counted, label, name))
 
     return Given(name_of(path), labels_of(first), side, {run: log for run, (log, _) in pairs.items()})
 
@@ -258,10 +263,12 @@ def of_result(folder: Path, progress: Progress) -> Given:
 
     def side(label: str, name: str) -> Side:
         kept = _stored(rows, times, label, name, _settings_of_result(result, label, stated))
+        kept = replace(kept, coverage=rows_of_side(stored_rows(folder), label, name))
         try:
             again = _replayed(folder, result, progress, kept)
         except BadInput as error:
             return replace(kept, notes=(_without_replay(folder, str(error)),))
+        again = replace(again, coverage=kept.coverage)
         difference = _row_that_differs(kept, again)
         return replace(kept, notes=(_without_replay(folder, difference),)) if difference else again
 

@@ -27,6 +27,7 @@ from pipeline.diagnosing.findings import (
 )
 from pipeline.diagnosing.hypotheses import Kind, hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.diagnosing.outputs import Outputs
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
@@ -34,7 +35,8 @@ from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
 from recorders.errors import BadInput, choices
-from recorders.log import RunMetadata, Schema, Stream, schemas
+from recorders.log import RunMetadata, Stream, schemas
+from recorders.log.streams import concatenate
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.streams.failures import reason_stream
@@ -124,7 +126,7 @@ class Diagnosis:
     def profiles(self) -> dict[str, Chart]:
         """NIS per component over time, by case."""
         charts: dict[str, Chart] = {}
-        for stream in _outputs(self.replay, schemas.INNOVATION).values():
+        for stream in Outputs(self.replay, schemas.INNOVATION).values():
             case = split_topic(stream.topic)[1]
             nis = stream["normalised_innovation_squared"]
             degrees = np.isfinite(stream["innovation"]).sum(axis=1)
@@ -251,9 +253,7 @@ def diagnose(
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
-    innovations, estimates = (
-        _outputs(done, schema) for schema in (schemas.INNOVATION, schemas.GAUSSIAN_ESTIMATE)
-    )
+    innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
         raise BadInput(
             f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
@@ -265,7 +265,7 @@ def diagnose(
     notes = []
     causes: list[Cause] = []
     tried, least = 0, np.inf
-    if all("log_likelihood" in stream.columns for stream in innovations.values()):
+    if innovations.state("log_likelihood"):
         opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
         likelihood = Likelihood(label)
         part, note = _first_part(source, bound, streamed)
@@ -283,8 +283,8 @@ def diagnose(
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
-        *of_messages([source.read([topic])[topic] for topic in streamed], source.epoch_ns),
-        *of_estimates(estimates),
+        *of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns),
+        *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(_of_errors(done, label) if not causes else []),
     ]
     sentences += [Sentence(*each) for each in findings]
@@ -321,29 +321,31 @@ def _asked(
     return source, chosen
 
 
-def _outputs(done: Replay, schema: Schema) -> dict[str, Stream]:
-    """The outputs of a replay that have a schema, by topic."""
-    estimates = done.estimates[0]
-    names = [name for name, topic in estimates.topics.items() if topic.schema_name == schema.full_name]
-    found = estimates.read(names) if names else {}
-    return {name: stream for name, stream in found.items() if len(stream)}
-
-
 def _first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> tuple[MemorySource, list[str]]:
     """What the estimator reads of a log, of a long one its first MOST_MESSAGES, in memory."""
-    topics = dict.fromkeys([*streamed, *(topic for each in bound for topic in each.static)])
-    streams = source.read([topic for topic in topics if topic in source.topics])
-    stamps_ns = np.concatenate([streams[topic].publish_time_ns for topic in streamed])
+    whole = dict.fromkeys(topic for each in bound for topic in each.static)
+    streams = source.read([topic for topic in whole if topic in source.topics])
+    parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
+    stamps_ns = np.empty(0, np.int64)
+    for block in source.blocks(streamed, "publish_time", MOST_MESSAGES):
+        for topic, stream in block.items():
+            parts[topic].append(stream)
+        stamps_ns = np.concatenate([stamps_ns, *(stream.publish_time_ns for stream in block.values())])
+        if len(stamps_ns) > MOST_MESSAGES:
+            break
+    for topic, found in parts.items():
+        streams[topic] = concatenate(found) if found else source.empty(topic)
     notes = []
     if len(stamps_ns) > MOST_MESSAGES:
         end_ns = np.partition(stamps_ns, MOST_MESSAGES)[MOST_MESSAGES]
         for topic in streamed:
             streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
+        count = sum(source.topics[topic].messages for topic in streamed)
         notes.append(
             f"causes were sought in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
-            f"{MOST_MESSAGES} of {len(stamps_ns)} messages; all else is of the whole log. For another "
+            f"{MOST_MESSAGES} of {count} messages; all else is of the whole log. For another "
             "part: fuselog cut"
         )
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)

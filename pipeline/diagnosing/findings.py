@@ -3,7 +3,7 @@
 Thresholds are far from what chance does to a log that is as its model says; each is beside its name.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -144,7 +144,7 @@ def _long_runs(flags: NDArray[np.bool_], least: int) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= least]
 
 
-def of_messages(streams: Sequence[Stream], epoch_ns: int) -> Iterator[Finding]:
+def of_messages(streams: Iterable[Stream], epoch_ns: int) -> Iterator[Finding]:
     """Lost, repeated and late messages, values that saturate or are coarse."""
     for stream in streams:
         if len(stream) >= FEWEST:

@@ -10,21 +10,24 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from scipy.spatial.transform import Rotation
 
+from recorders.extras import extra
 from recorders.log import Companion, Stream, schemas
 from replay.engine.streams.measurements import PLANE, covariances_of
 from replay.judging.errors.evaluation import Floats
 from replay.judging.errors.trajectory_streams import trajectory_of
 from replay.timeline.drawing.canvas import PALETTE, TRUTH
 from replay.timeline.drawing.plane import ellipses
+
+with extra("foxglove", "messages of Foxglove"):
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+    from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+    from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 # The log's own frame has no name; viewers want one.
 WORLD = "map"

@@ -1,20 +1,40 @@
 """The table `coverage`: what became of every topic of a log; nothing is unused in silence."""
 
+import json
+import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from replay.engine.replaying.usage import CONTROLS, LANDMARK, TRUTH, Row, Usage
-from replay.engine.streams.sources import Source, is_sensed
+from pipeline.output.results import read_table
+from recorders.errors import BadInput
+from recorders.log import Clock
+from recorders.parsing import parse_json
+from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.replaying import BLOCK_MESSAGES
+from replay.engine.replaying.usage import CONTROLS, INNOVATION, LANDMARK, SKIPPED, TRUTH, Row, Usage
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import LogSource, Source, is_sensed
+from replay.judging.errors.truths import Doubt
 
 if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = [*Row._fields]
 UNTAKEN = "the estimator does not take this topic"
+# An estimates log's note on the span and the clock of its replay, unless it is all by publish time.
+REPLAYED = "replayed"
 
 
-def untaken(source: Source, labels: Iterable[str], bound: Iterable[Any]) -> list[Row]:
-    """The topics of a log that an estimator does not take at all; truth, maps and controls are none."""
+def untaken(
+    sources: Sequence[Source], labels: Iterable[str], bound: Iterable[Bound], order: Clock
+) -> list[Row]:
+    """The topics that an estimator does not take at all, in the replayed spans of all logs.
+
+    Truths, maps and controls are none.
+    """
     taken: dict[str, set[str]] = {label: set() for label in labels}
     for each in bound:
         initialization = getattr(each, "initialization", None)
@@ -25,25 +45,182 @@ def untaken(source: Source, labels: Iterable[str], bound: Iterable[Any]) -> list
             *(initialization.topics if initialization else ()),
         }
         taken.setdefault(each.name.partition("/")[0], set()).update(own)
-    rows = []
-    for name, topic in source.topics.items():
-        if topic.schema_name in (*CONTROLS, LANDMARK, TRUTH) or not topic.messages:
-            continue
-        if name.endswith("/prior") or not is_sensed(source, name):
-            continue
-        rows += [
-            Row(label, name, topic.messages, 0, 0, 0, UNTAKEN)
-            for label, own in taken.items()
-            if name not in own
-        ]
-    return rows
+    messages: Counter[str] = Counter()
+    for source in sources:
+        for name, topic in source.topics.items():
+            if topic.schema_name in (*CONTROLS, LANDMARK, TRUTH) or name.endswith("/prior"):
+                continue
+            if all(name in own for own in taken.values()) or not topic.messages:
+                continue
+            if is_sensed(source, name):
+                messages[name] += _messages(source, name, order)
+    return [
+        Row(label, name, count, 0, 0, 0, UNTAKEN)
+        for name, count in messages.items()
+        for label, own in taken.items()
+        if count and name not in own
+    ]
 
 
-def rows_of(usages: Mapping[str, Usage], others: Sequence[Row]) -> list[Row]:
-    """All lines, by estimator and topic; of a topic that is not taken in any run."""
+def _messages(source: Source, topic: str, order: Clock) -> int:
+    """How many messages of a topic lie in the source's span."""
+    if source.start_ns is None and getattr(source, "end_ns", None) is None:
+        return source.topics[topic].messages
+    return sum(len(block[topic]) for block in source.blocks([topic], order, BLOCK_MESSAGES))
+
+
+def recounted(
+    estimates: Sequence[LogSource],
+    sources: Sequence[LogSource],
+    stated: Mapping[str, Any],
+    doubts: Mapping[str, Doubt],
+) -> list[Row]:
+    """The same table from estimates logs and the logs that they are of, as their replay counted it.
+
+    `stated` are the estimators' settings by label, `doubts` those about truths. What cannot be bound
+    here says so in its row.
+    """
+    rows: list[Row] = []
+    bound: list[Bound] = []
+    spans = [_replayed(each, source) for each, source in zip(estimates, sources, strict=True)]
+    for label, settings in stated.items():
+        try:
+            bound += bind(label, sources, settings)
+        except BadInput as error:
+            rows.append(Row(label, "all topics", 0, None, None, 0, f"they are not counted: {error}"))
+    usages: dict[str, Usage] = {}
+    for each, (source, order) in zip(estimates, spans, strict=True):
+        for name, usage in _recounted(each, source, order, bound).items():
+            if name in usages:
+                usages[name].merge(usage)
+            else:
+                usages[name] = usage
+    labels = dict.fromkeys(each.name.partition("/")[0] for each in bound)
+    orders = {order for _, order in spans}
+    if len(orders) == 1:
+        rows += untaken([source for source, _ in spans], labels, bound, orders.pop())
+    return rows_of(usages, rows, doubts)
+
+
+def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock]:
+    """The span of a log that estimates are of, and the clock that they go by."""
+    notes = estimates.run.notes if estimates.run else {}
+    start_ns, end_ns, order = _noted(notes.get(REPLAYED, ""))
+    return replace(source, start_ns=start_ns, end_ns=end_ns), order
+
+
+def replayed_note(source: Source, order: Clock) -> dict[str, str]:
+    """The note REPLAYED of a source's estimates; none where it was replayed whole, by publish time."""
+    ends = source.start_ns, getattr(source, "end_ns", None)
+    said = json.dumps([*ends, order])
+    return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: said}
+
+
+def _noted(note: str) -> tuple[int | None, int | None, Clock]:
+    try:
+        start_ns, end_ns, order = parse_json(note)
+    except (ValueError, TypeError):
+        return None, None, "publish_time"
+    ends = [
+        each if isinstance(each, int) and abs(each) < 1 << 63 else None for each in (start_ns, end_ns)
+    ]
+    return ends[0], ends[1], "log_time" if order == "log_time" else "publish_time"
+
+
+def _recounted(
+    estimates: LogSource, source: LogSource, order: Clock, bound: Sequence[Bound]
+) -> dict[str, Usage]:
+    """One run's counts by bound estimator: its messages, and what was said up to their last."""
+    usages = {each.name: Usage(each.name) for each in bound}
+    maps = {
+        topic: gather([source.read([topic])[topic]])
+        for topic in {topic for each in bound for topic in each.static}
+        if topic in source.topics and source.topics[topic].schema_name == LANDMARK
+    }
+    own_maps = {
+        each.name: {topic: maps[topic] for topic in each.static if topic in maps} for each in bound
+    }
+    for name, usage in usages.items():
+        usage.note_start(own_maps[name])
+    streamed = sorted({topic for each in bound for topic in each.streams})
+    empty = {topic: source.empty(topic) for topic in streamed}
+    told = [
+        topic
+        for topic, about in estimates.topics.items()
+        if about.schema_name in (INNOVATION, SKIPPED) and topic.rpartition("/")[0] in _places(bound)
+    ]
+    for topic in told:  # that it has innovations is said by a topic without messages too
+        usages[_places(bound)[topic.rpartition("/")[0]]].note_outputs([gather([estimates.empty(topic)])])
+    outputs = estimates.blocks(told, "publish_time", BLOCK_MESSAGES) if told else iter(())
+    inputs = source.blocks(streamed, order, BLOCK_MESSAGES) if streamed else iter(())
+    reached_ns = -1
+
+    def read_up_to(time_ns: float) -> None:
+        nonlocal reached_ns
+        while reached_ns < time_ns:
+            block = next(inputs, None)
+            if block is None:
+                return
+            reached_ns = max(int(each.times(order)[-1]) for each in block.values())
+            streams = {topic: gather([block.get(topic, empty[topic])]) for topic in streamed}
+            for each in bound:
+                given = {topic: streams[topic] for topic in each.streams}
+                usages[each.name].note_given(given, own_maps[each.name], order)
+
+    for block in outputs:
+        read_up_to(max(int(each.publish_time_ns[-1]) for each in block.values()))
+        for topic, stream in block.items():
+            usages[_places(bound)[topic.rpartition("/")[0]]].note_outputs([gather([stream])])
+    read_up_to(math.inf)
+    for usage in usages.values():
+        usage.shares.end()
+    return usages
+
+
+def _places(bound: Iterable[Bound]) -> dict[str, str]:
+    """The names of bound estimators by what their topics begin with."""
+    return {f"/estimates/{each.name}": each.name for each in bound}
+
+
+def rows_of(
+    usages: Mapping[str, Usage], others: Sequence[Row], doubts: Mapping[str, Doubt] | None = None
+) -> list[Row]:
+    """All lines, by estimator and topic: what was counted, other topics, and doubtful truths."""
     rows = [row for usage in usages.values() for row in usage.rows()]
     there = {(row.estimator, row.topic) for row in rows}
-    return [*rows, *(row for row in others if (row.estimator, row.topic) not in there)]
+    rows += [row for row in others if (row.estimator, row.topic) not in there]
+    labels = dict.fromkeys(name.partition("/")[0] for name in usages)
+    doubtful = [
+        Row(label, topic, doubt.messages, None, None, 0, doubt.why)
+        for label in labels
+        for topic, doubt in (doubts or {}).items()
+    ]
+    return [*rows, *doubtful]
+
+
+def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
+    """Lines on topics that are not taken, over runs and further ones."""
+    counts = {(row.estimator, row.topic): row for row in rows}
+    for row in more:
+        before = counts.get((row.estimator, row.topic))
+        counts[row.estimator, row.topic] = (
+            row if before is None else row._replace(messages=row.messages + before.messages)
+        )
+    return list(counts.values())
+
+
+def stored_rows(folder: Path) -> list[Row]:
+    """The table `coverage` of a result; older ones have none."""
+    path = folder / "tables" / "coverage.parquet"
+    if not path.is_file():
+        return []
+    table = read_table(path).astype(object)
+    return [Row(*row) for row in table.where(table.notna(), None)[[*Row._fields]].to_numpy().tolist()]
+
+
+def rows_of_side(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
+    """The lines of one estimator, under a side's name."""
+    return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 
 def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":

@@ -13,7 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pipeline.output.coverage import rows_of, untaken
+from pipeline.output.coverage import added, replayed_note, rows_of, untaken
 from pipeline.runs.initial_states import Origin, start_from
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, LogWriter, RunMetadata
@@ -90,7 +90,7 @@ class Pass:
         parameters: of every estimator, defaults included, by label.
         stated: those that are not given, as the first log's channels state them; see `stated_of`.
         usages: what became of the measurements, by bound estimator.
-        untaken: topics of the first log that estimators do not take.
+        untaken: topics that estimators do not take.
         seconds: that each estimator took, by label.
         refused: by estimator, why none of the runs can be replayed.
         input_sha256: a hash of the data that went in, where it was asked for.
@@ -108,7 +108,7 @@ class Pass:
     @property
     def coverage(self) -> list[Row]:
         """What became of every topic."""
-        return rows_of(self.usages, self.untaken)
+        return rows_of(self.usages, self.untaken, self.judge.doubts)
 
     def merge(self, other: "Pass") -> None:
         """Take in what a pass over later runs left."""
@@ -119,6 +119,7 @@ class Pass:
                 self.usages[name].merge(usage)
             else:
                 self.usages[name] = usage
+        self.untaken = added(self.untaken, other.untaken)
         self.refused = {name: why for name, why in self.refused.items() if name in other.refused}
 
     def check(self) -> "Pass":
@@ -181,7 +182,7 @@ def replay_parts(
                 stack.enter_context(
                     LogWriter(
                         path,
-                        estimates_metadata(source, estimators, path, log),
+                        estimates_metadata(source, estimators, path, log, order),
                         companions=companions,
                     )
                 )
@@ -218,7 +219,8 @@ def replay_parts(
         judge.close()
         done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
         done.stated = stated_of(bound, part.sources[0])
-        done.usages, done.untaken = report.usages, untaken(part.sources[0], estimators, bound)
+        done.usages = report.usages
+        done.untaken = untaken(part.sources, estimators, bound, order)
         if passes:
             passes[0].merge(done)
         else:
@@ -364,12 +366,15 @@ def judge_logs(
     return whole
 
 
-def estimates_metadata(source: Source, estimators: Settings, path: Path, log: Path) -> RunMetadata:
-    """What the estimates log at `path` says of itself: the run that it is of, the estimators, its log.
+def estimates_metadata(
+    source: Source, estimators: Settings, path: Path, log: Path, order: Clock = "publish_time"
+) -> RunMetadata:
+    """What the estimates log at `path` says of itself: its run, estimators, span, clock and log.
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath(log.resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()}, default=str)
-    return replace(run, notes={"log": place, "estimators": settings})
+    notes = {"log": place, "estimators": settings, **replayed_note(source, order)}
+    return replace(run, notes=notes)

@@ -89,14 +89,16 @@ class Runner:
         folder: str = "",
         *,
         drawn: str | None = "",
+        first_run: int = 0,
     ) -> None:
         """Write logs and estimates of the first runs to a folder, and the first timeline to another.
 
         `drawn` is None where no timeline is wanted. The other runs can be recorded again from the seed.
+        `first_run` is the number of the first of these, where they are a part of all.
         """
-        count = min(self.setting.logs, len(sources))
-        for run in self.setting.progress(range(count), "writing logs", count):
-            log, estimates = self._places(folder, run)
+        count = max(0, min(self.setting.logs - first_run, len(sources)))
+        for run in self.setting.progress(range(count), "writing logs", count) if count else ():
+            log, estimates = self._places(folder, first_run + run)
             _write_log(sources[run], log)
             metadata = estimates_metadata(sources[run], self.experiment.estimators, estimates, log)
             with LogWriter(estimates, metadata) as writer:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
 from recorders.errors import BadInput
+from recorders.extras import extra
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import require_unit
 from recorders.parameters import Parameters
@@ -88,7 +89,8 @@ def _trial(file: Path, parameters: BroadParameters, notes: dict[str, str]) -> li
 
 def _datasets(file: Path) -> tuple[dict[str, NDArray], float]:
     """The datasets of one file, all of one length, and the sampling rate."""
-    import h5py  # which takes long to import
+    with extra("papers", f"{file}, a file of HDF5"):
+        import h5py  # which takes long to import
 
     try:
         with h5py.File(file) as content:

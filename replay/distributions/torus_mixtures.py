@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import i0e, i1e, log_softmax, logsumexp
-from sklearn.cluster import KMeans
 
 from recorders.errors import BadInput
+from recorders.extras import extra
 from recorders.models.planar import wrap_angle
 from replay.engine.arrays import Floats
 
@@ -76,6 +76,9 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
             f"{len(angles)} pairs of angles for {components} components; give at least 10 for each"
         )
     embedded = np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+    with extra("papers", "a mixture on the torus"):
+        from sklearn.cluster import KMeans  # which takes long to import
+
     labels = KMeans(components, n_init=10, random_state=0).fit_predict(embedded)
     share = np.eye(components)[labels]
     mean = np.angle(share.T @ np.exp(1j * angles))

@@ -27,16 +27,20 @@ _BEYOND = 0.00025803248765390125
 
 
 def run_key(seed: int, first: Iterable[NDArray]) -> Words:
-    """A run's own key (2,): of a seed and its first data.
+    """Return a run's own key (2,): of a seed and its first data.
 
     So its numbers are the same on any number of cores, and whatever other runs there are.
+
+    Args:
+        seed: the parameter.
+        first: arrays of the run's first data.
     """
     words = [str(seed).encode(), *(part.tobytes() for part in first)]
     return np.frombuffer(sha256(b" ".join(words)).digest()[:16], np.uint64)
 
 
 def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
-    """The upper 64 bits of a product of 128."""
+    """Return the upper 64 bits of a product of 128."""
     low, half = np.uint64(0xFFFFFFFF), np.uint64(32)
     a_low, a_high, b_low, b_high = a & low, a >> half, b & low, b >> half
     first = a_high * b_low + ((a_low * b_low) >> half)
@@ -45,7 +49,12 @@ def high_word(a: np.uint64, b: np.uint64) -> np.uint64:
 
 
 def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """The block of four words with this number."""
+    """Return the block of four words with this number.
+
+    Args:
+        counter: the number of the block.
+        key: (2,) of the run.
+    """
     a, b, c, d = np.uint64(counter), np.uint64(0), np.uint64(0), np.uint64(0)
     k0, k1 = key[0], key[1]
     m0, m1 = np.uint64(_MULTIPLIERS[0]), np.uint64(_MULTIPLIERS[1])
@@ -57,7 +66,7 @@ def philox(counter: int, key: Words) -> tuple[np.uint64, np.uint64, np.uint64, n
 
 
 def unit(word: np.uint64) -> float:
-    """A number from the middles of 2^53 pieces of (0, 1): neither 0 nor 1."""
+    """Return a number from the middles of 2^53 pieces of (0, 1): neither 0 nor 1."""
     return (float(word >> np.uint64(11)) + 0.5) * _UNIT
 
 
@@ -103,13 +112,13 @@ def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int
 
 
 def layer_of(word: np.uint64) -> tuple[int, float, float]:
-    """A layer of the ziggurat, how far to its right end, and a sign."""
+    """Return a layer of the ziggurat, how far to its right end, and a sign."""
     layer = int(word & np.uint64(_LAYERS - 1))
     return layer, unit(word), 1.0 if word & np.uint64(_LAYERS) else -1.0
 
 
 def settled(layer: int, share: float, sign: float, key: Words, counter: int) -> tuple[float, int]:
-    """The draw of a layer beyond what lies inside for certain, and the counter after it."""
+    """Return the draw of a layer beyond what lies inside for certain, and the counter after it."""
     while True:
         counter += 1
         a, b, c, _ = philox(counter, key)

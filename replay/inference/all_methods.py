@@ -25,7 +25,7 @@ METHODS: Mapping[str, Method] = {
 
 
 def modelled(model: Model, method: str) -> Estimator[Any]:
-    """The estimator of the state of one model by one method, named as on the command line.
+    """Make the estimator of the state of one model by one method, named as on the command line.
 
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 

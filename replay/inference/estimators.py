@@ -47,7 +47,7 @@ from replay.inference.run.out_of_sequence import OutOfSequenceFilter
 
 @lru_cache(maxsize=256)
 def combined(model: Model, method: Method) -> type[ModelParameters]:
-    """The parameters of a model and of a method, in one type."""
+    """Return the parameters of a model and of a method, in one type."""
     name = f"{model.parameters.__name__}With{method.parameters.__name__}"
     return _created(name, (method.parameters, model.parameters))
 
@@ -55,13 +55,13 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
 ) -> type[Any]:
-    """A type of parameters; it has no text of its own in which their meanings could be looked for."""
+    """Make a type of parameters, without a text of its own in which meanings could be looked for."""
     says_nothing = {"use_attribute_docstrings": False}
     return create_model(name, __base__=bases, __cls_kwargs__=says_nothing, **(fields or {}))
 
 
 def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> type[ModelParameters]:
-    """A type of parameters with other defaults for some of them."""
+    """Make a type of parameters with other defaults for some of them."""
     fields: Any = {}
     for name, value in defaults.items():
         field = kind.model_fields[name]
@@ -70,7 +70,7 @@ def _with_defaults(kind: type[ModelParameters], defaults: Mapping[str, Any]) -> 
 
 
 def _accepted(field: FieldInfo) -> Any:
-    """What a parameter accepts: its type with its bounds."""
+    """Return what a parameter accepts: its type with its bounds."""
     bounds = tuple(field.metadata)
     return Annotated[(field.annotation, *bounds)] if bounds else field.annotation
 
@@ -78,7 +78,7 @@ def _accepted(field: FieldInfo) -> Any:
 def modelled_by(
     model: Model, method: Method, name: str, settings: Mapping[str, Any] | None = None
 ) -> Estimator[Any]:
-    """The estimator of one model by a method of that name; `settings` are its own defaults.
+    """Make the estimator of one model by a method of that name; `settings` are its own defaults.
 
     Raises BadInput where the method cannot be set so, or the model lacks what it needs then.
     """
@@ -101,12 +101,12 @@ def modelled_by(
 
 
 def of_any_model(method: Method) -> Estimator[Any]:
-    """The estimator that estimates, by one method, the state of the registered model that fits a log."""
+    """Make the estimator that estimates, by one method, the registered model that fits a log."""
     return _OfAnyModel(method)
 
 
 class _OfAnyModel(Estimator[Any]):
-    """What it needs and its parameters follow from all models; they are made when they are asked for."""
+    """Makes its requirements and parameters from all models when they are asked for."""
 
     def __init__(self, method: Method) -> None:
         vars(self).update(
@@ -118,19 +118,19 @@ class _OfAnyModel(Estimator[Any]):
 
     @cached_property
     def requirements(self) -> str:
-        """What a log must have."""
+        """Return what a log must have."""
         return " or ".join(
             f"({name}) {requirements_of(model)}" for name, model in registered_models().items()
         )
 
     @cached_property
     def parameters(self) -> type[Parameters]:
-        """Those of all models, and of the method."""
+        """Return those of all models, and of the method."""
         return _any_parameters(vars(self)["_method"])
 
 
 def registered_models() -> dict[str, Model]:
-    """The models by name; one that does not load is left out, and says why where it is named."""
+    """Return the models by name; one that does not load is left out, and says why where it is named."""
     found = {}
     for name in available("models"):
         with suppress(BadInput):
@@ -140,9 +140,9 @@ def registered_models() -> dict[str, Model]:
 
 @lru_cache(maxsize=16)
 def _any_parameters(method: Method) -> type[Parameters]:
-    """All parameters of all models, none of them set, with those of a method and the model's name.
+    """Collect all parameters of all models, none of them set, with a method's and the model's name.
 
-    What one model wants of a parameter is checked when the log has told which model it is.
+    What one model wants of a parameter is checked when it is known which model fits the log.
     """
     fields: dict[str, Any] = {"model": (str | None, None)}
     for model in registered_models().values():
@@ -169,11 +169,11 @@ def _bind_fitting(
     if named is not None:
         models = {named: load("models", named, Model)}
     renamed = given.get("topics") or {}
-    asked = {name: roles_of(model) for name, model in models.items()}
+    asked = {name: roles_of(model) for name, model in models.items()} if renamed else {}
     for role in renamed:
         _check_role(label, role, {each for roles in asked.values() for each in roles})
     found = {
-        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked[name]) else []
+        name: topics_of(model, topics, renamed) if renamed.keys() <= set(asked.get(name, ())) else []
         for name, model in models.items()
     }
     fitting = [name for name, model in models.items() if found[name] and (named or not model.by_name)]
@@ -211,7 +211,7 @@ def _bind_fitting(
 def bind_model(
     label: str, topics: Mapping[str, Topic], parameters: Any, *, model: Model, method: Method
 ) -> list[Bound]:
-    """A filter for everything in the log that is of this model."""
+    """Return a filter for everything in the log that is of this model."""
     method = _made_for(f"estimator {label}", method, parameters)
     bound: list[Bound] = []
     motion = _motion_of(label, model, parameters.mode)
@@ -272,7 +272,7 @@ def _check_topics(
 
 
 def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Floats | None:
-    """The origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
+    """Return the origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
 
     Raises BadInput where channels state different ones, or the first fix would have to be the origin
     though another sensor says where the thing is in a frame of its own.
@@ -296,7 +296,7 @@ def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topi
 def _reprocessing(
     bound: Recursive, filtering: "Filter", begun: Callable[[Start], Start], window_ns: int
 ) -> Recursive:
-    """The estimator that goes back for late messages; raises BadInput where the filter cannot."""
+    """Make the estimator that reprocesses late messages; raises BadInput where the filter cannot."""
     reason = filtering.why_in_sequence
     if reason:
         raise BadInput(
@@ -307,7 +307,10 @@ def _reprocessing(
 
 
 def _made_for(where: str, method: Method, parameters: Any) -> Method:
-    """The method that the parameters choose; BadInput that begins with `where`, if they choose none."""
+    """Choose the method that the parameters name.
+
+    BadInput that begins with `where`, if there is none.
+    """
     try:
         return method.made_for(parameters) if method.made_for else method
     except BadInput as error:
@@ -315,7 +318,7 @@ def _made_for(where: str, method: Method, parameters: Any) -> Method:
 
 
 def _motion_of(label: str, model: Model, mode: str | None) -> Motion:
-    """The motion of this name, the model's own where none is given; BadInput for an unknown one."""
+    """Find the motion of this name, the model's own where none is given; BadInput for an unknown one."""
     if mode is None:
         return model.motion
     if not model.modes:

@@ -20,7 +20,7 @@ DIFFERENTIATED = ("state", "control", "noise")
 
 
 def formulas(model: str | Model) -> str:
-    """The functions of a model and their derivatives, as text that a person can read.
+    """Return the functions of a model and their derivatives, as text that a person can read.
 
     A component after a step of the motion is called next_...; what a function uses more than once has a
     line of its own, v1 and so on. Derivatives that are not there are zero. They are by the components as
@@ -43,7 +43,7 @@ def formulas(model: str | Model) -> str:
 
 
 def formulas_by_function(model: str | Model) -> dict[str, list[str]]:
-    """The lines of `formulas` by the function that they are of, such as "motion, move"."""
+    """Return the lines of `formulas` by the function that they are of, such as "motion, move"."""
     found = load("models", model, Model) if isinstance(model, str) else model
     motions = found.modes or {"": found.motion}
     stage = stage_of(found, found.motion, found.all_sensors, tuple(motions.values()))
@@ -63,7 +63,7 @@ def formulas_by_function(model: str | Model) -> dict[str, list[str]]:
 
 
 def _of_motion(model: Model, motion: Motion) -> Iterator[tuple[str, list[str]]]:
-    """The functions of a motion by name, each with its lines; none where there is no function."""
+    """Return the functions of a motion by name, each with its lines; none where there is no function."""
     state, axes = list(model.state), _axes(model)
     control = model.control.components if model.control else ()
     noise = [f"noise{number}" for number in range(1, motion.noises + 1)]
@@ -83,7 +83,7 @@ def _of_motion(model: Model, motion: Motion) -> Iterator[tuple[str, list[str]]]:
 
 
 def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
-    """The functions of a sensor by name, as those of a motion."""
+    """Return the functions of a sensor by name, as those of a motion."""
     state, axes, measured = list(model.state), _axes(model), list(sensor.measured)
     noise = [f"noise{number}" for number in range(1, sensor.noises + 1)]
     entering = {"noise": noise} if noise else {}
@@ -109,12 +109,12 @@ def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
 
 
 def _axes(model: Model) -> list[str]:
-    """The components of the tangent space."""
+    """Return the components of the tangent space."""
     return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
 
 def _reference(sensor: Sensor) -> list[str]:
-    """What the entries of `reference` are, see `Sensor.reference_size`."""
+    """Return what the entries of `reference` are, see `Sensor.reference_size`."""
     names = [f"{_topic(each.topic)}_{name}" for each in sensor.maps for name in each.components]
     names += sensor.control.components if sensor.control else ()
     for name, size in sensor.fields.items():
@@ -127,7 +127,7 @@ def _topic(name: str) -> str:
 
 
 def _spread(axes: Names, block: int = 0) -> list[str]:
-    """What rows of a covariance's lower triangle are, and variances behind its block of axes."""
+    """Return what rows of a covariance's lower triangle are, and variances behind its block of axes."""
     block = block or len(axes)
     names = [
         f"variance of {axes[row]}" if row == column else f"covariance of {axes[row]} and {axes[column]}"
@@ -138,7 +138,10 @@ def _spread(axes: Names, block: int = 0) -> list[str]:
 
 
 def _lines(function: Any, given: Given, returned: Names = (), by: Names = DIFFERENTIATED) -> list[str]:
-    """The formulas of a traced function; where it returns less than is named, these are variances."""
+    """Write the formulas of a traced function.
+
+    Where it returns less than is named, these are variances.
+    """
     if function is None:
         return []
     assert isinstance(function, TracedFunction)
@@ -159,7 +162,7 @@ def _lines(function: Any, given: Given, returned: Names = (), by: Names = DIFFER
 
 
 def _entries(argument: str, named: Any, kind: Any) -> Iterator[tuple[Any, str]]:
-    """The places within an argument, and their names."""
+    """Return the places within an argument, and their names."""
     if isinstance(kind, Shape):
         for place in np.ndindex(kind.sizes):
             parts = ", ".join(names[index] for names, index in zip(named, place, strict=True))

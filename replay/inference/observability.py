@@ -57,7 +57,7 @@ class ObservabilityParameters(MethodParameters):
 
 
 class Gramian(NamedTuple):
-    """What is carried along: Phi and W (runs, t, t), and how many messages are in W (runs,)."""
+    """Holds what is carried along: Phi and W (runs, t, t), and how many messages are in W (runs,)."""
 
     transition: Floats
     information: Floats
@@ -65,7 +65,7 @@ class Gramian(NamedTuple):
 
 
 class LinearizationTrajectory(NamedTuple):
-    """The trajectory: its states (nodes, n), of every event the node, and memory for one offset."""
+    """Holds the trajectory: states (nodes, n), every event's node, and memory for one offset."""
 
     mean: Floats
     node: Integers
@@ -73,7 +73,7 @@ class LinearizationTrajectory(NamedTuple):
 
 
 def gramian_steps(stage: Stage) -> Steps:
-    """The steps that sum the Gramian along a trajectory, the only one of `memory`'s sets."""
+    """Make the steps that sum the Gramian along a trajectory, the only one of `memory`'s sets."""
     motion = _carried_by_motion(stage)
     sensors = tuple(_added_by_sensor(stage, number) for number in range(len(stage.sensors)))
 
@@ -175,10 +175,10 @@ def _summing(stage: Stage) -> tuple[Function, Steps]:
 
 
 class Observability(IteratedSmoother):
-    """The smoothed trajectory of every run, and the Gramians of its windows along it."""
+    """Runs the smoothed trajectory of every run, and the Gramians of its windows along it."""
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """One message for every window, at its last stamp."""
+        """Return one message for every window, at its last stamp."""
         state, _ = self.ended(state)
         if not state.kept:
             return []
@@ -207,12 +207,12 @@ class Observability(IteratedSmoother):
 
     @property
     def components(self) -> list[str]:
-        """The names of the tangent space's components."""
+        """Return the names of the tangent space's components."""
         model = self.stage.model
         return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
     def _scales(self, state: FilterState) -> Floats:
-        """What a scaled component of one stands for (runs, t)."""
+        """Return what a scaled component of one stands for (runs, t)."""
         scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
         for name, scale in self.parameters.scales.items():
             if name not in self.components:
@@ -224,7 +224,7 @@ class Observability(IteratedSmoother):
         return scales
 
     def _windows(self, way: Way, start_ns: Integers) -> Integers:
-        """The window of every node; what is left of a run behind the last whole one belongs to it."""
+        """Find the window of every node; what is left behind a run's last whole one belongs to it."""
         run = np.repeat(np.arange(len(start_ns)), np.diff(way.offsets))
         since_ns = way.nodes.time_ns - start_ns[run]
         if self.parameters.window_s is None:
@@ -235,7 +235,7 @@ class Observability(IteratedSmoother):
         return np.minimum(np.maximum(since_ns - 1, 0) // length_ns, last[run])
 
     def _gramians(self, state: FilterState, way: Way, window_of: Integers) -> tuple[Estimates, Integers]:
-        """The Gramians at the last stamps of windows, and how many messages are in each."""
+        """Return the Gramians at the last stamps of windows, and how many messages are in each."""
         stage, offsets, runs = self.stage, way.offsets, len(way.offsets) - 1
         t, (loop, steps) = stage.model.tangent, _summing(stage)
         ends = np.append(np.diff(window_of) != 0, True)[: len(window_of)]
@@ -292,7 +292,7 @@ def spectrum(information: Floats, scales: Floats) -> Spectrum:
 
 
 def in_words(told: Spectrum, components: Sequence[str]) -> str:
-    """What there is to say of the weakest direction."""
+    """Describe the weakest direction in a sentence."""
     largest = np.abs(told.direction).max(initial=0.0)
     moved = [
         f"{share:+.3g} {name}"
@@ -319,5 +319,5 @@ OBSERVABILITY = of_any_model(METHOD)
 
 
 def observability_of(model: Model) -> Estimator[Any]:
-    """The same of one model; raises BadInput where that lacks what it needs."""
+    """Return the same of one model; raises BadInput where that lacks what it needs."""
     return modelled_by(model, METHOD, "observability")

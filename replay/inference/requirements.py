@@ -18,7 +18,7 @@ OWN_MODEL = (
 
 
 def requirements_of(model: Model) -> str:
-    """What a log has to have for a model, in words; of one that can start without, what it may have."""
+    """Say in words what a model requires of a log; of one that can start without, what it may have."""
     words = [part.words for part in parts_of(model, UnderPrefix({}, "...", {}))]
     if model.start is None or model.control is None or not model.needs_sensor:
         return "; ".join(words)
@@ -28,7 +28,7 @@ def requirements_of(model: Model) -> str:
 
 
 def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
-    """Which of the models comes nearest to fitting a log, and what the log lacks for it."""
+    """Find which of the models comes nearest to fitting a log, and what the log lacks for it."""
     tried = [(name, nearest_parts(model, topics)) for name, model in models.items()]
     name, parts = max(tried, key=lambda one: _fit(one[1]))
     if not any(part.is_here for part in parts):
@@ -39,7 +39,7 @@ def nearest(models: Mapping[str, Model], topics: Mapping[str, Topic]) -> str:
 
 
 def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: Mapping[str, str]) -> str:
-    """Which model the log's prior is of, where only its control has another name; empty where none is.
+    """Find the model of the log's prior, where only its control has another name; empty where none is.
 
     As with several inertial units, of which one has to be chosen.
     """
@@ -64,7 +64,7 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
 
 
 def nearest_parts(model: Model, topics: Mapping[str, Topic]) -> list["Part"]:
-    """What a model needs, under the prefix of a log that has most of it."""
+    """Return what a model needs, under the prefix of a log that has most of it."""
     prefixes = dict.fromkeys(["...", *(topic.rpartition("/")[0] for topic in topics)])
     return max((parts_of(model, UnderPrefix(topics, each, {})) for each in prefixes), key=_fit)
 
@@ -81,7 +81,7 @@ class Part(NamedTuple):
 
 
 def parts_of(model: Model, here: UnderPrefix) -> list[Part]:
-    """All that a model needs under one prefix."""
+    """Return all that a model needs under one prefix."""
 
     def part(name: str, schema: Schema, system: str = "") -> Part:
         place, known = here.place(name), here.topics.get(here.place(name))
@@ -115,6 +115,6 @@ def parts_of(model: Model, here: UnderPrefix) -> list[Part]:
 
 
 def names_state(prior: Topic, model: Model, *, exactly: bool = False) -> bool:
-    """Whether a prior's channel names all components of a model's state, and no others if `exactly`."""
+    """Tell whether a prior names all components of a model's state, and no others if `exactly`."""
     named = set(prior.metadata.get("components", "").split(","))
     return named == set(model.state) if exactly else named >= set(model.state)

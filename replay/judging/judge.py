@@ -27,7 +27,7 @@ from replay.judging.errors.evaluation import (
     split_topic,
     unjudged,
 )
-from replay.judging.errors.truths import Truths
+from replay.judging.errors.truths import Doubt, Truths
 from replay.judging.metrics.means import MeansOfAll
 from replay.judging.metrics.measuring import (
     Measurement,
@@ -130,6 +130,7 @@ class Judge:
         self._degrees: Counter[str] = Counter()
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
+        self._doubts: dict[str, Doubt] = {}
 
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
@@ -206,6 +207,7 @@ class Judge:
 
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
+        self._doubts = self.doubts
         self._sources, self._truths, self._on_errors = (), [], None
         self._steps.clear()
         for each in self._quantities.values():
@@ -215,6 +217,7 @@ class Judge:
         """Take in what was judged of other runs."""
         self.runs += other.runs
         self._names |= other._names
+        self._doubts = other.doubts | self.doubts
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
         self._degrees.update(other._degrees)
@@ -262,6 +265,14 @@ class Judge:
     def tells(self) -> bool:
         """Whether there are numbers, but for what a replay says of itself."""
         return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in TOLD))
+
+    @property
+    def doubts(self) -> dict[str, Doubt]:
+        """By topic, what is doubtful about a truth, of the first run of which there is something."""
+        found = dict(self._doubts)
+        for truths in self._truths:
+            found = truths.doubts | found
+        return found
 
     @property
     def unjudged(self) -> list[str]:

@@ -5,18 +5,23 @@ is computed holds the exact result: disc offsets are polygons around it, and wha
 added.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import shapely
-from shapely import Polygon
-from shapely.geometry.base import BaseGeometry
 
+from recorders.extras import AtFirstUse
 from recorders.models.planar import drive, wrap_angle
 from replay.engine.arrays import Floats, Integers
 from replay.regions.feasible_sets import Arena
 from replay.regions.pseudo_ellipsoids import PseudoEllipsoid, monomials, outline
+
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = AtFirstUse("shapely", "papers", "guaranteed sets over time")
 
 ROUNDING_M = 1e-7
 ON_A_LINE_M = 1e-10  # a vertex so near to the line between its neighbours is none
@@ -130,7 +135,9 @@ def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
     return Headings(middle, min(headings.half_rad + motion.turn_error_rad, np.pi))
 
 
-def moved(places: BaseGeometry, headings: Headings, motion: Motion, direction: int = 1) -> BaseGeometry:
+def moved(
+    places: shapely.Geometry, headings: Headings, motion: Motion, direction: int = 1
+) -> shapely.Geometry:
     """Where a robot is after a motion, or with the direction -1 where it was before it.
 
     `headings` are those before the motion. The displacements of all of them lie on an arc, and this in a
@@ -148,7 +155,7 @@ def moved(places: BaseGeometry, headings: Headings, motion: Motion, direction: i
     return shifted.buffer(radius * WIDER, quad_segs=QUARTER_SEGMENTS)
 
 
-def directions(places: BaseGeometry, target: Floats) -> Headings:
+def directions(places: shapely.Geometry, target: Floats) -> Headings:
     """The directions in which a point is seen from a set; all of them where it is in the set's hull."""
     hull = places.convex_hull
     if hull.covers(shapely.Point(target)):
@@ -162,24 +169,24 @@ def directions(places: BaseGeometry, target: Floats) -> Headings:
     )
 
 
-def from_rings(rings: Sequence[Floats]) -> BaseGeometry:
+def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
     """A set from its borders (n, 2), holes the other way round."""
-    places: BaseGeometry = Polygon()
+    places: shapely.Geometry = shapely.Polygon()
     for ring in rings:
-        places = places.symmetric_difference(shapely.make_valid(Polygon(ring)))
+        places = places.symmetric_difference(shapely.make_valid(shapely.Polygon(ring)))
     return places
 
 
-def corners_of(places: BaseGeometry) -> BaseGeometry:
+def corners_of(places: shapely.Geometry) -> shapely.Geometry:
     """A set without the vertices on its edges, which are there or not as rounding has it."""
     return shapely.simplify(places, ON_A_LINE_M)
 
 
-def to_rings(places: BaseGeometry) -> list[Floats]:
+def to_rings(places: shapely.Geometry) -> list[Floats]:
     """The borders (n, 2) of a set: on their left is the set."""
     found = []
     for part in shapely.get_parts(corners_of(places)):
-        if isinstance(part, Polygon) and not part.is_empty:
+        if isinstance(part, shapely.Polygon) and not part.is_empty:
             upright = shapely.orient_polygons(part)
             found += [
                 shapely.get_coordinates(ring)[:-1] for ring in (upright.exterior, *upright.interiors)
@@ -187,7 +194,7 @@ def to_rings(places: BaseGeometry) -> list[Floats]:
     return found
 
 
-def within_l8(places: BaseGeometry) -> BaseGeometry:
+def within_l8(places: shapely.Geometry) -> shapely.Geometry:
     """A pseudo-ellipsoid with L = 8 around a set, as a polygon.
 
     It is the level set of the least ellipsoid around the monomials T of the set's points (by

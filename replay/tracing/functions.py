@@ -23,6 +23,7 @@ from replay.engine.compiling.kernels.values import Array, Record, entries, load,
 from replay.tracing.derivatives import slopes_of
 from replay.tracing.emission import emit, python_of
 from replay.tracing.graph import INPUT, Graph, Node, described, needed
+from replay.tracing.reads import Reads, reads_of
 from replay.tracing.traced import MOST_WAYS, CannotTrace, Trace, refused, too_many_ways
 
 # Files in whose lines nobody looks for a model's mistake.
@@ -79,6 +80,10 @@ class TracedFunction:
 
     def kernel_identity(self) -> str:
         """What is part of a kernel's key: the graph."""
+        return self._identity
+
+    @cached_property
+    def _identity(self) -> str:
         where = [(argument, place) for argument, place, _ in self.result.written]
         return _digest(
             [repr(self.arguments), repr(where), str(self.result.is_number), *described(self.outputs)]
@@ -346,27 +351,31 @@ def _digest(words: Sequence[str]) -> str:
     return sha256("\n".join([digest_of("replay.tracing"), *words]).encode()).hexdigest()
 
 
-_KNOWN: dict[Any, TracedFunction] = {}
+_KNOWN: dict[Any, tuple[TracedFunction, Reads | None]] = {}
 
 
 def traced(function: Any, *arguments: Argument) -> Any:
     """A function as a traced one; the same again while it does the same.
 
-    It is called anew every time: that takes milliseconds, and whatever it is made of may have changed.
+    It is called anew where what it reads has changed, or may have changed unseen; see `reads`.
     None for None, and what is traced already is as it was.
 
     Raises BadInput where it cannot be traced, or gives something else when it is traced again.
     """
     if function is None or isinstance(function, TracedFunction):
         return function
-    made = TracedFunction(function, arguments)
-    known = _KNOWN.get((id(function), arguments))
+    key = id(function), arguments
+    known, reads = _KNOWN.get(key, (None, None))
+    if reads is not None and reads.are_unchanged():
+        return known
+    reads, made = reads_of(function), TracedFunction(function, arguments)
     if known is not None and known.kernel_identity() == made.kernel_identity():
+        _KNOWN[key] = known, reads
         return known
     if TracedFunction(function, arguments).kernel_identity() != made.kernel_identity():
         raise BadInput(
             f"{place_of(function)}: it gives something else when it is called again; a clock, random "
             "numbers and what changes meanwhile are no part of a model, so take them as parameters"
         )
-    _KNOWN[id(function), arguments] = made  # which holds the function, whose id is no other's then
+    _KNOWN[key] = made, reads  # which holds the function, whose id is no other's then
     return made

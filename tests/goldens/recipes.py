@@ -7,6 +7,7 @@ family, reaches code that the first log does not, that is a golden of its own.
 import tarfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +65,7 @@ class Recipe:
     late: str = ""
     over: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def loaded(self) -> Experiment:
         """The experiment, with what the recipe puts over it."""
         return load_experiment(self.experiment, {}, self.over)[1]

@@ -41,9 +41,10 @@ def test_what_is_named_is_there(name: str) -> None:
 
 def test_the_lanes_run_every_test_once() -> None:
     """Those that `make test` starts side by side."""
-    (started,) = re.findall(r"^\t\$\(MAKE\) -j\d (.*)", MAKEFILE, re.MULTILINE)
+    joined = MAKEFILE.replace("\\\n", "")
+    (started,) = re.findall(r"^\t\$\(MAKE\) -j\d (.*)", joined, re.MULTILINE)
     lanes = [
-        re.findall(rf"^{lane}: .*\n\t\$\(BIN\)/pytest (.*)", MAKEFILE, re.MULTILINE)[0].split()
+        re.findall(rf"^{lane}: .*\n\t\$\(BIN\)/pytest (.*)", joined, re.MULTILINE)[0].split()
         for lane in started.removesuffix(" lint").split()
     ]
 

@@ -166,8 +166,9 @@ def test_a_cell_that_is_changed_while_others_are_worked_off_is_worked_off_again(
 
 
 @pytest.mark.unix
-@pytest.mark.parametrize("mode", [0o755, 0o775, 0o1777])
-@pytest.mark.parametrize("umask", [0o022, 0o002, 0o000])
+@pytest.mark.parametrize(
+    ("mode", "umask"), [(0o755, 0o022), (0o755, 0o000), (0o775, 0o002), (0o1777, 0o000)]
+)
 def test_a_campaign_runs_wherever_its_folder_is_the_users_own(
     mode: int, umask: int, tmp_path: Path, fuselog: Callable[..., Said]
 ) -> None:

@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -131,7 +132,7 @@ def test_no_file_of_the_user_is_changed(
     way: str, command: str, situation: str, here: Path, before: Path
 ) -> None:
     what, where = COMMANDS[command], SITUATIONS[situation]
-    if way != "straight" and where.over_ours and where.code == 0:
+    if way != "straight" and where.code == 0 and situation != "nothing":
         pytest.skip("is as straight")
     place = Path("out" + what.suffix)
     if where.over_ours:
@@ -237,9 +238,8 @@ def test_a_full_disk_loses_nothing(command: str, over_ours: bool, here: Path, be
     earlier = _state(here)
     with _full_disk():
         said = _run(what, place)
-    _check_refusal(
-        said, here, earlier, "" if "Vulkan" in said.err else "cannot be written (File too large)"
-    )
+    is_record_or_run = command in ("record --out", "run --out")
+    _check_refusal(said, here, earlier, "cannot be written (File too large)" * is_record_or_run)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -257,8 +257,10 @@ def test_a_place_that_takes_nothing_is_said(command: str, here: Path) -> None:
         assert "Vulkan" in said.err or str(place.parent) in said.err
 
 
-@pytest.mark.parametrize(("mode", "umask"), [(0o775, 0o002), (0o1777, 0o000)])
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    ("command", "mode", "umask"),
+    [(name, *way) for name, way in zip(COMMANDS, cycle([(0o775, 0o002), (0o1777, 0o000)]))],
+)
 def test_a_folder_that_others_write_to_is_as_good_as_any(
     command: str, mode: int, umask: int, here: Path
 ) -> None:

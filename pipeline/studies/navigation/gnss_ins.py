@@ -19,6 +19,7 @@ from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.navigation.outages import (
     COASTED,
@@ -44,6 +45,7 @@ from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Ensemble, MemorySource, memory_source
 
 CHI_SQUARE_95 = 7.81  # of three components
+RUNS_AT_ONCE = 2  # in memory, with their estimates
 
 
 class Bridged(Parameters):
@@ -128,10 +130,17 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             "options.first_s, options.every_s and options.lengths_s move them"
         )
     runner = Runner(experiment, setting)
-    sources = Ensemble(withheld(whole, rows, each) for each in [*runs, []])
-    replayed = runner.replay(sources)
-    runner.keep(sources, replayed.outputs)
-    errors = error_table(rows, runs, replayed.outputs, list(experiment.estimators))
+    tables = []
+    for first in range(0, len(runs), RUNS_AT_ONCE):
+        now = runs[first : first + RUNS_AT_ONCE]
+        sources = Ensemble(withheld(whole, rows, each) for each in now)
+        outputs = replay_in_memory(sources, experiment.estimators, progress=setting.progress)
+        runner.keep(sources, outputs, drawn=None if first else "", first_run=first)
+        tables.append(error_table(rows, now, outputs, list(experiment.estimators)))
+    errors = pd.concat(tables, ignore_index=True)
+    undisturbed = Ensemble([withheld(whole, rows, [])])
+    outputs = replay_in_memory(undisturbed, experiment.estimators, progress=setting.progress)
+    runner.keep(undisturbed, outputs, drawn=None, first_run=len(runs))
     by_window = window_table(errors)
     by_length = length_table(by_window).sort_values("length_s", kind="stable")
     outcome = Outcome(input_sha256=hash_streams([whole]))
@@ -140,18 +149,18 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             outcome.metrics[f"{label}.{name}.{length_s:g}s"] = value
     for label, name, value in by_window[["estimator", "window", "over_rmse_m"]].to_numpy():
         outcome.metrics[f"{label}.over_rmse_m.{name}"] = value
-    kinds = innovations_of(replayed.outputs, rows, len(runs), options)
+    kinds = innovations_of(outputs, rows, options)
     for kind, each in kinds.items():
         outcome.metrics[f"{options.filter}.{kind}_nis"] = each.nis
         outcome.metrics[f"{options.filter}.{kind}_nis_share_above_95"] = each.share_above
         for axis, value in zip("xyz", each.by_axis, strict=True):
             outcome.metrics[f"{options.filter}.{kind}_nis_{axis}"] = value
-    last = replayed.outputs[f"/estimates/{options.filter}/state"].of_run(len(runs))
+    last = outputs[f"/estimates/{options.filter}/state"].stream
     end = dict(zip(last.components, last["mean"][-1].tolist(), strict=True))
     for name in [each for each in end if "_bias_" in each]:
         outcome.metrics[f"{options.filter}.end_{name}"] = end[name]
-    started = replayed.outputs.get(f"/estimates/{options.filter}/started")  # none of a log with a prior
-    begun = [] if started is None else sentences_of(started.of_run(len(runs)))
+    started = outputs.get(f"/estimates/{options.filter}/started")  # none of a log with a prior
+    begun = [] if started is None else sentences_of(started.stream)
     notes = [*whole.run.notes.items(), *((sentence, "") for sentence in begun)]
     outcome.tables |= {
         "summary": summary_table(outcome.metrics),
@@ -210,10 +219,10 @@ def _recording(
 
 
 def innovations_of(
-    outputs: Mapping[str, Ragged], rows: Rows, run: int, options: GnssInsOptions
+    outputs: Mapping[str, Ragged], rows: Rows, options: GnssInsOptions
 ) -> dict[str, Innovations]:
-    """What the filter's innovations of positions and velocities are worth in a run without outages."""
-    stream = outputs[f"/estimates/{options.filter}/innovation"].of_run(run)
+    """What the filter's innovations of positions and velocities are worth in the run without outages."""
+    stream = outputs[f"/estimates/{options.filter}/innovation"].stream
     size = stream["innovation"].shape[1]
     covariance = stream["covariance"].reshape(-1, size, size)
     squares = stream["innovation"] ** 2 / np.diagonal(covariance, axis1=1, axis2=2)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.errors import BadInput
+from recorders.extras import extra
 from recorders.importers.tables.mapping import Origin
 from recorders.models.geodesy import into_tangent_plane
 
@@ -48,14 +49,9 @@ class Plane(NamedTuple):
 
 @cache
 def _onto_map(projection: str) -> Any:
-    try:
+    with extra("maps", f"projection {projection}"):
         from pyproj import CRS, Transformer
         from pyproj.exceptions import CRSError
-    except ImportError:
-        raise BadInput(
-            f"projection {projection}: needs pyproj; pip install 'fuselog[maps]', or leave the "
-            "projection out to use the tangent plane"
-        ) from None
     try:
         crs = CRS.from_user_input(projection)
     except CRSError:

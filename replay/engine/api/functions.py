@@ -51,7 +51,7 @@ def recursive(
     compiled: bool = True,
     allocates: bool = True,
 ) -> Estimator[ParametersType]:
-    """An estimator that follows its messages in time.
+    """Make an estimator that follows its messages in time.
 
     Args:
         summary: what it is, in one line.
@@ -61,9 +61,9 @@ def recursive(
             estimates among them are priors: of the estimate's components, see `Given.prior`.
         components: the estimate's components by name, with their kinds.
         truth: the topic with the truth of what is estimated.
-        measured: the components of the innovations, where `follow` tells of them.
+        measured: the components of the innovations, where `follow` fills them.
         vectors: what is wanted of the vectors that topics of `streams` hold, by topic. What the log
-            does not say of them is refused; without an entry here vectors come as the log has them.
+            does not state of them is refused; without an entry here vectors come as the log has them.
         optional: which of `streams` and `static` a log may lack.
         outputs: further outputs by name, with schemas whose fields are numbers; see `Results.further`.
         draws: whether random numbers are drawn: `follow` then gets the run's own generator as its last
@@ -176,7 +176,7 @@ def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
 
 
 def _drawn_on(generators: Generators, messages: Messages, parameters: Any) -> Generators:
-    """The runs' generators for one block: copies, since a block may have to be gone through again.
+    """Copy the runs' generators for one block, since a block may have to be processed again.
 
     A run that has none yet gets one at its first message.
     """
@@ -204,7 +204,7 @@ def batch(
     outputs: Mapping[str, Schema] = MappingProxyType({}),
     solve: Callable[[Given[ParametersType]], Solved],
 ) -> Estimator[ParametersType]:
-    """An estimator that solves whole streams.
+    """Make an estimator that solves whole streams.
 
     Args as for `recursive`, and:
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
@@ -316,7 +316,7 @@ def _estimator(
 
 
 class _Carried(NamedTuple):
-    """What a recursion carries from block to block; `told` (runs,) says whose failure was told.
+    """Holds what a recursion carries from block to block; `told` (runs,): whose failure was reported.
 
     A run's generator is None until there is a message, or where none is wanted.
     """

@@ -34,14 +34,14 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     runs: int
 
     def stated(self, topic: str, name: str) -> float:
-        """The parameter `name`, or where it is None the number that the topic's channel states.
+        """Return the parameter `name`, or where it is None the number that the topic's channel states.
 
         Raises BadInput where neither does.
         """
         return given_or_stated(self.parameters, [self.topics[topic]], name)
 
     def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
-        """The prior of every run: stamps (runs,), means (runs, d), covariances (runs, t, t).
+        """Return the prior of every run: stamps (runs,), means (runs, d), covariances (runs, t, t).
 
         They are of the estimate's components, in their order, whatever the log's order is. NaN where a
         run has none that can be used: it has failed, and gets no messages.
@@ -49,21 +49,21 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
         return gaussians(self.static[topic])
 
     def __getitem__(self, topic: str) -> Ragged:
-        """A static topic, all runs end to end."""
+        """Return a static topic, all runs end to end."""
         return self.static[topic]
 
     def __iter__(self) -> Iterator[str]:
-        """The names of what is given."""
+        """Return the names of what is given."""
         return iter(self.static)
 
     def __len__(self) -> int:
-        """How many topics are given."""
+        """Count how many topics are given."""
         return len(self.static)
 
 
 @dataclass(frozen=True, eq=False)
 class OneRun(Mapping[str, Stream]):
-    """What is given of one run, stream by stream; see `Given` and `each_run`."""
+    """Holds what is given of one run, stream by stream; see `Given` and `each_run`."""
 
     given: Given[Any]
     run: int
@@ -73,14 +73,14 @@ class OneRun(Mapping[str, Stream]):
         return self.given.stated(topic, name)
 
     def prior(self, topic: str) -> tuple[int, Floats, Floats]:
-        """The run's prior, see `Given.prior`: stamp, mean (d,), covariance (t, t)."""
+        """Return the run's prior, see `Given.prior`: stamp, mean (d,), covariance (t, t)."""
         stream = self[topic]
         time_ns, mean, covariance = gaussians(Ragged(stream, np.array([0, len(stream)])))
         return int(time_ns[0]), mean[0], covariance[0]
 
     @cached_property
     def generator(self) -> np.random.Generator:
-        """The run's own generator: from the parameter `seed` and the first messages of its streams.
+        """Make the run's own generator, from the parameter `seed` and the first messages of its streams.
 
         So it is the same on any number of cores, and whatever other runs there are.
         """
@@ -88,26 +88,31 @@ class OneRun(Mapping[str, Stream]):
         return generator_of(self.given.parameters, first)
 
     def __getitem__(self, topic: str) -> Stream:
-        """A topic's messages of this run."""
+        """Return a topic's messages of this run."""
         return self.given[topic].of_run(self.run)
 
     def __iter__(self) -> Iterator[str]:
-        """The names of what is given."""
+        """Return the names of what is given."""
         return iter(self.given)
 
     def __len__(self) -> int:
-        """How many topics are given."""
+        """Count how many topics are given."""
         return len(self.given)
 
 
 def generator_of(parameters: Any, first: Iterable[NDArray]) -> np.random.Generator:
-    """A counter-based generator (Philox), keyed by a seed and a run's first data."""
+    """Return a counter-based generator (Philox), keyed by a seed and a run's first data.
+
+    Args:
+        parameters: with a `seed`.
+        first: arrays of the run's first messages.
+    """
     key = run_key(getattr(parameters, "seed", 0), first)
     return np.random.Generator(np.random.Philox(key=key))
 
 
 class Messages(NamedTuple):
-    """The messages of all runs in time order: run r owns the rows offsets[r]:offsets[r + 1].
+    """Holds the messages of all runs in time order: run r owns the rows offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
@@ -124,7 +129,7 @@ class Messages(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """Messages that were not used: offsets by run, stamps, and the number of the reason of each."""
+    """Holds messages that were not used: offsets by run, stamps, and the number of each's reason."""
 
     offsets: Integers
     time_ns: Integers
@@ -135,7 +140,13 @@ class Skipped(NamedTuple):
 def messages_of(
     block: Block, vectors: Mapping[str, Vectors], parameters: Any
 ) -> tuple[Messages, Skipped]:
-    """A block's messages, their fields as numbers; and those that lack a covariance."""
+    """Return a block's messages, their fields as numbers; and those that lack a covariance.
+
+    Args:
+        block: of all runs.
+        vectors: the vectors that are wanted of topics, by name.
+        parameters: the estimator's.
+    """
     events = block.events
     read = [
         numbers_of(ragged.stream, vectors.get(topic), parameters)

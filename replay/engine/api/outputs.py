@@ -21,7 +21,7 @@ DIVERGED = "the estimate is no longer finite: the filter diverged"
 
 
 class Results(NamedTuple):
-    """What a recursion fills, one row for every message; a row of NaN says nothing.
+    """Holds what a recursion fills, one row for every message; a row of NaN is none.
 
     Attributes:
         mean, covariance: (n, d), (n, t, t) the estimate after the message; t components in the tangent
@@ -31,7 +31,7 @@ class Results(NamedTuple):
         accepted: (n,) whether a gate let the message in; 1 unless set.
         target: (n,) what the message was about; 0 unless set.
         further: (n, k) the fields of the further outputs that were named, after the sensor's clock, side
-            by side in order; a message is told of an output where its first field is a number.
+            by side in order; an output has a message where its first field is a number.
     """
 
     mean: Floats
@@ -45,7 +45,7 @@ class Results(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """How the solutions ended, (n,) each; the cost is what was minimised."""
+    """Describes how the solutions ended, (n,) each; the cost is what was minimised."""
 
     iterations: Integers
     converged: Integers
@@ -54,14 +54,14 @@ class Solution(NamedTuple):
 
 
 class Diagnostics(NamedTuple):
-    """Numbers that a batch gives beside its estimates: stamps (n,), and columns by a schema's fields."""
+    """Holds numbers that a batch gives beside its estimates: stamps (n,), and columns of a schema."""
 
     time_ns: Integers
     columns: Mapping[str, NDArray]
 
 
 class Measured(NamedTuple):
-    """Innovations of a batch's measurements: stamps (n,), (n, m) with covariances (n, m, m).
+    """Holds innovations of a batch's measurements: stamps (n,), (n, m) with covariances (n, m, m).
 
     `target` (n,) is what each was about; 0 unless given.
     """
@@ -73,13 +73,13 @@ class Measured(NamedTuple):
 
 
 class Estimates(NamedTuple):
-    """What one run's streams were solved to.
+    """Holds what one run's streams were solved to.
 
     Attributes:
         time_ns, mean, covariance: stamps (n,), means (n, d), covariances (n, t, t).
         solution: how it ended.
         innovations: of the measurements, where the batch names what is `measured`.
-        further: by name, what the batch's further `outputs` say.
+        further: by name, the batch's further `outputs`.
     """
 
     time_ns: Integers
@@ -91,7 +91,7 @@ class Estimates(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """The estimates by run, and the failures; a run that failed has no estimates."""
+    """Holds the estimates by run, and the failures; a run that failed has no estimates."""
 
     estimates: Mapping[int, Estimates]
     failures: Mapping[int, Failure]
@@ -99,7 +99,7 @@ class Solved(NamedTuple):
 
 @dataclass(frozen=True)
 class Outputs:
-    """The output topics of one bound estimator: state, failures and, where told, innovations."""
+    """Makes the output topics of one bound estimator: state, failures and innovations."""
 
     name: str
     topic: str
@@ -110,11 +110,11 @@ class Outputs:
 
     @property
     def tangent(self) -> int:
-        """How many components the tangent space has."""
+        """Count how many components the tangent space has."""
         return len(tangent_components(list(self.components), list(self.components.values())))
 
     def blank(self, rows: int) -> Results:
-        """Results that say nothing."""
+        """Return results that are all NaN."""
         d, t, m = len(self.components), self.tangent, len(self.measured)
         width = sum(len(schema.fields) - 1 for schema in self.further.values())
         return Results(
@@ -129,7 +129,7 @@ class Outputs:
         )
 
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
-        """The outputs of one block; of several estimates at a stamp the last stands."""
+        """Return the outputs of one block; of several estimates at a stamp the last stands."""
         # what is said of a covariance that is none is for the replay to find
         said = np.isfinite(np.einsum("nd->n", results.mean))
         rows = _last_of_stamps(messages, np.flatnonzero(said))
@@ -150,7 +150,7 @@ class Outputs:
         return [*made, *self._further_of_block(messages, results.further)]
 
     def of_skipped(self, skipped: Skipped) -> list[Ragged]:
-        """What was not used, for estimators of what may lack a covariance."""
+        """Return what was not used, for estimators of what may lack a covariance."""
         if not any(skipped.reasons):
             return []
         topic = f"{self.topic}/skipped"
@@ -158,7 +158,7 @@ class Outputs:
         return [Ragged(stream, skipped.offsets)]
 
     def of_solved(self, solved: Solved, runs: int) -> list[Ragged]:
-        """The outputs of a batch."""
+        """Return the outputs of a batch."""
         made = [failures_by_run(self.topic, solved.failures, runs)]
         parts: dict[str, dict[int, Stream]] = {}
         for run, estimates in solved.estimates.items():
@@ -195,7 +195,7 @@ class Outputs:
             yield Ragged(stream, np.searchsorted(rows, messages.offsets))
 
     def _of_run(self, estimates: Estimates) -> Iterator[Stream]:
-        """What is said of one run, in streams; raises BadInput where a shape is wrong."""
+        """Make the output streams of one run; raises BadInput where a shape is wrong."""
         time_ns, mean, covariance = self._checked(
             "", estimates[:3], ((), (len(self.components),), (self.tangent,) * 2)
         )

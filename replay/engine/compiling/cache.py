@@ -25,7 +25,7 @@ _TURN_S = 120.0
 
 
 def cache_folder() -> Path:
-    """Where this user's computed results are kept.
+    """Find where this user's computed results are kept.
 
     FUSELOG_CACHE, else $XDG_CACHE_HOME/fuselog, else ~/.cache/fuselog. By XDG's specification a relative
     path there does not count.
@@ -38,7 +38,7 @@ def cache_folder() -> Path:
 
 
 def is_private(folder: Path) -> bool:
-    """Whether only this user can have written to a folder of the cache; what speaks against it is said.
+    """Tell whether only this user can have written to a folder of the cache; reports why not.
 
     A folder that is not there yet is private: `write_checked` makes it so. Of the folder that it lies in
     others may be owners or writers where that is sticky, as /tmp is: nobody else moves an entry away.
@@ -64,7 +64,7 @@ def is_private(folder: Path) -> bool:
 
 
 def is_own(status: os.stat_result) -> bool:
-    """Whether a file or folder is this user's, and nobody else may write to it.
+    """Tell whether a file or folder is this user's, and nobody else may write to it.
 
     Systems without user numbers (Windows) keep a user's folders apart by themselves.
     """
@@ -77,12 +77,12 @@ def _user() -> int | None:
 
 @cache
 def say_once(sentence: str) -> None:
-    """A warning that one process gives once, however often its cause is met."""
+    """Return a warning that one process gives once, however often its cause is met."""
     logging.getLogger("fuselog").warning(sentence)
 
 
 def kept_files() -> Iterator[Path]:
-    """The files in this user's cache that fuselog wrote, and that are as it wrote them."""
+    """Return the files in this user's cache that fuselog wrote, and that are as it wrote them."""
     for path in sorted(cache_folder().glob("*/*.bin")):
         ours = not path.is_symlink() and is_private(path.parent)
         if ours and read_checked(path) is not None:
@@ -99,7 +99,7 @@ def read_own(path: Path) -> bytes | None:
 
 
 def read_checked(source: Path | Traversable) -> bytes | None:
-    """The content that `write_checked` wrote, or None where the file is damaged or not there."""
+    """Return the content that `write_checked` wrote, or None where the file is damaged or not there."""
     try:
         return _content(source.read_bytes())
     except OSError:

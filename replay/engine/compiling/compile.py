@@ -21,10 +21,10 @@ Result = TypeVar("Result")
 
 
 class Loop(Protocol):
-    """A compiled loop over runs."""
+    """Represents a compiled loop over runs."""
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
-        """What goes through the runs from a first one up to an end, with these arguments.
+        """Return what goes through the runs from a first one up to an end, with these arguments.
 
         The last of them, `scratch`, is what one core works in.
         """
@@ -40,6 +40,10 @@ def compiled(
     are given by position. One that makes no arrays (`allocates=False`) is compiled in a twentieth of the
     time; it returns nothing, or one number of the kind that its annotation says.
     Raises BadInput, when called, where a source is not at hand.
+
+    Args:
+        function: plain Python over arrays and numbers.
+        allocates: whether it makes arrays.
     """
 
     @cache
@@ -108,7 +112,10 @@ def compile_over_runs(
 
 
 def uncompiled_over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
-    """What `compile_over_runs` returns, in plain Python; NaN and infinity raise nothing here either."""
+    """Make the loop of `compile_over_runs` in plain Python.
+
+    NaN and infinity raise nothing here either.
+    """
 
     def loop(
         runs: int,
@@ -181,7 +188,7 @@ def use_cores(count: int) -> None:
 
 @cache
 def core_count() -> int:
-    """How many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
+    """Count how many cores kernels use: NUMBA_NUM_THREADS, else those that this process may use."""
     asked = os.environ.get("NUMBA_NUM_THREADS", "")
     if asked.isdigit() and int(asked) > 0:
         return int(asked)
@@ -191,10 +198,10 @@ def core_count() -> int:
 
 @lru_cache(maxsize=1)
 def _helpers(process: int) -> ThreadPoolExecutor:  # noqa: ARG001
-    """The threads beside the calling one; a forked process has none of its parent's."""
+    """Return the threads beside the calling one; a forked process has none of its parent's."""
     return ThreadPoolExecutor(max(1, core_count() - 1))
 
 
 def is_uncompiled() -> bool:
-    """Whether kernels are plain Python now."""
+    """Tell whether kernels are plain Python now."""
     return os.environ.get("FUSELOG_UNCOMPILED") == "1"

@@ -19,7 +19,7 @@ _OF_PYTHON = {"numpy", *sys.stdlib_module_names}
 
 
 def identity(function: FunctionType) -> str:
-    """The words of a function, each thing that it needs described once."""
+    """Return the words of a function, each thing that it needs described once."""
     told: dict[int, int] = {}
     kept: list[Any] = []  # whose ids are keys
     return "\n".join(_words(function, told, kept, ()))
@@ -27,14 +27,14 @@ def identity(function: FunctionType) -> str:
 
 @cache
 def digest_of(room: str) -> str:
-    """The digest of a room's own sources: what it made before is made anew after a change."""
+    """Return the digest of a room's own sources: what it made before is made anew after a change."""
     places = sorted(files(room).iterdir(), key=lambda place: place.name)
     sources = [place.read_bytes() for place in places if place.name.endswith(".py")]
     return sha256(b"".join(sources)).hexdigest()
 
 
 def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[str]) -> Iterator[str]:
-    """The words of what is used by code that has these names, among them its attributes."""
+    """Return the words of what is used by code that has these names, among them its attributes."""
 
     def of(part: Any) -> Iterator[str]:
         return _words(part, told, kept, names)
@@ -90,7 +90,7 @@ def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[st
 
 
 def _is_told(value: Any, told: dict[int, int], kept: list[Any]) -> bool:
-    """Whether it was described before, which it is from now on."""
+    """Tell whether it was described before, which it is from now on."""
     if id(value) in told:
         return True
     told[id(value)] = len(told)

@@ -10,7 +10,7 @@ from numba.core.typed_passes import NativeLowering
 
 
 class _InlinedLibrary(JITCodeLibrary):
-    """The code of one function that only other compiled code calls, and of which that gets a copy.
+    """Holds the code of one function that only other compiled code calls, which gets a copy of it.
 
     It is optimised there, once; numba would optimise it at every level of calls above it, which takes
     half of the time that a kernel of many small functions needs to compile. Nor is machine code made of
@@ -54,10 +54,10 @@ class _InlinedLowering(NativeLowering):
 
 
 class Inlined(Compiler):
-    """The compiler of functions that end up in another kernel, see `numba.njit(pipeline_class=...)`."""
+    """Compiles functions that end up in another kernel, see `numba.njit(pipeline_class=...)`."""
 
     def define_pipelines(self) -> Any:
-        """The usual passes, but for the last, into a library of another kind."""
+        """Return the usual passes, but for the last, into a library of another kind."""
         codegen = self.state.targetctx.codegen()
         library = _InlinedLibrary(codegen, self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
         self.state.library = library

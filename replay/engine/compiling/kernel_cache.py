@@ -39,7 +39,12 @@ _COLOURLESS = SimpleNamespace(
 
 @lru_cache(maxsize=64)
 def load(text: str, title: str) -> Callable[..., Any]:
-    """The function `kernel` of a module with this text; `title` is what to call it to a user."""
+    """Make the function `kernel` of a module with this text; `title` is what to call it to a user.
+
+    Args:
+        text: the source, in which `kernel` stands.
+        title: see above.
+    """
     versions = f"{sys.implementation.cache_tag} numba {numba.__version__} numpy {version('numpy')}"
     name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
     module = ModuleType(name)
@@ -52,7 +57,13 @@ def load(text: str, title: str) -> Callable[..., Any]:
 
 
 def execute(source: str, name: str, module: ModuleType) -> None:
-    """Define what a source defines in a module; `name` is its file in tracebacks."""
+    """Define what a source defines in a module; `name` is its file in tracebacks.
+
+    Args:
+        source: Python's text.
+        name: see above.
+        module: in which it is defined.
+    """
     exec(compile(source, name, "exec", __future__.annotations.compiler_flag), vars(module))
 
 
@@ -77,7 +88,7 @@ class _CompiledCode:
             return by_numba(signature)
 
     def load_overload(self, signature: Any, target: Any) -> CompileResult | None:
-        """The code, or None: it is compiled then, which is said where it takes long.
+        """Return the code, or None: it is compiled then, which is said where it takes long.
 
         Of several processes that want it one compiles, and the others load what that one has kept.
         """
@@ -106,7 +117,7 @@ class _CompiledCode:
             say_once(f"the cache {path.parent} {why}: what is compiled now is not kept")
 
     def _path(self, signature: Any, target: Any) -> Path | None:
-        """The file for one processor and these types of arguments."""
+        """Return the file for one processor and these types of arguments."""
         key = "\n".join([*map(str, target.codegen().magic_tuple()), *map(_described, signature)])
         try:
             folder = cache_folder()
@@ -148,7 +159,7 @@ def _compiling(title: str) -> Iterator[None]:
 
 
 def _described(kind: Any) -> str:
-    """The name of a type, and the fields of a named tuple, which numba knows by its class alone."""
+    """Describe a type by its name, and the fields of a named tuple, which numba knows by its class."""
     if not isinstance(kind, types.BaseTuple):
         return str(kind)
     entries = ", ".join(map(_described, kind.types))  # type: ignore[attr-defined]

@@ -22,11 +22,11 @@ _NAME = "_defined_here"
 
 
 class DoesNotCompile(BadInput):
-    """What numba says of a function that it cannot compile, and of which line."""
+    """Raised for a function that numba cannot compile, with its line and the reason."""
 
 
 class KernelSource:
-    """Sources in the order they are needed, each under a name that says what it is.
+    """Gathers sources in the order they are needed, each under a name that says what it is.
 
     The name has the hash of the source, in which the names of all that it needs stand: two closures of
     one function, over different models, are two, and what two kernels need is one and compiled once.
@@ -87,7 +87,7 @@ class KernelSource:
         return own
 
     def _source(self, function: FunctionType) -> tuple[str, dict[int, str]]:
-        """A function called `_NAME`, and where its lines, counted from 1, come from."""
+        """Make a function called `_NAME`, and where its lines, counted from 1, come from."""
         closure = inspect.getclosurevars(function)
         needed = {**closure.globals, **closure.nonlocals}
         definition = _definition(function)
@@ -116,7 +116,7 @@ class KernelSource:
 
 
 def _is_global_random(node: ast.AST, needed: Mapping[str, Any]) -> TypeGuard[ast.expr]:
-    """Whether an expression is NumPy's module of generators that are nobody's own."""
+    """Tell whether an expression is NumPy's module of generators that are nobody's own."""
     if isinstance(node, ast.Attribute) and node.attr == "random":
         return isinstance(node.value, ast.Name) and needed.get(node.value.id) is np
     if isinstance(node, ast.Name):
@@ -126,13 +126,13 @@ def _is_global_random(node: ast.AST, needed: Mapping[str, Any]) -> TypeGuard[ast
 
 
 def _is_made_here(value: Any) -> bool:
-    """Whether it is a NamedTuple that was made at run time, which no import by name finds."""
+    """Tell whether it is a NamedTuple that was made at run time, which no import by name finds."""
     made = isinstance(value, type) and issubclass(value, tuple) and hasattr(value, "_fields")
     return made and getattr(sys.modules.get(value.__module__), value.__name__, None) is not value
 
 
 def _is_known_to_numba(function: FunctionType) -> bool:
-    """Whether numba has an implementation of its own for it (`numba.extending.overload`)."""
+    """Tell whether numba has an implementation of its own for it (`numba.extending.overload`)."""
     from numba.core.registry import cpu_target  # which takes long to import
 
     context = cpu_target.typing_context
@@ -145,7 +145,7 @@ def _is_known_to_numba(function: FunctionType) -> bool:
 
 
 def _stamp(value: Any) -> str:
-    """What changes with a thing that is imported by name, and so makes another kernel.
+    """Return what changes with a thing that is imported by name, and so makes another kernel.
 
     Of a NamedTuple the order of its fields; of what numba has an implementation of, the module's source.
     """
@@ -160,7 +160,7 @@ def _stamp(value: Any) -> str:
 
 
 def _literal(value: Any) -> str | None:
-    """A number, text, tuple of these or read-only array as source; None for anything else."""
+    """Return a number, text, tuple of these or read-only array as source; None for anything else."""
     if isinstance(value, float):
         return f"float('{float(value)!r}')"  # infinity and NaN too
     if isinstance(value, tuple):
@@ -173,7 +173,7 @@ def _literal(value: Any) -> str | None:
 
 
 def _definition(function: FunctionType) -> ast.FunctionDef:
-    """A function's source without its decorators and docstring."""
+    """Make a function's source without its decorators and docstring."""
     definition = copy.deepcopy(definition_of(function)[0])  # which is changed here
     definition.decorator_list = []
     if ast.get_docstring(definition) is not None:

@@ -5,7 +5,7 @@ file has changed, and stops on a damaged file. So the sources of a kernel and of
 become one module, whose compiled code is kept in the user's cache under the hash of that text: a changed
 function is a new file, a known one loads in a fraction of a second.
 
-`bundling` gathers sources, `inlining` compiles the inner functions, `keeping` keeps compiled code.
+`kernel_source` gathers sources, `inlining` compiles the inner functions, `kernel_cache` keeps code.
 """
 
 import collections
@@ -30,7 +30,7 @@ vars(_PARTS).update(collections=collections, numba=numba, numpy=np, Inlined=Inli
 
 
 def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function as numba compiles it."""
+    """Make a function as numba compiles it."""
     source = KernelSource()
     name = source.add(function.__name__, function)
     names = ", ".join(inspect.signature(function).parameters)
@@ -39,7 +39,7 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Loop:
-    """A function of one run as a loop over runs."""
+    """Represents a function of one run as a loop over runs."""
 
     def __init__(self, run_once: Callable[..., None], title: str = "") -> None:
         source = KernelSource()
@@ -55,7 +55,7 @@ class _Loop:
         self._loop = _compile(source, kernel, text, title)
 
     def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
-        """The loop for these arguments."""
+        """Make the loop for these arguments."""
 
         def through(first: int, end: int) -> None:
             try:
@@ -78,7 +78,7 @@ loop_of = _Loop
 
 
 def _compile(source: KernelSource, called: str, definition: str, title: str) -> Callable[..., Any]:
-    """The function `kernel` that calls one that a bundle holds; `title` says what it is."""
+    """Make the function `kernel` that calls one of a source; `title` names it."""
     for name, defined in source.definitions.items():
         if name not in vars(_PARTS):
             execute(defined, name, _PARTS)

@@ -42,13 +42,13 @@ class Coverage:
         return np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9
 
     def misses(self, now_ns: Integers) -> NDArray[np.bool_]:
-        """Whether the time (runs,) since each run's last estimate is a gap."""
+        """Tell whether the time (runs,) since each run's last estimate is a gap."""
         interval = _bin_of(now_ns - self.last_ns)
         missed: NDArray[np.bool_] = interval > self.SECOND
         return missed & (interval > self._longest()) if missed.any() else missed
 
     def _longest(self) -> Integers:
-        """The bin (runs,) of the longest intervals that are no gaps."""
+        """Return the bin (runs,) of the longest intervals that are no gaps."""
         reached = np.cumsum(self._counts, axis=0)
         median = np.argmax(2 * reached >= reached[-1], axis=0)
         return np.maximum(median + self.GAP, self.SECOND)

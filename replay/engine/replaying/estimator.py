@@ -24,7 +24,7 @@ from replay.engine.vectors.components import Components
 
 
 class Initialized(NamedTuple):
-    """What the first messages of a log give: static topics to start from, and output streams."""
+    """Holds what the first messages of a log give: static topics to start from, and output streams."""
 
     static: dict[str, Ragged]
     outputs: list[Ragged]
@@ -32,7 +32,7 @@ class Initialized(NamedTuple):
 
 @dataclass(frozen=True)
 class Initialization:
-    """How an estimator finds what a log does not state, such as where to begin.
+    """Describes how an estimator finds what a log does not state, such as where to begin.
 
     Attributes:
         topics: those whose first messages it is handed.
@@ -47,7 +47,7 @@ class Initialization:
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True)
 class Recursive:
-    """An estimator that goes through its topics in time.
+    """Describes an estimator that goes through its topics in time.
 
     Attributes:
         name: what its output topics begin with, `/estimates/` + name.
@@ -87,7 +87,7 @@ class Recursive:
 @renamed(whole="static")
 @dataclass(frozen=True)
 class Batch:
-    """An estimator that needs everything at once: `solve` turns its topics into output streams.
+    """Describes an estimator that needs everything at once: `solve` turns its topics into outputs.
 
     `streams` are the measurements, within the span that is replayed; all else as for `Recursive`.
     """
@@ -125,7 +125,7 @@ class Estimator(Generic[ParametersType]):
 
 
 def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
-    """The registered estimator of `name`, and the parameter that a `name:variant` sets.
+    """Return the registered estimator of `name`, and the parameter that a `name:variant` sets.
 
     Raises BadInput where there is none, or it has no variants.
     """
@@ -135,7 +135,7 @@ def find_estimator(name: str) -> tuple[Estimator[Any], dict[str, Any]]:
 
 
 def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) -> dict[str, Any]:
-    """The parameter that the variant of a name sets; nothing where the name has none.
+    """Return the parameter that the variant of a name sets; nothing where the name has none.
 
     Raises BadInput where what is named, an estimator or a method of this kind, has no variants.
     """
@@ -147,13 +147,17 @@ def set_by_variant(what: str, kind: str, variant: str, parameter: str | None) ->
 
 
 def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], Parameters]:
-    """The estimator of a label, and its parameters.
+    """Make the estimator of a label, and its parameters.
 
     `label` is its name, or any word where an entry `kind` of the settings gives the name: so one
     estimator can be replayed with several settings at once. A `kind` may be an `Estimator` too, which
     needs no name. The other settings are its parameters.
 
     Raises BadInput where the name or a parameter is unknown, or the label is not fit for a topic's name.
+
+    Args:
+        label: see above.
+        settings: by name, with `kind` perhaps among them.
     """
     if not re.fullmatch(r"[\w:=-]+", label):
         raise BadInput(
@@ -181,6 +185,11 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
 
     Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
     of them must be stated alike.
+
+    Args:
+        label: of the estimator, see `configure`.
+        sources: the runs.
+        settings: its parameters by name, with `kind` perhaps among them.
     """
     estimator, parameters = configure(label, settings)
     first = sources[0]

@@ -32,21 +32,25 @@ LONGEST_S = 1e9
 
 
 class Late(NamedTuple):
-    """What is done about messages that come late, and how long is waited or how far gone back."""
+    """Holds what is done about messages that come late, and how long is waited or how far gone back."""
 
     policy: str
     window_ns: int
 
     @property
     def back_ns(self) -> int:
-        """How far the stamps go back that an estimator is handed."""
+        """Compute how far the stamps go back that an estimator is handed."""
         return self.window_ns if self.policy == "rewind" else 0
 
 
 def parse_late(text: str, *, arrival_order: bool) -> Late:
-    """What `drop`, `wait:SECONDS` or `rewind:SECONDS` says.
+    """Parse `drop`, `wait:SECONDS` or `rewind:SECONDS`.
 
-    Raises BadInput where it says nothing, or messages are not taken in the order of their arrival.
+    Raises BadInput where it has another form, or messages are not taken in the order of their arrival.
+
+    Args:
+        text: as given on the command line.
+        arrival_order: whether messages are taken in the order of arrival.
     """
     policy, _, seconds = text.partition(":")
     if policy not in POLICIES:
@@ -72,9 +76,13 @@ def parse_late(text: str, *, arrival_order: bool) -> Late:
 
 
 def taking_late(bound: Bound, late: Late) -> Recursive:
-    """The estimator, handed its messages in the order of log time.
+    """Make the estimator, handed its messages in the order of log time.
 
     Raises BadInput where it is none that goes through its messages in time, or it cannot go back.
+
+    Args:
+        bound: the estimator that wants its messages in order of their stamps.
+        late: what is done with late ones.
     """
     if not isinstance(bound, Recursive):
         raise BadInput(
@@ -97,7 +105,7 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
 
 
 class _State(NamedTuple):
-    """What is carried from block to block.
+    """Holds what is carried from block to block.
 
     Attributes:
         inner: the estimator's own.
@@ -121,7 +129,7 @@ def _run(bound: Recursive, late: Late, state: _State, block: Block) -> tuple[_St
 
 
 def _finish(bound: Recursive, late: Late, state: _State) -> list[Ragged]:
-    """What was held back to the end, and what the estimator itself still has to say."""
+    """Return what was held back to the end, and the estimator's own last outputs."""
     made: list[Ragged] = []
     if state.waiting:
         nothing = {
@@ -152,7 +160,7 @@ def _take(
 
 
 class _Arrivals(NamedTuple):
-    """Messages of all topics in the order in which they are taken, run by run.
+    """Holds messages of all topics in the order in which they are taken, run by run.
 
     Attributes:
         streams: the topics.
@@ -171,12 +179,12 @@ class _Arrivals(NamedTuple):
 
     @property
     def runs(self) -> int:
-        """How many runs there are, empty ones included."""
+        """Count how many runs there are, empty ones included."""
         return next(iter(self.streams.values())).runs
 
 
 def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragged]) -> _Arrivals:
-    """The next messages, and those that were held back; at the same moment in the file's order."""
+    """Join the next messages and those held back; at the same moment in the file's order."""
     if waiting:
         streams = {topic: join([waiting[topic], streams[topic]]) for topic in streams}
     columns = [
@@ -211,7 +219,7 @@ def _reached(streams: dict[str, Ragged]) -> Integers:
 def _find_behind(
     arrivals: _Arrivals, ready: Booleans, before_ns: Integers | None
 ) -> tuple[Integers, Integers]:
-    """The newest stamps (runs,) after those that are taken, and by how much (n,) each was behind them.
+    """Find the newest stamps (runs,) after those taken, and by how much (n,) each was behind them.
 
     Zero for a message that is not behind what was taken before it, and for one that is not ready.
     """
@@ -227,7 +235,7 @@ def _find_behind(
 
 
 def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
-    """The chosen messages, every topic in the order in which they are taken."""
+    """Return the chosen messages, every topic in the order in which they are taken."""
     run, topic, row = (column[chosen] for column in (arrivals.run, arrivals.topic, arrivals.row))
     streams: dict[str, Ragged] = {}
     source, before = np.empty(len(run), np.int64), 0
@@ -247,7 +255,7 @@ def _block(arrivals: _Arrivals, chosen: Booleans) -> Block:
 
 
 def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> Ragged:
-    """The messages that were left out."""
+    """Return the messages that were left out."""
     by = f"more than {late.back_ns * 1e-9:g} s " if late.back_ns else ""
     reasons = [f"topic {topic}: it is {by}{OLDER}" for topic in arrivals.streams]
     stream = reason_stream(
@@ -264,7 +272,7 @@ def _skipped(name: str, arrivals: _Arrivals, is_late: Booleans, late: Late) -> R
 def _waited(
     name: str, streams: dict[str, Ragged], arrived_ns: Integers | None, late: Late
 ) -> tuple[Integers, Ragged]:
-    """The newest stamps (runs,) that have arrived, and the late messages that newer ones wait for."""
+    """Find the newest stamps (runs,) that have arrived, and late messages that newer ones wait for."""
     arrivals = _arrivals(Late("drop", 0), streams, {})
     everything = np.ones(len(arrivals.run), bool)
     arrived_ns, behind_ns = _find_behind(arrivals, everything, arrived_ns)

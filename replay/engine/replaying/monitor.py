@@ -38,7 +38,7 @@ FOREVER = np.iinfo(np.int64).max
 
 
 class RunMonitor:
-    """One bound estimator over the runs of an ensemble; see the module.
+    """Represents one bound estimator over the runs of an ensemble; see the module.
 
     Attributes:
         name: the bound estimator's.
@@ -78,13 +78,13 @@ class RunMonitor:
             self._end_ns[run] = 0
 
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
-        """What `work` makes of the next streams of the runs that have not failed.
+        """Return what `work` makes of the next streams of the runs that have not failed.
 
         `work` is called again, from the same state, without a run that raises. Raises what it raises
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
-        self.usage.note_given(streams, self.static)
+        self.usage.note_given(streams, self.static, self._order)
         began = time.perf_counter()
         try:
             try:
@@ -96,7 +96,7 @@ class RunMonitor:
             self.seconds += time.perf_counter() - began
 
     def receive(self, outputs: Sequence[Ragged]) -> list[Ragged]:
-        """A block's outputs without what is no estimate and all after it; failures are held back."""
+        """Take a block's outputs up to the first that is no estimate; failures are held back."""
         cuts = [self._unsound(each) for each in outputs]
         sound = [self._cut(each, cut) for each, cut in zip(outputs, cuts, strict=True)]
         self.usage.note_outputs(sound)
@@ -118,7 +118,8 @@ class RunMonitor:
         return passed
 
     def finish(self) -> list[Ragged]:
-        """All failures of all runs; what this noted is told where the estimator tells its own."""
+        """Return all failures of all runs: those found here beside the estimator's own."""
+        self.usage.shares.end()
         told = {topic: join(parts) for topic, parts in self._told.items()}
         for run, reason in self._unable.items():
             if self._last_ns[run] >= 0:
@@ -139,7 +140,7 @@ class RunMonitor:
     def coverage(self) -> list[Ragged]:
         """For each case, how much of every run's span was estimated; none of a run without messages.
 
-        Nothing is said of outputs that are no estimates of a state, such as fused scores.
+        There is none for outputs that are no estimates of a state, such as fused scores.
         """
         rows = np.flatnonzero(self._last_ns >= 0)
         offsets = np.searchsorted(rows, np.arange(self.runs + 1))
@@ -161,7 +162,7 @@ class RunMonitor:
         ]
 
     def _starts(self) -> Integers:
-        """What estimates are of before there is one: a batch's first speaks of all from the start."""
+        """Return the stamps before any estimate: a batch's first estimate covers all from the start."""
         return self._first_ns if self._is_batch else np.full(self.runs, -1)
 
     def _note_span(self, streams: Streams) -> None:
@@ -174,7 +175,7 @@ class RunMonitor:
             self._last_ns[runs] = np.maximum(self._last_ns[runs], last)
 
     def _before(self, streams: Streams, end_ns: Integers) -> dict[str, Ragged]:
-        """The messages of every run before its end (runs,)."""
+        """Return the messages of every run before its end (runs,)."""
         if (end_ns == FOREVER).all():
             return dict(streams)
         return {
@@ -226,7 +227,10 @@ class RunMonitor:
             self._end_ns[run] = 0 if self._is_batch else stamps[bad]
 
     def _unsound(self, estimates: Ragged) -> Integers | None:
-        """The first row (runs,) of every run that is no estimate, and its end at that; None for none."""
+        """Find the first row (runs,) of every run that is no estimate, and end it there.
+
+        None for none.
+        """
         stream = estimates.stream
         if stream.schema.full_name != GAUSSIAN or not len(stream):
             return None
@@ -259,7 +263,7 @@ class RunMonitor:
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
-        """An output without the rows from a run's first bad one on, or from the run's end on."""
+        """Return an output without the rows from a run's first bad one on, or from the run's end on."""
         if first_bad is None and (self._end_ns == FOREVER).all():
             return output
         run = _run_of(output)

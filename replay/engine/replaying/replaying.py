@@ -21,7 +21,7 @@ from replay.engine.streams.blocks import Block, Ragged, gather, join, merge_even
 from replay.engine.streams.priors import start_of_runs
 from replay.engine.streams.sources import Ensemble, Source, ensemble_of
 
-BLOCK_MESSAGES = 1 << 18
+BLOCK_MESSAGES = 1 << 16
 # Of a run, those that an initialization looks at.
 FIRST_MESSAGES = 1 << 15
 # Of the product of two standard deviations: rounding is far below.
@@ -32,7 +32,7 @@ _REFUSED = object()
 
 @dataclass
 class Report:
-    """What there is to say of a replay beside its outputs.
+    """Reports on a replay beside its outputs.
 
     Attributes:
         seconds: how long each estimator worked, by label; compiling is part of a first use.
@@ -66,7 +66,7 @@ def replay(
         late: in the order of log time, what is done about messages whose publish times go back; else
             log time is taken for the time at which they were measured.
         block_messages: about how many messages of a run are in memory at once.
-        report: filled with what there is to say when all is done.
+        report: filled when all is done.
         is_part: whether there are more runs than these. Then it is no bad input that an estimator can
             follow none of them: they fail, and the report says so.
 
@@ -137,7 +137,7 @@ def _open(
     bound: Bound,
     static: Mapping[str, Ragged],
 ) -> dict[str, Ragged]:
-    """What an estimator starts from that is found in the first messages; `told` gets what it says."""
+    """Find what an estimator starts from in the first messages; `told` gets its streams."""
     if not isinstance(bound, Recursive) or bound.initialization is None:
         return {}
     topics = bound.initialization.topics
@@ -155,7 +155,7 @@ def _start(
     statics: Sequence[Mapping[str, Ragged]],
     initialization: Callable[[Bound, Mapping[str, Ragged]], dict[str, Ragged]],
 ) -> tuple[list[Any], dict[str, BadInput]]:
-    """The states of recursions and what batches are given; _REFUSED where there is none.
+    """Return the states of recursions and what batches are given; _REFUSED where there is none.
 
     Of what one estimator estimates (each robot, say), what cannot start fails alone. Where that is all,
     there is also the reason, by the estimator's label.
@@ -246,7 +246,7 @@ def _refuse_asymmetric_priors(
 def _required(
     ensemble: Ensemble[Source], topics: Sequence[str], order: Clock, block_messages: int
 ) -> Iterator[dict[str, Ragged]]:
-    """The blocks of the ensemble; raises BadInput where no run has a message of the topics."""
+    """Return the blocks of the ensemble; raises BadInput where no run has a message of the topics."""
     blocks = ensemble.blocks(topics, order, block_messages)
     first = next(blocks, None)
     if first is None and topics:

@@ -5,13 +5,14 @@ what the estimator says that it skipped.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
-from recorders.log import Stream, schemas
+from recorders.log import Clock, Stream, schemas
+from replay.engine.replaying.attribution import Attribution
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 
@@ -22,15 +23,15 @@ LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
 
 
 class Row(NamedTuple):
-    """A line of the table `coverage`.
+    """Holds a line of the table `coverage`.
 
     Attributes:
         estimator: its label.
-        topic: the measurements; several where innovations do not say which of them they are of.
+        topic: the measurements; several where innovations do not name theirs.
         messages: how many there were.
         used, gated: how many gave an innovation that was taken, and one that was refused; None where
             the estimator states no innovations.
-        skipped: how many of them the estimator says that it left out.
+        skipped: how many of them the estimator reports as left out.
         why: of those that were not used, in words.
     """
 
@@ -44,12 +45,12 @@ class Row(NamedTuple):
 
     @property
     def unused(self) -> int:
-        """How many came to nothing, though they were not gated."""
+        """Count how many came to nothing, though they were not gated."""
         return 0 if self.used is None else self.messages - self.used - (self.gated or 0)
 
     @property
     def sentence(self) -> str:
-        """What is said of them; empty where all came to something, or the estimator says why not."""
+        """Write a sentence on them; empty where all had an effect, or the estimator says why not."""
         if self.unused > self.skipped or (self.unused > 0 and not self.used):
             share = f"{self.unused} of {self.messages}"
             return f"{self.estimator}: {self.topic}: {share} not used: {self.why}"
@@ -64,11 +65,12 @@ class Usage:
         name: the bound estimator's.
         given: messages by topic.
         measured: the topics of measurements among these.
-        facts: by topic, how many messages there is something to say of.
+        facts: by topic, how many messages a fact is about.
         used, gated: innovations.
         skipped: what was left out, by reason.
         speaks: whether it gives innovations.
-        doubtful: what to say of a topic that it begins with.
+        doubtful: a sentence on a topic that it begins with.
+        shares: the innovations by topic.
     """
 
     name: str
@@ -80,16 +82,18 @@ class Usage:
     skipped: Counter[str] = field(default_factory=Counter)
     speaks: bool = False
     doubtful: dict[str, str] = field(default_factory=dict)
+    shares: Attribution = field(default_factory=Attribution)
 
     def note_start(self, static: Mapping[str, Ragged]) -> None:
         """Look at the streams that the estimator begins with."""
         for topic, ragged in static.items():
             if ragged.stream.schema.full_name == LANDMARK:
+                self.given[topic] += len(ragged)
                 for run in range(ragged.runs):
                     self._note_map(topic, ragged.of_run(run))
 
     def _note_map(self, topic: str, stream: Stream) -> None:
-        """Say where a landmark is at two places."""
+        """Report landmarks that are at two places."""
         order = np.argsort(stream["landmark_id"], kind="stable")
         number, place = stream["landmark_id"][order], stream["position_m"][order]
         apart_m = np.linalg.norm(np.diff(place, axis=0), axis=1) * (np.diff(number) == 0)
@@ -99,8 +103,17 @@ class Usage:
                 f"landmark {number[worst]} is stated at two places, {apart_m[worst]:.3g} m apart"
             )
 
-    def note_given(self, streams: Mapping[str, Ragged], static: Mapping[str, Ragged]) -> None:
+    def note_given(
+        self, streams: Mapping[str, Ragged], static: Mapping[str, Ragged], order: Clock = "publish_time"
+    ) -> None:
         """Count a block of messages; `static` are the streams that the estimator began with."""
+        sensed = {
+            topic: ragged
+            for topic, ragged in streams.items()
+            if ragged.stream.schema.full_name not in CONTROLS
+        }
+        if len(sensed) > 1:
+            self.shares.note_given(sensed, order)
         for topic, ragged in streams.items():
             stream = ragged.stream
             self.given[topic] += len(stream)
@@ -119,12 +132,15 @@ class Usage:
 
     def note_outputs(self, outputs: Sequence[Ragged]) -> None:
         """Count a block of what the estimator gave."""
-        for stream in (each.stream for each in outputs):
+        for each in outputs:
+            stream = each.stream
             if stream.schema.full_name == INNOVATION:
                 accepted = int((stream["accepted"] != 0).sum())
                 self.used += accepted
                 self.gated += len(stream) - accepted
                 self.speaks = True
+                if len(self.measured) > 1:
+                    self.shares.note_innovations(each)
             elif stream.schema.full_name == SKIPPED and len(stream):
                 self.skipped.update(sentences_of(stream))
 
@@ -139,27 +155,46 @@ class Usage:
         self.skipped.update(other.skipped)
         self.speaks |= other.speaks
         self.doubtful = other.doubtful | self.doubtful
+        self.shares.merge(other.shares)
 
     def rows(self) -> Iterator[Row]:
-        """What became of its measurements: of each topic, or of all where innovations are of several."""
+        """Count what became of measurements: by topic, or all where innovations are of several."""
         label, topics = self.name.partition("/")[0], sorted(self.measured)
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
-        groups = [topics] if self.speaks and topics else [[topic] for topic in topics]
-        for group in groups:
+        for group in [[topic] for topic in topics] if self._is_by_topic else [topics]:
             facts = [
                 f"{count} {fact}" if len(group) == 1 else f"{count} of {topic} {fact}"
                 for topic in group
                 for fact, count in self.facts[topic].items()
                 if count
             ]
-            told = [f"{count} skipped: {why}" for why, count in self.skipped.items()]
+            skipped = {
+                why: count
+                for why, count in self.skipped.items()
+                if len(group) == len(topics) or _topic_in(why, group)
+            }
+            told = [f"{count} skipped: {why}" for why, count in skipped.items()]
             messages = sum(self.given[topic] for topic in group)
-            used, gated = (self.used, self.gated) if self.speaks else (None, None)
-            row = Row(label, " + ".join(group), messages, used, gated, self.skipped.total(), "")
+            row = Row(label, " + ".join(group), messages, None, None, sum(skipped.values()), "")
+            if self.speaks:
+                row = row._replace(used=self.used, gated=self.gated)
+            if self.speaks and len(group) < len(topics):
+                row = row._replace(used=self.shares.used[group[0]], gated=self.shares.gated[group[0]])
             if row.unused > 0 and not facts and not told:
                 told = ["they gave no innovation"]
             yield row._replace(why="; ".join([*told, *facts]))
+
+    @property
+    def _is_by_topic(self) -> bool:
+        """Whether it is known of every topic what became of it, or there is nothing to know."""
+        named = all(_topic_in(why, self.measured) for why in self.skipped)
+        return not self.measured or (named and (self.shares.is_known or not self.speaks))
+
+
+def _topic_in(why: str, topics: Iterable[str]) -> bool:
+    """Whether a reason is of one of these topics, which such reasons begin with."""
+    return any(why.startswith(f"topic {topic}:") for topic in topics)
 
 
 def _infinite(stream: Stream) -> np.ndarray:
@@ -171,7 +206,7 @@ def _infinite(stream: Stream) -> np.ndarray:
 
 
 def _repeated(stream: Stream) -> np.ndarray:
-    """The messages that are in all the same as the one before; NaN is as good as NaN."""
+    """Return the messages that are in all the same as the one before; NaN is as good as NaN."""
     found = np.zeros(len(stream), bool)
     if len(stream) > 1:
         same = np.diff(stream.publish_time_ns) == 0

@@ -16,13 +16,13 @@ from replay.engine.streams.failures import join_streams
 
 @dataclass(frozen=True)
 class Ragged:
-    """One topic of several runs: run r owns the rows offsets[r]:offsets[r + 1] of the stream."""
+    """Holds one topic of several runs: run r owns the rows offsets[r]:offsets[r + 1] of the stream."""
 
     stream: Stream
     offsets: NDArray[np.int64]
 
     def __getitem__(self, name: str) -> NDArray:
-        """The column of one field, all runs end to end."""
+        """Return the column of one field, all runs end to end."""
         return self.stream.columns[name]
 
     def __len__(self) -> int:
@@ -30,16 +30,16 @@ class Ragged:
 
     @property
     def runs(self) -> int:
-        """How many runs there are, empty ones included."""
+        """Count how many runs there are, empty ones included."""
         return len(self.offsets) - 1
 
     def of_run(self, run: int) -> Stream:
-        """The rows of one run, without a copy."""
+        """Return the rows of one run, without a copy."""
         return self.stream.take(slice(int(self.offsets[run]), int(self.offsets[run + 1])))
 
 
 class Events(NamedTuple):
-    """The messages of several topics in time order: run r owns offsets[r]:offsets[r + 1].
+    """Holds the messages of several topics in time order: run r owns offsets[r]:offsets[r + 1].
 
     Event e is of the topic with index `topic[e]`, and message number `source[e]` of all topics laid end
     to end. `is_last[e]` says that no later event of the run has its stamp: the moment for an estimate.
@@ -56,7 +56,7 @@ CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
 
 
 class Block(NamedTuple):
-    """What an estimator gets at once: a span of its topics, in all runs.
+    """Holds what an estimator gets at once: a span of its topics, in all runs.
 
     `arrival` (n, 2) says of every event when it was taken and its place in the file, where that is not
     its stamp's order alone; see `replay.engine.replaying.late`.
@@ -67,7 +67,7 @@ class Block(NamedTuple):
     arrival: NDArray[np.int64] | None = None
 
     def column(self, *names: str, missing: float = np.nan) -> NDArray:
-        """One field of every event: the first of `names` that its topic has, else `missing`."""
+        """Return one field of every event: the first of `names` that its topic has, else `missing`."""
         parts = []
         for ragged in self.streams.values():
             found = [name for name in names if name in ragged.stream.columns]
@@ -76,16 +76,20 @@ class Block(NamedTuple):
 
 
 def copied(carried: CarriedType) -> CarriedType:
-    """A NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
+    """Return a NamedTuple of arrays, or of such NamedTuples, to be changed at will."""
     columns: Any = carried
     made: Any = type(carried)
     return made(*(copied(column) if isinstance(column, tuple) else column.copy() for column in columns))
 
 
 def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
-    """Views of the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
+    """View the part of a NamedTuple of arrays, first axis = run, that belongs to some runs.
 
     An entry may be such a NamedTuple itself.
+
+    Args:
+        carried: a NamedTuple of arrays (runs, ...), or of such NamedTuples.
+        runs: which.
     """
     columns: Any = carried
     made: Any = type(carried)
@@ -95,7 +99,12 @@ def of_runs(carried: CarriedType, runs: slice) -> CarriedType:
 
 
 def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The offsets that the chosen rows of ragged columns have, laid end to end."""
+    """Return the offsets that the chosen rows of ragged columns have, laid end to end.
+
+    Args:
+        chosen: (n,) which rows.
+        offsets: (runs + 1,) of all rows.
+    """
     if chosen.all():
         return offsets
     return np.concatenate([[0], np.cumsum(chosen)])[offsets]
@@ -104,7 +113,7 @@ def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArra
 def filled_rows(
     offsets: NDArray[np.int64], end: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
-    """What is filled of ragged columns whose run r goes from offsets[r] to end[r]: rows, and offsets."""
+    """Find the filled rows of ragged columns whose run r goes from offsets[r] to end[r], and offsets."""
     if np.array_equal(end, offsets[1:]):
         return slice(None), offsets
     run = np.repeat(np.arange(len(end)), np.diff(offsets))
@@ -132,7 +141,12 @@ def join(parts: Sequence[Ragged]) -> Ragged:
 
 
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
-    """All messages of the topics in time order, run by run; equal stamps keep the order of the file."""
+    """Merge messages of the topics in time order, run by run; equal stamps keep the file's order.
+
+    Args:
+        streams: by topic, in all runs.
+        order: the clock.
+    """
     everything = list(streams.values())
     if len(everything) == 1:
         return _in_order(everything[0], order)
@@ -150,14 +164,14 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
 
 
 def _in_order(ragged: Ragged, order: Clock) -> Events:
-    """The messages of the only topic."""
+    """Return the messages of the only topic."""
     times_ns, offsets, count = ragged.stream.times(order), ragged.offsets, len(ragged)
     is_last = last_of_equals(offsets, times_ns)
     return Events(offsets, times_ns, np.zeros(count, np.int64), np.arange(count), is_last)
 
 
 def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Whether a row (n,) is the last of its run, or the next one differs in one of the columns."""
+    """Tell whether a row (n,) is the last of its run, or the next one differs in one of the columns."""
     is_last = np.zeros(len(columns[0]), bool)
     for column in columns:
         is_last[:-1] |= column[1:] != column[:-1]

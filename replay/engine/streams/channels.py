@@ -17,7 +17,7 @@ def stated(
     *,
     needed: bool = True,
 ) -> float:
-    """The first number of this name that one of the channels states; NaN where none needs to.
+    """Return the first number of this name that one of the channels states; NaN where none needs to.
 
     Where it stands for a parameter, that is of the type `parameters`. Raises BadInput where none states
     it though it is needed, it is no number, or the parameter does not take it.
@@ -45,13 +45,26 @@ def _number(topic: str, name: str, text: str, parameters: type[Parameters] | Non
 
 
 def given_or_stated(values: Parameters, topics: Sequence[Topic], name: str) -> float:
-    """A parameter; where it is None, what one of the channels states for it. Errors as `stated`."""
+    """Return a parameter; where it is None, what a channel states for it. Errors as `stated`.
+
+    Args:
+        values: the parameters.
+        topics: asked in this order.
+        name: of the parameter.
+    """
     value = getattr(values, name)
     return stated(topics, name, type(values)) if value is None else float(value)
 
 
 def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) -> dict[int, Topic]:
-    """The topics /STEM<N>/LEAF of a schema, by N in order."""
+    """Return the topics /STEM<N>/LEAF of a schema, by N in order.
+
+    Args:
+        topics: of the log, by name.
+        stem: in front of the number.
+        leaf: behind it.
+        schema: that the topics have to have.
+    """
     found = {}
     for topic in topics.values():
         number = topic.name.removeprefix(f"/{stem}").removesuffix(f"/{leaf}")
@@ -64,7 +77,7 @@ def numbered(topics: Mapping[str, Topic], stem: str, leaf: str, schema: Schema) 
 def bindings(
     topics: Mapping[str, Topic], asked: Mapping[str, Schema], optional: Collection[str] = ()
 ) -> Iterator[tuple[str, dict[str, Topic]]]:
-    """Where a log has all the topics asked for, with their schemas: prefix, and topics as asked for.
+    """Find where a log has all the topics asked for, with their schemas: prefix, and topics by name.
 
     Those that are optional may be absent.
 
@@ -86,5 +99,10 @@ def bindings(
 
 
 def resolved(name: str, prefix: str) -> str:
-    """A topic's full name under a prefix; one with a slash in front is the same for all."""
+    """Return a topic's full name under a prefix; one with a slash in front is the same for all.
+
+    Args:
+        name: as an estimator or model has it.
+        prefix: such as `/robot1`.
+    """
     return name if name.startswith("/") or not name else f"{prefix}/{name}"

@@ -29,7 +29,7 @@ class Failure(NamedTuple):
 
 
 def reason_of(error: Exception) -> str:
-    """What an exception says: the sentence itself where it is one of ours."""
+    """Return an exception's text: the sentence itself where it is one of ours."""
     if isinstance(error, BadInput) and error.__cause__ is None:
         return str(error)
     raised = error.__cause__ if isinstance(error, BadInput) else error
@@ -37,7 +37,12 @@ def reason_of(error: Exception) -> str:
 
 
 def failure_stream(topic: str, failures: Sequence[Failure]) -> Stream:
-    """One message for each failure, on `topic`."""
+    """Return one message for each failure, on `topic`.
+
+    Args:
+        topic: to be written.
+        failures: when and why.
+    """
     if not failures:
         return empty_stream(topic, schemas.FAILURE, {REASONS: "[]"})
     reasons = list(dict.fromkeys(failure.reason for failure in failures))
@@ -57,14 +62,22 @@ def reason_stream(
     reason: NDArray[np.int64],
     reasons: Iterable[str],
 ) -> Stream:
-    """Messages (n,) of a schema whose only field, `reason`, counts in a list of sentences."""
+    """Return messages (n,) of a schema whose only field, `reason`, counts in a list of sentences.
+
+    Args:
+        topic: to be written.
+        schema: with the field `reason`.
+        time_ns: (n,) stamps.
+        reason: (n,) numbers in the list.
+        reasons: the sentences.
+    """
     return make_stream(
         topic, schema, time_ns, metadata={REASONS: json.dumps(list(reasons))}, reason=reason
     )
 
 
 def sentences_of(stream: Stream) -> list[str]:
-    """The reason of every message of a stream of `reason_stream`.
+    """Return the reason of every message of a stream of `reason_stream`.
 
     Raises BadInput where the channel's list is not one of sentences in JSON, as in logs before 0.1.0.
     """
@@ -88,7 +101,7 @@ def join_streams(parts: Sequence[Stream]) -> Stream:
 
 
 def _renumbered(part: Stream, merged: list[str], told: Mapping[str, str]) -> Stream:
-    """The part with numbers that count in the merged list; what its own list lacks stays beyond it."""
+    """Renumber a part by the merged list; what its own list lacks stays beyond it."""
     places = np.array([*map(merged.index, _reasons(part)), len(merged)])
     numbers = places[np.minimum(part["reason"].astype(np.int64), len(places) - 1)]
     columns = {**part.columns, "reason": numbers.astype(part["reason"].dtype)}

@@ -55,7 +55,7 @@ def _in_words(origin: Iterable[float]) -> str:
 
 
 def origins_of(fixes: Ragged) -> Floats:
-    """The first fix (runs, 3) of every run, in deg, deg and m; NaN where a run has none."""
+    """Return the first fix (runs, 3) of every run, in deg, deg and m; NaN where a run has none."""
     has_one = np.diff(fixes.offsets) > 0
     rows = fixes.offsets[:-1][has_one]
     origins = np.full((fixes.runs, 3), np.nan)
@@ -66,10 +66,14 @@ def origins_of(fixes: Ragged) -> Floats:
 
 
 def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
-    """A topic of geodetic fixes as one of positions (n, 3) about the origins (runs, 3).
+    """Return a topic of geodetic fixes as one of positions (n, 3) about the origins (runs, 3).
 
     What a fix lacks (its altitude, say) is NaN. Covariances (n, 9) are turned from the axes of the fix
     to those of the origin; a log may have them diagonal or full, of east and north alone or with up.
+
+    Args:
+        fixes: latitudes, longitudes and altitudes, in all runs.
+        origins: (runs, 3) latitudes, longitudes and altitudes, see `origins_of`.
     """
     stream = fixes.stream
     origin = origins[np.repeat(np.arange(fixes.runs), np.diff(fixes.offsets))]
@@ -87,7 +91,10 @@ def in_plane(fixes: Ragged, origins: Floats) -> Ragged:
 
 
 def _turned(stream: Stream, axes: Floats, own: Floats) -> Floats:
-    """The fixes' covariances (n, 9) in other axes (n, 3, 3) than their own; NaN where they lack them."""
+    """Turn the fixes' covariances (n, 9) to other axes (n, 3, 3) than their own.
+
+    NaN where they lack them.
+    """
     given = stream.columns.get("covariance_m2", np.empty((len(stream), 0)))
     size = {0: 0, 2: 2, 3: 3, 4: 2, 9: 3}.get(given.shape[1])
     if size is None:

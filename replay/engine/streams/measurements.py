@@ -25,7 +25,7 @@ _IMPLIED = {
 
 
 class Vectors(NamedTuple):
-    """What is wanted of the vectors of a topic.
+    """Holds what is wanted of the vectors of a topic.
 
     Attributes:
         fields: by field, the components, or how many numbers where the schema says what they are.
@@ -38,7 +38,7 @@ class Vectors(NamedTuple):
     sigma: str = ""
 
     def complaint(self, topic: str) -> str:
-        """Why a message was not used; "" where there is no covariance that could be missing."""
+        """Explain why a message was not used; "" where there is no covariance that could be missing."""
         mend = f"; give --set {self.sigma}=..." if self.sigma else ""
         return f"topic {topic}: {self.covariance} is missing{mend}" if self.covariance else ""
 
@@ -56,10 +56,15 @@ class Fixes(NamedTuple):
 
 
 def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
-    """The wanted components (n, d) of a vector field, in the order wanted.
+    """Return the wanted components (n, d) of a vector field, in the order wanted.
 
     The channel's metadata names them; positions of two or three numbers need no names. Raises BadInput
     where a component is missing, or the vectors have another width than the channel states.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        wanted: components by name, with their kinds.
     """
     if not len(stream):
         return np.empty((0, len(wanted)))
@@ -70,11 +75,18 @@ def read_vectors(stream: Stream, field: str, wanted: Components) -> Floats:
 def read_fixes(
     stream: Stream, field: str, covariance: str, wanted: Components, sigma: float | None
 ) -> Fixes:
-    """The wanted components of a vector field and of its covariance, row-major or diagonal in another.
+    """Read wanted components of a vector field and its covariance, row-major or diagonal in another.
 
     `sigma` of every component stands where the covariance is unknown. A position in the plane serves
     where one in space is wanted: its height is NaN. Raises BadInput as `read_vectors`, and where the
     covariance has another width than the vector.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        covariance: the field of its covariance.
+        wanted: components by name, with their kinds.
+        sigma: of every component where a message states no covariance; None for unknown.
     """
     stream = _in_space(stream, field, covariance, wanted)
     value = read_vectors(stream, field, wanted)
@@ -94,15 +106,20 @@ def read_fixes(
 
 
 def unknown(covariance: Floats) -> NDArray[np.bool_]:
-    """Which covariances (n, d, d) are none: NaN, or with a variance that is not positive."""
+    """Find which covariances (n, d, d) are none: NaN, or with a variance that is not positive."""
     smallest: Floats = np.diagonal(covariance, axis1=1, axis2=2).min(axis=1)
     return ~(smallest > 0.0) | np.isnan(covariance.sum(axis=(1, 2)))
 
 
 def matrices(stream: Stream, field: str, covariance: str) -> Floats:
-    """The covariances (n, d, d) of a vector field of d numbers, stated whole or as their diagonals.
+    """Read the covariances (n, d, d) of a vector field of d numbers, stated whole or as diagonals.
 
     Raises BadInput where they have another width.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        covariance: the field of its covariance.
     """
     size, width = stream[field].shape[1], stream[covariance].shape[1]
     if width == size**2:
@@ -116,9 +133,13 @@ def matrices(stream: Stream, field: str, covariance: str) -> Floats:
 
 
 def covariances_of(stream: Stream, wanted: Components) -> Floats:
-    """The covariances (n, t, t) of the wanted components of states, in the tangent space.
+    """Compute the covariances (n, t, t) of the wanted components of states, in the tangent space.
 
     Raises BadInput where the channel lacks one of the components.
+
+    Args:
+        stream: of states.
+        wanted: components by name, with their kinds.
     """
     at = match_tangent(stream.metadata, wanted, f"topic {stream.topic}")
     size = isqrt(stream["covariance"].shape[1])
@@ -127,7 +148,7 @@ def covariances_of(stream: Stream, wanted: Components) -> Floats:
 
 
 def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -> Stream:
-    """Positions in the plane as such in space, of unknown height, where that is wanted."""
+    """Return positions in the plane as such in space, of unknown height, where that is wanted."""
     is_plane = field == "position_m" and len(stream) and stream[field].shape[1] == 2
     if not is_plane or "z_m" not in wanted or "components" in stream.metadata:
         return stream
@@ -141,9 +162,14 @@ def _in_space(stream: Stream, field: str, covariance: str, wanted: Components) -
 def numbers_of(
     stream: Stream, vectors: Vectors | None, parameters: object
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """The fields after the sensor's clock side by side (n, width), and which (n,) lack a covariance.
+    """Lay the fields after the sensor's clock side by side (n, width); which (n,) lack a covariance.
 
     Raises BadInput where vectors are not what is wanted.
+
+    Args:
+        stream: the messages.
+        vectors: how vector fields are read; None for as they are.
+        parameters: the estimator's.
     """
     fields = {} if vectors is None else vectors.fields
     columns = {entry.name: stream[entry.name] for entry in stream.schema}
@@ -164,7 +190,13 @@ def numbers_of(
 
 
 def check_width(stream: Stream, field: str, width: int) -> None:
-    """Raise BadInput where a vector field does not have so many numbers."""
+    """Raise BadInput where a vector field does not have so many numbers.
+
+    Args:
+        stream: the messages.
+        field: the vector's.
+        width: how many numbers it has to have.
+    """
     if len(stream) and stream[field].shape[1] != width:
         raise BadInput(
             f"topic {stream.topic}: {field} has {stream[field].shape[1]} numbers; {width} are needed"
@@ -172,7 +204,7 @@ def check_width(stream: Stream, field: str, width: int) -> None:
 
 
 def _stated(stream: Stream, field: str) -> Mapping[str, str]:
-    """The channel's names and kinds, or those that the field implies; checked against the width."""
+    """Read the channel's names and kinds, or those that the field implies; checked against the width."""
     width = stream[field].shape[1]
     stated = stream.metadata
     if "components" not in stated:

@@ -26,7 +26,7 @@ NOT_POSITIVE_DEFINITE = "the prior's covariance is not positive definite"
 
 
 class Priors(NamedTuple):
-    """The first Gaussian of every run, its components in the order in which they were wanted.
+    """Holds the first Gaussian of every run, its components in the order in which they were wanted.
 
     Attributes:
         time_ns: (runs,) stamps.
@@ -42,10 +42,14 @@ class Priors(NamedTuple):
 
 
 def priors_of(prior: Ragged, components: Components) -> Priors:
-    """The priors of all runs; see `Priors`.
+    """Return the priors of all runs; see `Priors`.
 
     Raises BadInput where the channel does not state the components (see `match_components`), or the
     vectors have other widths than it states.
+
+    Args:
+        prior: Gaussian estimates of all runs.
+        components: wanted, by name, with their kinds.
     """
     stream, runs = prior.stream, prior.runs
     where = f"topic {stream.topic}"
@@ -79,7 +83,7 @@ def priors_of(prior: Ragged, components: Components) -> Priors:
 
 
 class _Layout(NamedTuple):
-    """How many components a channel states, of the tangent space too, and where the wanted stand."""
+    """Describes how many components a channel states, tangent space too, and where the wanted stand."""
 
     stated: int
     tangent: int
@@ -89,7 +93,10 @@ class _Layout(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
-    """The layout of a channel that states these names and kinds; raises BadInput as `read_priors`."""
+    """Make the layout of a channel that states these names and kinds.
+
+    Raises BadInput as `read_priors`.
+    """
     metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
     stated = stated_components(metadata, components, where)
     return _Layout(
@@ -101,7 +108,13 @@ def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where:
 
 
 def no_priors(runs: int, components: Components, reason: str) -> Priors:
-    """Priors that cannot be used, all for one reason."""
+    """Return priors that cannot be used, all for one reason.
+
+    Args:
+        runs: how many.
+        components: wanted, by name, with their kinds.
+        reason: why, as a sentence.
+    """
     size = len(tangent_components(list(components), list(components.values())))
     return Priors(
         np.zeros(runs, np.int64),
@@ -114,7 +127,7 @@ def no_priors(runs: int, components: Components, reason: str) -> Priors:
 def start_of_runs(
     static: Mapping[str, Ragged], priors: Mapping[str, Components]
 ) -> tuple[dict[str, Ragged], dict[int, str]]:
-    """What an estimator starts from, and why some runs cannot start.
+    """Return what an estimator starts from, and why some runs cannot start.
 
     Args:
         static: topics of all runs.
@@ -138,7 +151,7 @@ def start_of_runs(
 def gaussians(
     prior: Ragged,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """What an estimator starts from a prior of `start_of_runs`.
+    """Return what an estimator starts from a prior of `start_of_runs`.
 
     Stamps (runs,), means (runs, d), covariances (runs, t, t), to be changed at will.
     """

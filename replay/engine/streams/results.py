@@ -20,7 +20,7 @@ ALL_WELL = -1  # of a run; what is not negative counts in a list of reasons
 
 
 def named(components: Mapping[str, str]) -> dict[str, str]:
-    """Components and their kinds as a channel states them."""
+    """Return components and their kinds as a channel states them."""
     return {"components": ",".join(components), "kinds": ",".join(components.values())}
 
 
@@ -32,9 +32,17 @@ def state_stream(
     mean: Floats,
     covariance: Floats,
 ) -> Stream:
-    """Means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space.
+    """Return means (n, d), their angles wrapped, and covariances (n, t, t) in the tangent space.
 
     `truth` is the topic that they are compared with; None where there is nothing to compare.
+
+    Args:
+        topic: to be written.
+        time_ns: (n,) stamps.
+        components: by name, with their kinds.
+        truth: the topic of the truth, "" for none.
+        mean: (n, d).
+        covariance: (n, t, t).
     """
     angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
     if angular:
@@ -48,7 +56,15 @@ def state_stream(
 def gaussian_stream(
     topic: str, time_ns: Integers, mean: Floats, covariance: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Means (n, d) and covariances (n, t, t); what is no number ends its run, see `monitor`."""
+    """Return means (n, d) and covariances (n, t, t); what is no number ends its run, see `monitor`.
+
+    Args:
+        topic: to be written.
+        time_ns: (n,) stamps.
+        mean: (n, d).
+        covariance: (n, t, t).
+        metadata: of the channel.
+    """
     columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
     schema = schemas.GAUSSIAN_ESTIMATE
     return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)
@@ -64,7 +80,7 @@ def states_in(
     mean: Floats,
     covariance: Floats,
 ) -> Ragged:
-    """The states in some rows, in order, of columns in which run r owns offsets[r]:offsets[r + 1]."""
+    """Make the states in some rows, in order, of columns whose run r owns offsets[r]:offsets[r + 1]."""
     stream = state_stream(topic, time_ns[rows], components, truth, mean[rows], covariance[rows])
     return Ragged(stream, np.searchsorted(rows, offsets))
 
@@ -82,7 +98,7 @@ def innovation_stream(
     squared: Floats,
     log_likelihood: Floats | None = None,
 ) -> Stream:
-    """Innovations (n, m) with their covariances (n, m, m), NIS (n,) and, where known, log-likelihood."""
+    """Make the stream of innovations (n, m), covariances (n, m, m), NIS (n,) and log-likelihood."""
     if log_likelihood is None:
         log_likelihood = np.full(len(time_ns), np.nan)
     return make_stream(
@@ -100,14 +116,14 @@ def innovation_stream(
 
 
 def _flat(covariance: Floats) -> Floats:
-    """Matrices (n, m, m) as rows (n, m m)."""
+    """Return matrices (n, m, m) as rows (n, m m)."""
     return covariance.reshape(len(covariance), covariance.shape[1] * covariance.shape[2])
 
 
 def failures_of(
     topic: str, before: Integers, after: Integers, time_ns: Integers, reasons: Sequence[str]
 ) -> Ragged:
-    """The runs that failed in a block, on `topic`/failure; one message each, at its own time.
+    """Return the runs that failed in a block, on `topic`/failure; one message each, at its own time.
 
     Args:
         topic: the estimator's, /estimates/NAME and its case.
@@ -122,7 +138,13 @@ def failures_of(
 
 
 def failures_by_run(topic: str, failures: Mapping[int, Failure], runs: int) -> Ragged:
-    """The failures of some of the runs, by their numbers, on `topic`/failure."""
+    """Return the failures of some of the runs, by their numbers, on `topic`/failure.
+
+    Args:
+        topic: of the estimator.
+        failures: by run.
+        runs: how many there are.
+    """
     failed = sorted(failures)
     stream = failure_stream(f"{topic}/failure", [failures[run] for run in failed])
     return Ragged(stream, np.searchsorted(failed, np.arange(runs + 1)))

@@ -25,45 +25,50 @@ from replay.engine.streams.blocks import Ragged, gather
 
 
 class Source(Protocol):
-    """One run, as replay and evaluation see it."""
+    """Represents one run, as replay and evaluation see it."""
 
     @property
     def name(self) -> str:
-        """What to call the run in a message."""
+        """Return what to call the run in a message."""
 
     @property
     def run(self) -> RunMetadata | None:
-        """What the run was."""
+        """Return what the run was."""
 
     @property
     def epoch_ns(self) -> int:
-        """The run's time zero."""
+        """Return the run's time zero."""
 
     @property
     def start_ns(self) -> int | None:
-        """Where the replayed span begins, by the clock of the replay; None where the run begins."""
+        """Find where the replayed span begins, by the clock of the replay; None where the run begins."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """What it holds."""
+        """Return what it holds."""
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Whole topics, in publish-time order."""
+        """Return whole topics, in publish-time order."""
 
     def empty(self, topic: str) -> Stream:
-        """The topic without its messages."""
+        """Return the topic without its messages."""
 
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
+        """Return topics in blocks that follow one another in time; see `recorders.log.read_blocks`."""
 
     def whole(self) -> "Source":
-        """The run without a span."""
+        """Return the run without a span."""
 
 
 def is_sensed(source: Source, topic: str) -> bool:
-    """Whether a topic is the run's own, and columns: no estimates, no images."""
+    """Tell whether a topic is the run's own, and columns: no estimates, no images.
+
+    Args:
+        source: the run.
+        topic: the name.
+    """
     if topic.startswith("/estimates/"):
         return False
     try:
@@ -74,7 +79,7 @@ def is_sensed(source: Source, topic: str) -> bool:
 
 
 class _Readable(Mapping[str, Stream]):
-    """A source as a person reads it: whole streams by topic.
+    """Represents a source as a person reads it: whole streams by topic.
 
     A topic that is not there raises `UnknownName`.
     """
@@ -106,7 +111,7 @@ class _Readable(Mapping[str, Stream]):
 
 @dataclass(frozen=True, repr=False)
 class LogSource(_Readable):
-    """A log file, read lazily; it maps its topics to their streams."""
+    """Represents a log file, read lazily; it maps its topics to their streams."""
 
     log: Log
     start_ns: int | None = None
@@ -114,21 +119,21 @@ class LogSource(_Readable):
 
     @property
     def name(self) -> str:
-        """The log's path."""
+        """Compute the log's path."""
         return str(self.log.path)
 
     @property
     def run(self) -> RunMetadata | None:
-        """The log's run metadata."""
+        """Compute the log's run metadata."""
         return self.log.run
 
     @cached_property
     def epoch_ns(self) -> int:
-        """The run's time zero; where the log does not say, its first publish stamp."""
+        """Return the run's time zero; where the log does not say, its first publish stamp."""
         return self.zero_ns("publish_time")
 
     def zero_ns(self, clock: Clock) -> int:
-        """What times in seconds count from, by one of the two clocks.
+        """Return what times in seconds count from, by one of the two clocks.
 
         It is the epoch that the log states; without one the first stamp of that clock, for the two may
         have nothing in common (simulated and wall time, say).
@@ -136,20 +141,20 @@ class LogSource(_Readable):
         return self.log.run.epoch_ns if self.log.run else read_span(self.log, clock)[0]
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """The first and the last stamp in ns by one of the two clocks."""
+        """Find the first and the last stamp in ns by one of the clocks; zeros where there are none."""
         return read_span(self.log, clock)
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """The log's topics."""
+        """Compute the log's topics."""
         return self.log.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Whole topics, in publish-time order, whatever the source's span."""
+        """Return whole topics, in publish-time order, whatever the source's span."""
         return read_streams(self.log, topics)
 
     def empty(self, topic: str) -> Stream:
-        """The topic without its messages."""
+        """Return the topic without its messages."""
         return read_empty(self.log, topic)
 
     def blocks(
@@ -166,13 +171,13 @@ class LogSource(_Readable):
         )
 
     def whole(self) -> "LogSource":
-        """The whole log."""
+        """Return the whole log."""
         return LogSource(self.log)
 
 
 @dataclass(frozen=True, repr=False)
 class MemorySource(_Readable):
-    """A recording in memory: read and replayed as if it had been written and read back."""
+    """Represents a recording in memory: read and replayed as if it had been written and read back."""
 
     streams: Mapping[str, Stream]
     run: RunMetadata
@@ -182,11 +187,11 @@ class MemorySource(_Readable):
 
     @property
     def epoch_ns(self) -> int:
-        """The run's time zero."""
+        """Return the run's time zero."""
         return self.run.epoch_ns
 
     def zero_ns(self, clock: Clock) -> int:  # noqa: ARG002
-        """What times in seconds count from: the epoch, by either clock."""
+        """Return what times in seconds count from: the epoch, by either clock."""
         return self.epoch_ns
 
     def extent(self, clock: Clock) -> tuple[int, int]:
@@ -197,18 +202,18 @@ class MemorySource(_Readable):
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
-        """The recording's topics."""
+        """Return the recording's topics."""
         return {
             topic: Topic(topic, stream.schema.full_name, "protobuf", (), stream.metadata, len(stream))
             for topic, stream in self.streams.items()
         }
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Whole topics, in publish-time order."""
+        """Return whole topics, in publish-time order."""
         return {topic: self.in_order(topic, "publish_time") for topic in topics}
 
     def empty(self, topic: str) -> Stream:
-        """The topic without its messages."""
+        """Return the topic without its messages."""
         return self.streams[topic].take(slice(0, 0))
 
     def blocks(
@@ -217,23 +222,23 @@ class MemorySource(_Readable):
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """The source's span in one block, unless there is nothing: everything is in memory already."""
+        """Yield the source's span in one block, unless there is nothing: all is in memory already."""
         spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
             yield block
 
     def whole(self) -> "MemorySource":
-        """The whole recording."""
+        """Return the whole recording."""
         return replace(self, start_ns=None, end_ns=None)
 
     @property
     def is_whole(self) -> bool:
-        """Whether there is no span."""
+        """Tell whether there is no span."""
         return self.start_ns is None and self.end_ns is None
 
     def _within(self, stream: Stream, order: Clock) -> Stream:
-        """The messages of the source's span, of a stream in order."""
+        """Return the messages of the source's span, of a stream in order."""
         if self.is_whole:
             return stream
         times_ns = stream.times(order)
@@ -242,21 +247,26 @@ class MemorySource(_Readable):
         return stream.take(slice(int(start), int(end)))
 
     def in_order(self, topic: str, order: Clock) -> Stream:
-        """A topic by one of the clocks; equal stamps as in the file."""
+        """Return a topic by one of the clocks; equal stamps as in the file."""
         stream = self.stream_of(topic)
         if is_in_order(gather([stream]), order):
             return stream
         return stream.take(np.lexsort((stream.position, stream.times(order))))
 
     def stream_of(self, topic: str) -> Stream:
-        """A topic as it was recorded; raises BadInput where it is not there."""
+        """Return a topic as it was recorded; raises BadInput where it is not there."""
         if topic not in self.streams:
             raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
         return self.streams[topic]
 
 
 def is_in_order(runs: Ragged, order: Clock) -> bool:
-    """Whether the messages of every run go by one of the clocks, and by their places in the file."""
+    """Tell whether every run's messages go by one of the clocks, and by their places in the file.
+
+    Args:
+        runs: the messages of a topic, in all runs.
+        order: the clock.
+    """
     clock, position = runs.stream.times(order), runs.stream.position
     ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
     if ordered.all():
@@ -267,7 +277,12 @@ def is_in_order(runs: Ragged, order: Clock) -> bool:
 
 
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
-    """A recording with the positions that a log of it would have: merged by log time, ties in order."""
+    """Make a source of a recording with a log's positions: merged by log time, ties in order.
+
+    Args:
+        recording: streams in memory.
+        run: what is known of it.
+    """
     streams = recording.streams
     ranks = np.empty(sum(map(len, streams)), np.int64)
     times = [stream.log_time_ns for stream in streams]
@@ -286,7 +301,7 @@ SourceType = TypeVar("SourceType", bound=Source)
 
 
 class Ensemble(list[SourceType]):
-    """Runs that are replayed together: they hold the same topics.
+    """Represents runs that are replayed together: they hold the same topics.
 
     An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept;
     no run may be added to it or taken from it.
@@ -299,7 +314,7 @@ class Ensemble(list[SourceType]):
 
     @cached_property
     def starts_ns(self) -> dict[int, int]:
-        """Where the replayed spans begin, by run; of those that do not begin with their run."""
+        """Find where the replayed spans begin, by run; of those that do not begin with their run."""
         starts_ns = ((run, source.start_ns) for run, source in enumerate(self))
         return {run: start_ns for run, start_ns in starts_ns if start_ns is not None}
 
@@ -322,7 +337,7 @@ class Ensemble(list[SourceType]):
             self._alike.add(topic)
 
     def read(self, topics: Sequence[str]) -> dict[str, Ragged]:
-        """Whole topics, in publish-time order."""
+        """Return whole topics, in publish-time order."""
         if self._recordings:
             return self._laid_out(topics, "publish_time")
         runs = [source.read(topics) for source in self]
@@ -331,7 +346,7 @@ class Ensemble(list[SourceType]):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Ragged]]:
-        """The next block of every run, until all runs are at their end.
+        """Return the next block of every run, until all runs are at their end.
 
         The runs need not be at the same time: each has its own state. Recordings are one block.
         """
@@ -353,17 +368,17 @@ class Ensemble(list[SourceType]):
 
     @cached_property
     def _recordings(self) -> list[MemorySource]:
-        """The runs, where all are in memory."""
+        """Return the runs, where all are in memory."""
         found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
         return found if len(found) == len(self) else []
 
     @cached_property
     def _are_whole(self) -> bool:
-        """Whether all runs are in memory, without spans."""
+        """Tell whether all runs are in memory, without spans."""
         return bool(self._recordings) and all(run.is_whole for run in self._recordings)
 
     def _laid_out(self, topics: Sequence[str], order: Clock) -> dict[str, Ragged]:
-        """Topics of recordings, each run by one of the clocks."""
+        """Return topics of recordings, each run by one of the clocks."""
         for topic in topics:
             if (topic, order) not in self._kept:
                 together = gather([source.stream_of(topic) for source in self._recordings])
@@ -374,5 +389,5 @@ class Ensemble(list[SourceType]):
 
 
 def ensemble_of(sources: Sequence[SourceType]) -> Ensemble[SourceType]:
-    """The ensemble of these runs, which may be one already."""
+    """Return the ensemble of these runs, which may be one already."""
     return sources if isinstance(sources, Ensemble) else Ensemble(sources)

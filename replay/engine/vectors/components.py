@@ -11,12 +11,12 @@ Components = Mapping[str, Kind]
 
 
 def components_of(names: Sequence[str]) -> Components:
-    """Names with their kinds: an angle is a component in rad that wraps, others are linear."""
+    """Return names with their kinds: an angle is a component in rad that wraps, others are linear."""
     return stated_components(state_metadata(names), {}, "components")
 
 
 def match_components(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Where the wanted components stand among those that a channel states.
+    """Find where the wanted components stand among those that a channel states.
 
     Args:
         stated: the channel's metadata: names as `components`, with or without their `kinds`.
@@ -41,7 +41,7 @@ def match_components(stated: Mapping[str, str], wanted: Components, where: str) 
 
 
 def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> list[int]:
-    """Which rows and columns of a stated covariance are those of the wanted components, in their order.
+    """Find which rows and columns of a stated covariance are the wanted components', in order.
 
     A covariance is in the tangent space: one row for an axis, three for a quaternion, see
     `replay.engine.vectors.tangent`. Args and errors as `match_components`.
@@ -60,10 +60,15 @@ def match_tangent(stated: Mapping[str, str], wanted: Components, where: str) -> 
 
 
 def stated_components(stated: Mapping[str, str], wanted: Components, where: str) -> dict[str, Kind]:
-    """Names and kinds as a channel states them, in its order; empty where it names none.
+    """Return names and kinds as a channel states them, in its order; empty where it names none.
 
     A channel without kinds means the wanted ones, and "linear" for what is not wanted. Raises BadInput
     where a name stands twice, or the kinds are none or not one for each name.
+
+    Args:
+        stated: the channel's metadata.
+        wanted: whose kinds hold where none are stated.
+        where: the topic, for errors.
     """
     names = [name for name in stated.get("components", "").split(",") if name]
     listed = stated.get("kinds", "")

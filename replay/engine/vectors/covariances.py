@@ -13,10 +13,14 @@ ROUNDING = 1e-14
 
 
 def normalized_error_squared(error: Array, covariance: Array) -> Array:
-    """NEES or NIS e' P^-1 e of errors (..., n) and covariances (..., n, n); leading axes broadcast.
+    """Compute NEES or NIS e' P^-1 e of errors (..., n); leading axes broadcast.
 
     A component of infinite variance counts nothing. NaN where there are no components, where an error or
     a covariance is NaN, or where a covariance is not positive definite.
+
+    Args:
+        error: (..., n).
+        covariance: (..., n, n).
 
     >>> errors = np.array([[1.0, 2.0], [0.0, 1.0]])
     >>> normalized_error_squared(errors, np.diag([1.0, 4.0])).tolist()
@@ -34,13 +38,13 @@ def normalized_error_squared(error: Array, covariance: Array) -> Array:
 
 
 def is_positive_definite(covariance: Array) -> NDArray[np.bool_]:
-    """Whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
+    """Tell whether covariances (..., n, n) are, (...); see `normalized_error_squared`."""
     pivots = np.diagonal(_factors(covariance), axis1=-2, axis2=-1)
     return np.isfinite(pivots).all(axis=-1) & (pivots.shape[-1] > 0)
 
 
 def _factors(covariance: Array) -> Array:
-    """The lower Cholesky factors (..., n, n); NaN from where there is none on.
+    """Return the lower Cholesky factors (..., n, n); NaN from where there is none on.
 
     A component of infinite variance is one that is independent of all others.
     """

@@ -25,7 +25,7 @@ TANGENT_WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 1, "quaternio
 
 
 def are_kinds(kinds: Sequence[str]) -> bool:
-    """Whether these are kinds, with all components of every axis and quaternion side by side."""
+    """Tell whether these are kinds, with all components of every axis and quaternion side by side."""
     index = 0
     while index < len(kinds):
         width = WIDTHS.get(kinds[index])
@@ -45,10 +45,14 @@ def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
 
 
 def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[tuple[str, str]]:
-    """Names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
+    """Return names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
 
     A linear component or angle keeps its name; an axis has one "angle", a quaternion three components
     of kind "rotation".
+
+    Args:
+        components: names.
+        kinds: one for each.
     """
     found: list[tuple[str, str]] = []
     for kind, columns in manifold_blocks(kinds):
@@ -62,7 +66,13 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
 
 
 def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
-    """Estimate - truth, both (n, components), in the tangent space (n, tangent components)."""
+    """Subtract truth from estimate, both (n, components), in the tangent space (n, tangent components).
+
+    Args:
+        estimate: (n, components).
+        truth: (n, components).
+        kinds: one for each component.
+    """
     parts = []
     for kind, columns in manifold_blocks(kinds):
         if kind in ("axis", "quaternion"):
@@ -75,7 +85,14 @@ def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:
 
 
 def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -> Floats:
-    """States (n, components) on the shortest way from left to right, at weights (n,) from 0 to 1."""
+    """Interpolate states (n, components) the shortest way from left to right, at weights (n,).
+
+    Args:
+        left: (n, components).
+        right: (n, components).
+        weight: (n,), from 0 for left to 1 for right.
+        kinds: one for each component.
+    """
     value = np.empty(left.shape)
     for kind, columns in manifold_blocks(kinds):
         here, there = left[:, columns], right[:, columns]
@@ -90,7 +107,14 @@ def between(left: Floats, right: Floats, weight: Floats, kinds: Sequence[str]) -
 def truth_at(
     truth: Stream, time_ns: NDArray[np.int64], kinds: Sequence[str], gap_limit_s: float
 ) -> Floats:
-    """The truth's state (n, d) at any stamps; see `states_at`."""
+    """Return the truth's state (n, d) at any stamps; see `states_at`.
+
+    Args:
+        truth: the stream, whose `state` is (m, d).
+        time_ns: (n,).
+        kinds: one for each component.
+        gap_limit_s: the longest gap that is bridged.
+    """
     return states_at(truth.publish_time_ns, truth["state"], time_ns, kinds, gap_limit_s)
 
 
@@ -101,9 +125,16 @@ def states_at(
     kinds: Sequence[str],
     gap_limit_s: float,
 ) -> Floats:
-    """States (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
+    """Return states (m, d) at times (m,) as states (n, d) at any stamps (n,), the shortest way between.
 
     NaN over gaps above the limit; a stamp that there is a state of exactly needs no neighbour.
+
+    Args:
+        times: (m,), in order.
+        state: (m, d).
+        time_ns: (n,).
+        kinds: one for each component.
+        gap_limit_s: the longest gap that is bridged.
     """
     if len(times) == 0:
         return np.full((len(time_ns), len(kinds)), np.nan)
@@ -118,7 +149,7 @@ def states_at(
 
 
 def rotation_vector(x: Floats) -> Floats:
-    """The shortest rotations of unit complex numbers (n, 2), as angles (n, 1), or of quaternions (n, 4).
+    """Make the shortest rotations of unit complex numbers (n, 2), as angles, or of quaternions (n, 4).
 
     In rad; x and -x are the same, so that the angle of an axis lies in [-pi/2, pi/2].
     """

@@ -15,6 +15,7 @@ from pydantic import Field, NonNegativeFloat, PositiveInt
 from threadpoolctl import threadpool_limits
 
 from recorders.errors import BadInput, choices
+from recorders.extras import extra
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
 from recorders.parameters import Parameters
@@ -121,7 +122,8 @@ def learn_classifier(
 
     QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
     """
-    from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
+    with extra("papers", f"classifier {parameters.classifier}"):
+        from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
 
     vectors = np.nan_to_num(vectors)
     model = _classifier(parameters, int(rng.integers(2**31)))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
+from recorders.extras import extra
 from replay.engine.arrays import Floats
 
 UNEVEN = 1e-9  # far more than rounding, and far less than scores say
@@ -80,7 +81,8 @@ def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
 
 def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     """States in the order of the vectors: k-means of each, one step at a time, or any after any."""
-    from sklearn.cluster import KMeans  # which takes long to import
+    with extra("papers", "a mixture of scores"):
+        from sklearn.cluster import KMeans  # which takes long to import
 
     states = sequences.shape[1]
     initial, transition = np.full(states, 1 / states), np.full((states, states), 1 / states)

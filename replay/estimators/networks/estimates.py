@@ -50,16 +50,6 @@ def inverted(matrix: Floats, inverse: Floats) -> bool:
     return True
 
 
-def multiply(left: Floats, right: Floats, product: Floats) -> None:
-    """Fill left @ right."""
-    for row in range(left.shape[0]):
-        for column in range(right.shape[1]):
-            entry = 0.0
-            for k in range(left.shape[1]):
-                entry += left[row, k] * right[k, column]
-            product[row, column] = entry
-
-
 def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
     """Fill matrix @ vector."""
     for row in range(len(vector)):

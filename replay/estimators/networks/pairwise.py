@@ -11,12 +11,12 @@ from replay.estimators.networks.estimates import (
     determinant,
     golden,
     inverted,
-    multiply,
     one_of,
     put,
     steps_for,
     transform,
 )
+from replay.inference.linear_algebra.gaussian import multiply
 
 SIGHTING_STEPS = 40
 

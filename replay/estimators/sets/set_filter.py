@@ -10,16 +10,17 @@ A frame and what came before it that contradict each other leave two sets, one o
 if only one of them is wrong; the union is the estimate until later frames have emptied one of the two.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
-import shapely
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
-from shapely.geometry.base import BaseGeometry
 
+from recorders.extras import AtFirstUse
 from recorders.log import Stream, Topic, make_stream, schemas
 from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Batch, Bound, Estimator
@@ -68,6 +69,11 @@ from replay.regions.moving_sets import (
     within_l8,
 )
 
+if TYPE_CHECKING:
+    import shapely
+else:
+    shapely = AtFirstUse("shapely", "papers", "guaranteed sets over time")
+
 LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
@@ -107,7 +113,7 @@ class Step(NamedTuple):
 
     time_ns: int
     anchor_ns: int
-    parts: list[BaseGeometry]
+    parts: list[shapely.Geometry]
     headings: Headings
     growth: float = 1.0
     finding: int | None = None
@@ -120,7 +126,7 @@ class Anchor:
 
     time_ns: int
     pose: Floats
-    parts: list[BaseGeometry]
+    parts: list[shapely.Geometry]
     headings: Headings
 
 
@@ -134,7 +140,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 
 
 def narrowed(
-    headings: Headings, places: BaseGeometry, seen: Bearings, bound_rad: float
+    headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
     """The headings from which landmarks are seen as they were; None where there are none."""
     left: Headings | None = headings
@@ -175,14 +181,14 @@ def follow(
     return steps
 
 
-def _first(frame: Frame, cut: BaseGeometry, seen: Bearings, bounds: Bounds) -> Step:
+def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> Step:
     """What a frame says by itself."""
     headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
     return Step(frame.time_ns, frame.time_ns, [cut], headings)
 
 
 def _advance(
-    anchor: Anchor, frame: Frame, cut: BaseGeometry, seen: Bearings, pose: Floats, bounds: Bounds
+    anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
 ) -> Step:
     """The set of an anchor moved to a frame and cut by it; the anchor is cut by the frame as well."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
@@ -207,7 +213,7 @@ def _advance(
 
 
 def _cut(
-    anchor: Anchor, step: Step, cut: BaseGeometry, seen: Bearings, motion: Motion, bounds: Bounds
+    anchor: Anchor, step: Step, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
 ) -> Step | None:
     """The step and its anchor cut by a frame; None, and no change, where nothing would be left."""
     common = shapely.union_all(step.parts).intersection(cut)
@@ -232,18 +238,18 @@ def _cut(
     return step._replace(parts=[parts[index] for index in alive], headings=headings, finding=finding)
 
 
-def _contradicting(frame: Frame, places: BaseGeometry) -> int | None:
+def _contradicting(frame: Frame, places: shapely.Geometry) -> int | None:
     """The relative bearing whose bound is exceeded most at the corner of a set that suits it best."""
     excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
     best = excess[np.argmin(excess.max(axis=1))]
     return int(np.argmax(best)) if best.max() > 0.0 else None
 
 
-def _simpler(part: BaseGeometry, most_edges: int) -> BaseGeometry:
+def _simpler(part: shapely.Geometry, most_edges: int) -> shapely.Geometry:
     return within_l8(part) if shapely.get_num_coordinates(corners_of(part)) > most_edges else part
 
 
-def _area(parts: Sequence[BaseGeometry]) -> float:
+def _area(parts: Sequence[shapely.Geometry]) -> float:
     return float(shapely.union_all(parts).area)
 
 

@@ -108,7 +108,10 @@ def hungarian(
 
 
 def cost_of(weights: Weights, row: int, column: int, detections: int) -> float:
-    """What a pair costs beside a miss: minus the log of its weight; infinity where it cannot be."""
+    """Compute what a pair costs beside a miss: minus the log of its weight.
+
+    Infinity where it cannot be.
+    """
     if column >= detections:
         return 0.0 if column - detections == row else np.inf
     return -np.log(weights.detected[row, column] / weights.missed[row])
@@ -118,9 +121,9 @@ ASSOCIATIONS = {"nearest": nearest, "hungarian": hungarian, "jpda": jpda}
 
 
 def existence_after(existence: float, none: float, detection_probability: float) -> float:
-    """How probable it is that a track exists, after a scan that gave it no detection by `none`.
+    """Compute how probable it is that a track exists, after a scan that gave it no detection by `none`.
 
-    Musicki and Evans' (15): a miss tells against it by as much as its detection was probable.
+    Musicki and Evans' (15): a miss counts against it by as much as its detection was probable.
     """
     missed = 1.0 - detection_probability
     if_missed = missed * existence / (1.0 - detection_probability * existence)
@@ -128,7 +131,7 @@ def existence_after(existence: float, none: float, detection_probability: float)
 
 
 def marginals(detected: ArrayLike, missed: ArrayLike, association: str = "jpda") -> Floats:
-    """How probable it is that each track has no detection, the first, the second ...: (tracks, 1 + n).
+    """Compute the probabilities of associations (tracks, 1 + n): of none, the first, the second ...
 
     Args:
         detected: (tracks, n), the weights of pairs; 0 outside a gate.

@@ -26,7 +26,7 @@ from replay.inference.linear_algebra.tuples import tuple_of
 
 
 class Births(NamedTuple):
-    """How detections begin tracks, by kind of sensors.
+    """Describes how detections begin tracks, by kind of sensors.
 
     Attributes:
         begins: whether those of a kind do.
@@ -40,7 +40,7 @@ class Births(NamedTuple):
 
 
 def births_of(kinds: Sequence[ScanSensor]) -> Births:
-    """The births of these kinds of sensors."""
+    """Return the births of these kinds of sensors."""
     begins = tuple(kind.birth is not None for kind in kinds)
     births = [kind.birth for kind in kinds if kind.birth is not None]
     number = tuple(sum(begins[:k]) for k in range(len(kinds)))
@@ -48,7 +48,7 @@ def births_of(kinds: Sequence[ScanSensor]) -> Births:
 
 
 def ending(tracker: Tracker) -> Function:
-    """`end_tracks(run, tracks, p)`: which tracks are over."""
+    """Make `end_tracks(run, tracks, p)`: which tracks are over."""
     names = list(tracker.stage.model.state)
     x, y = place_of(tracker.stage.model)
     has_velocity = "vx_mps" in names and "vy_mps" in names
@@ -56,7 +56,7 @@ def ending(tracker: Tracker) -> Function:
     _, _, is_over = MANAGEMENTS[tracker.management]
 
     def is_another(run: int, place: int, tracks: Tracks, p: Any) -> bool:
-        """Whether an older confirmed track is about where this confirmed one is, and moves alike."""
+        """Tell whether an older confirmed track is about where this one is, and moves alike."""
         for other in range(place if tracks.is_confirmed[run, place] else 0):
             if (
                 tracks.is_confirmed[run, other]
@@ -81,7 +81,7 @@ def ending(tracker: Tracker) -> Function:
 
 
 def beginning(tracker: Tracker) -> Function:
-    """`begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
+    """Make `begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)`: which tracks begin."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     (x, y), corner, (shared_at, shared) = place_of(model), corner_of(model), tracker.shared
     begins, birth_number, birth = births_of(kinds)
@@ -93,7 +93,7 @@ def beginning(tracker: Tracker) -> Function:
         correlate = choosing(correlations)
 
     def is_taken(run: int, at_x: float, at_y: float, tracks: Tracks, p: Any) -> bool:
-        """Whether a confirmed track is too near for another one to begin."""
+        """Tell whether a confirmed track is too near for another one to begin."""
         for place in range(tracks.used[run]):
             apart = np.hypot(
                 at_x - expected(run, place, x, tracks), at_y - expected(run, place, y, tracks)
@@ -105,7 +105,7 @@ def beginning(tracker: Tracker) -> Function:
     def first_existence(
         run: int, detection: int, at_x: float, at_y: float, tracks: Tracks, p: Any, memory: ScanMemory
     ) -> float:
-        """How probable it is that a detection is of a target that no track is of; 0 to begin none."""
+        """Compute the probability that a detection is of a target without a track; 0 to begin none."""
         if p.undetected_per_m2 > 0.0:
             share = memory.undetected[detection] / memory.clutter[detection]
             existence = memory.left[detection] * share

@@ -15,7 +15,7 @@ NONE = -1
 
 @varying(2)
 class Weights(NamedTuple):
-    """What maps are made of.
+    """Holds what maps are made of.
 
     Attributes:
         detected: (tracks, detections), the weight of a pair; 0 outside a gate.
@@ -28,7 +28,7 @@ class Weights(NamedTuple):
 
 @varying(2)
 class AssociationMemory(NamedTuple):
-    """What association works in, for so many tracks and detections at most.
+    """Holds what association works in, for so many tracks and detections at most.
 
     Attributes:
         rows, columns: the tracks and detections of a cluster.
@@ -60,7 +60,7 @@ class AssociationMemory(NamedTuple):
 
 
 def memory_for(tracks: int, detections: int) -> AssociationMemory:
-    """Memory for scans of so many tracks and detections at most."""
+    """Make memory for scans of so many tracks and detections at most."""
     items, columns = max(tracks, detections), tracks + detections
     slots = min(tracks, detections, MOST_ENUMERATED)
     return AssociationMemory(
@@ -142,7 +142,7 @@ def gather_cluster(
 def enumerate_maps(
     weights: Weights, rows: int, columns: int, probability: Floats, memory: AssociationMemory
 ) -> None:
-    """The marginals of one cluster by the sum over all of its maps.
+    """Compute the marginals of one cluster by the sum over all of its maps.
 
     Of tracks and detections the fewer are slots, which the others, the items, take one after another.
     What the later items can do depends on the set of slots that are taken, not on who took them: sums
@@ -216,7 +216,7 @@ def sum_maps(weights: Weights, rows: int, columns: int, memory: AssociationMemor
 
 
 def ending_without(slot: int, items: int, slots: int, memory: AssociationMemory) -> float:
-    """The sum over the maps in which no item takes a slot."""
+    """Compute the sum over the maps in which no item takes a slot."""
     found = 0.0
     for taken in range(1 << slots):
         if not taken >> slot & 1:

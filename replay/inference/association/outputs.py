@@ -17,7 +17,7 @@ from replay.inference.model.stage import Stage
 
 @varying(2)
 class TrackOutputs(NamedTuple):
-    """What is said after every scan; scan s of run r has the rows of that number.
+    """Holds a tracker's outputs after every scan; scan s of run r has the rows of that number.
 
     Attributes:
         end: (runs, 2), how many rows of tracks and of associations a run has filled.
@@ -47,7 +47,7 @@ class TrackOutputs(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Where one run's estimates go, as `replay.inference.kalman.steps.Steps.estimate` fills them in."""
+    """Holds where one run's estimates go, as `Steps.estimate` fills them in."""
 
     mean: Floats
     covariance: Floats
@@ -55,12 +55,12 @@ class Rows(NamedTuple):
 
 
 def writing_pairs(modes: int) -> Function:
-    """`write_pairs(run, scan, count, tracks, outputs, memory)`: the associations of confirmed tracks."""
+    """Make `write_pairs(run, scan, count, tracks, outputs, memory)`: confirmed tracks' associations."""
 
     def write_pairs(
         run: int, scan: int, count: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
     ) -> None:
-        """Tell which detections went to confirmed tracks."""
+        """Write which detections went to confirmed tracks."""
         for place in range(tracks.used[run]):
             for detection in range(count if tracks.is_confirmed[run, place] else 0):
                 if memory.probability[place, 1 + detection] > 0.0:
@@ -82,13 +82,13 @@ def writing_pairs(modes: int) -> Function:
 
 
 def writing_tracks(stage: Stage) -> Function:
-    """`write_tracks(run, scan, tracks, outputs, memory)`: the confirmed tracks."""
+    """Make `write_tracks(run, scan, tracks, outputs, memory)`: the confirmed tracks."""
     belief_of, estimate = believing(stage), moving(stage).estimate
 
     def write_tracks(
         run: int, scan: int, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
     ) -> None:
-        """Tell the confirmed tracks as they are now."""
+        """Write the confirmed tracks as they are now."""
         belief = belief_of(run, tracks)
         rows = Rows(outputs.mean[run], outputs.covariance[run], outputs.probability[run])
         outputs.confirmed[scan] = 0
@@ -109,7 +109,7 @@ BY_PAIR = ("associated", "white", "factor")
 
 
 def blank_outputs(scans: Scans, runs: int, places: int, sizes: tuple[int, int, int]) -> TrackOutputs:
-    """Room for all that could be said: memory that is not written takes none."""
+    """Make memory for all outputs that are possible: pages that are not written take none."""
     modes, n, t = sizes
     counts = np.diff(scans.offsets)
     detections = np.add.reduceat(np.append(scans.end - scans.first, 0), scans.offsets[:-1])
@@ -133,7 +133,7 @@ def blank_outputs(scans: Scans, runs: int, places: int, sizes: tuple[int, int, i
 
 
 def of_last(scans: Scans, outputs: TrackOutputs) -> tuple[Scans, TrackOutputs]:
-    """The last scan of one run, and what was said of it."""
+    """Return the last scan of one run, and its outputs."""
     last = len(scans.time_ns) - 1
     count, (end, paired) = max(int(outputs.confirmed[last]), 0), outputs.end[0]
     is_of_it = outputs.pair[0, :paired, 1] == last

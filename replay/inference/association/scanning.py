@@ -37,7 +37,7 @@ from replay.inference.model.stage import Stage, traced_sensor
 
 @varying(1, probability=2, white=3, likelihood=3, after=0, moment=0, shift=0)
 class ScanMemory(NamedTuple):
-    """What one core works in; axes are tracks, their modes, and the detections of a scan.
+    """Holds what one core works in; axes are tracks, their modes, and the detections of a scan.
 
     Attributes:
         motion: of the motion of tracks, see `replay.inference.kalman.steps.Steps`.
@@ -85,7 +85,7 @@ class ScanMemory(NamedTuple):
 
 
 def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: int) -> ScanMemory:
-    """Memory for so many errors that tracks share, tracks, and detections in a scan."""
+    """Make memory for so many errors that tracks share, tracks, and detections in a scan."""
     modes, size = max(1, len(stage.modes)), stage.model.tangent
     return ScanMemory(
         motion=motion,
@@ -115,7 +115,7 @@ def memory_of(stage: Stage, motion: Any, shared: int, places: int, detections: i
 
 
 def target_of(model: Model) -> Function:
-    """`target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state has not is zero."""
+    """Make `target(state)`: (x_m, vx_mps, y_m, vy_mps); a velocity that the state has not is zero."""
     names = list(model.state)
     places = tuple(names.index(name) if name in names else -1 for name in PLANE_MOTION)
 
@@ -127,7 +127,7 @@ def target_of(model: Model) -> Function:
 
 @lru_cache(maxsize=64)
 def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
-    """What of a kind of sensors is as a model's sensor is, which may read parameters of these names."""
+    """Make a model's sensor of a kind of scan sensors, which may read parameters of these names."""
     target, inner = target_of(model), kind.measure
 
     def measure(state: Any, reference: Any, parameters: Any) -> Any:
@@ -138,7 +138,10 @@ def measuring(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Sensor:
 
 
 def errors_at(component: int) -> Function:
-    """`errors(parameters)`: where in the state errors of a measured component stand; -1 for nowhere."""
+    """Make `errors(parameters)`: where errors of a measured component stand in the state.
+
+    -1 for nowhere.
+    """
     names = (f"registration_at_{component}", f"correlated_at_{component}")
 
     def errors(parameters: Any) -> tuple[float, ...]:
@@ -148,7 +151,7 @@ def errors_at(component: int) -> Function:
 
 
 def adding_errors(components: int) -> Function:
-    """`add(rows, predicted, mean, parameters)`: the errors that the state has of what is measured."""
+    """Make `add(rows, predicted, mean, parameters)`: it adds the state's errors of the measurement."""
     errors = tuple(errors_at(component) for component in range(components))
 
     def add(rows: Floats, predicted: Floats, mean: Floats, parameters: Any) -> None:
@@ -162,7 +165,7 @@ def adding_errors(components: int) -> Function:
 
 
 def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Function:
-    """`observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
+    """Make `observe(track, mode, mean, covariance, origin, parameters, memory)`: what a scan should say.
 
     Fills the prediction of a track's mode and its whitened innovation covariance. Returns the density's
     factor before exp(-d2 / 2), NaN where the covariance is none.
@@ -210,7 +213,7 @@ def observing(model: Model, kind: ScanSensor, names: tuple[str, ...]) -> Functio
 def correlating(
     model: Model, kind: ScanSensor, corner: tuple[int, int], names: tuple[str, ...]
 ) -> Function:
-    """`correlate(mean, covariance, origin, parameters, work)`: a newborn's position with sensor errors.
+    """Make `correlate(mean, covariance, origin, parameters, work)`: adds sensor errors to a new track.
 
     The error db of a detection puts the position out by -H^-1 db, H the derivative of what is measured
     by the position, whose components stand at `corner`.
@@ -248,7 +251,7 @@ def correlating(
 
 
 def comparing(kind: ScanSensor) -> Function:
-    """`compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
+    """Make `compare(track, mode, detection, memory)`: whitens the innovation of a pair; returns d2."""
     m, angular = len(kind.measured), tuple(each == "angle" for each in kind.measured.values())
 
     def compare(track: int, mode: int, detection: int, memory: ScanMemory) -> float:
@@ -266,7 +269,7 @@ def comparing(kind: ScanSensor) -> Function:
 
 
 def updating(model: Model, kind: ScanSensor) -> Function:
-    """`update(track, mode, detections, mean, covariance, memory)`: by the associations in the mode."""
+    """Make `update(track, mode, detections, mean, covariance, memory)`: by associations in the mode."""
     m, correct = len(kind.measured), correcting(model.kinds, model.correct)
     find_slope = sloping(model.kinds, model.correct)
 

@@ -12,7 +12,7 @@ from replay.engine.vectors.components import Components
 
 @dataclass(frozen=True, eq=False)
 class ScanSensor:
-    """A kind of sensor of unordered scans.
+    """Represents a kind of sensor of unordered scans.
 
     Its functions take a target as (x_m, vx_mps, y_m, vy_mps), whatever the model's state is, and
     `origin`, where the sensor is when it scans.
@@ -42,7 +42,7 @@ class ScanSensor:
 
 
 class Scans(NamedTuple):
-    """The scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
+    """Holds the scans of all runs in time order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
@@ -68,7 +68,7 @@ BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
 
 
 def take_scans(scans: Scans, rows: Integers) -> Scans:
-    """Some of the scans, in this order, as those of one run."""
+    """Return some of the scans, in this order, as those of one run."""
     own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
     counts = own["end"] - own["first"]
     ends = np.cumsum(counts)
@@ -78,7 +78,10 @@ def take_scans(scans: Scans, rows: Integers) -> Scans:
 
 
 def in_time(first: Scans, second: Scans) -> Scans:
-    """The scans of both, of one run, in time order; of equal stamps those of the first come first."""
+    """Merge the scans of two sequences of one run in time order.
+
+    At equal stamps the first's come first.
+    """
     shifted = second._replace(
         first=second.first + len(first.detection), end=second.end + len(first.detection)
     )

@@ -17,12 +17,12 @@ import numpy as np
 
 from replay.engine.arrays import Booleans, Floats, varying
 from replay.inference.association.tracks import Tracks
-from replay.inference.linear_algebra.gaussian import cholesky
+from replay.inference.linear_algebra.gaussian import invert
 
 
 @varying(0, is_updated=1)
 class Pool(NamedTuple):
-    """What sharing k errors works in: matrices (k, k), vectors (k,), and a track's gain (t, k).
+    """Holds what sharing k errors works in: matrices (k, k), vectors (k,), and a track's gain (t, k).
 
     `is_updated` (tracks,) says which tracks a scan has updated.
     """
@@ -38,7 +38,7 @@ class Pool(NamedTuple):
 
 
 def pool_of(shared: int, tangent: int, places: int) -> Pool:
-    """Memory for so many errors, tangent components and tracks."""
+    """Make memory for so many errors, tangent components and tracks."""
     square = (shared, shared)
     return Pool(
         np.empty(square),
@@ -52,27 +52,8 @@ def pool_of(shared: int, tangent: int, places: int) -> Pool:
     )
 
 
-def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
-    """Fill the inverse of a symmetric matrix; False where it is not positive definite."""
-    size = len(matrix)
-    if not cholesky(factor, matrix, size):
-        return False
-    for column in range(size):
-        for row in range(size):
-            entry = 1.0 if row == column else 0.0
-            for k in range(row):
-                entry -= factor[row, k] * inverse[k, column]
-            inverse[row, column] = entry / factor[row, row]
-        for row in range(size - 1, -1, -1):
-            entry = inverse[row, column]
-            for k in range(row + 1, size):
-                entry -= factor[k, row] * inverse[k, column]
-            inverse[row, column] = entry / factor[row, row]
-    return True
-
-
 def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Put together what the confirmed tracks of a run have learnt of the errors, and tell it to all.
+    """Fuse the errors that the confirmed tracks of a run have estimated, and give the result to all.
 
     The errors are the components of every track's state from `first` on, as many as are shared. Where
     associations were so ambiguous that nothing is left of what is known, all stays as it was.
@@ -107,7 +88,7 @@ def pool_errors(run: int, first: int, tracks: Tracks, pool: Pool) -> None:
 
 
 def conform(run: int, place: int, first: int, tracks: Tracks, pool: Pool) -> None:
-    """Give a track the errors that all share; what it says of its target given these stays."""
+    """Give a track the shared errors; its conditional estimate of the target given these stays."""
     shared_mean, shared = tracks.shared_mean[run], tracks.shared_covariance[run]
     mean, covariance = tracks.mean[run, place, 0], tracks.covariance[run, place, 0]
     size, t = len(shared_mean), len(covariance)

@@ -22,11 +22,11 @@ CHANCE = 0.5
 
 
 class Management(NamedTuple):
-    """A way to manage tracks.
+    """Holds a way to manage tracks.
 
     Attributes:
-        wait: (run, place, duration_s, tracks, parameters), what time alone says.
-        judge: (run, place, evidence, tracks, parameters), what a scan says; it may confirm a track.
+        wait: (run, place, duration_s, tracks, parameters), what time alone changes.
+        judge: (run, place, evidence, tracks, parameters), what a scan changes; it may confirm a track.
         is_over: (run, place, tracks, parameters) -> whether a track ends.
     """
 
@@ -36,7 +36,7 @@ class Management(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a scan says of one track.
+    """Holds the evidence of a scan for one track.
 
     Attributes:
         detectable: how probable its detection in the gate is, if the target exists.
@@ -51,13 +51,13 @@ class Evidence(NamedTuple):
 
 
 def is_silent(run: int, place: int, tracks: Tracks, p: Any) -> bool:
-    """Whether no sensor that begins tracks has seen a track for too long."""
+    """Tell whether no sensor that begins tracks has seen a track for too long."""
     silent_s = (tracks.time_ns[run] - tracks.seen_ns[run, place]) * 1e-9
     return silent_s > (p.silence_s if tracks.is_confirmed[run, place] else p.tentative_silence_s)
 
 
 def wait_unchanged(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
-    """Nothing: time alone says nothing."""
+    """Do nothing: time alone changes nothing."""
     return
 
 
@@ -83,7 +83,7 @@ def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p:
 
 
 def does_not_exist(run: int, place: int, tracks: Tracks, p: Any) -> bool:
-    """Whether it is silent, or improbable."""
+    """Tell whether it is silent, or improbable."""
     return is_silent(run, place, tracks, p) or tracks.existence[run, place] < p.ending_existence
 
 
@@ -102,7 +102,7 @@ def judge_hits(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any)
 
 
 def was_hit_too_seldom(run: int, place: int, tracks: Tracks, p: Any) -> bool:
-    """Whether it is silent, or was not hit often enough in its first chances."""
+    """Tell whether it is silent, or was not hit often enough in its first chances."""
     is_young = not tracks.is_confirmed[run, place]
     return is_silent(run, place, tracks, p) or (is_young and tracks.chances[run, place] >= p.chances)
 
@@ -132,7 +132,7 @@ def judge_score(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any
 
 
 def has_lost_its_score(run: int, place: int, tracks: Tracks, p: Any) -> bool:
-    """Whether it is silent, or clutter explains it better: since its birth, or its highest score."""
+    """Tell whether it is silent, or clutter explains it better since its birth or highest score."""
     begun = tracks.best_score[run, place] if tracks.is_confirmed[run, place] else 0.0
     lowest = np.log(p.missed_confirmation / (1.0 - p.false_confirmation))
     return is_silent(run, place, tracks, p) or tracks.score[run, place] - begun <= lowest

@@ -25,7 +25,7 @@ from replay.inference.smoothing.backward_pass import (
 def smooth_tracks(
     stage: Stage, parameters: Any, track: Integers, time_ns: Integers, mean: Floats, covariance: Floats
 ) -> tuple[Floats, Floats]:
-    """Smoothed means (n, size) and covariances (n, size, size) of the filtered estimates of tracks.
+    """Smooth the filtered estimates of tracks: means (n, size) and covariances (n, size, size).
 
     `track` (n,) says whose each is; the estimates of a track are in time order. The motion of the
     stage is linear, and nothing controls it.
@@ -50,7 +50,10 @@ def smooth_tracks(
 def _nodes(
     stage: Stage, parameters: Any, offsets: Integers, time_ns: Integers, mean: Floats, covariance: Floats
 ) -> Nodes:
-    """The estimates, with how each comes from the one before; that of a track's first is not used."""
+    """Make nodes of estimates, with how each comes from the one before.
+
+    A track's first comes from none.
+    """
     duration_s = np.diff(time_ns, prepend=time_ns[:1]) * 1e-9
     duration_s[offsets[:-1]] = 0.0
     before, spread = np.roll(mean, 1, axis=0), np.roll(covariance, 1, axis=0)
@@ -71,7 +74,7 @@ def _nodes(
 
 
 def _motion(stage: Stage, parameters: Any, mean: Floats, duration_s: Floats) -> tuple[Floats, Floats]:
-    """The matrices (n, size, size) of a linear motion over so long each, and of its noise."""
+    """Return the matrices (n, size, size) of a linear motion over so long each, and of its noise."""
     size, count, state = stage.model.size, len(duration_s), tuple(mean.T)
     assert stage.motion.noise is not None
     transition, noise = np.empty((count, size, size)), np.zeros((count, size, size))

@@ -16,7 +16,7 @@ from replay.inference.modes.mixture import ModeBelief
 
 
 class Tracker(NamedTuple):
-    """A tracker put together.
+    """Holds a tracker put together.
 
     Attributes:
         stage: the targets' model, with one of its motions or all modes.
@@ -36,12 +36,12 @@ class Tracker(NamedTuple):
 
     @property
     def sizes(self) -> tuple[int, int, int]:
-        """How many modes the model has, and how many components its state and tangent space."""
+        """Count how many modes the model has, and how many components its state and tangent space."""
         return max(1, len(self.stage.modes)), self.stage.model.size, self.stage.model.tangent
 
 
 class Newborn(NamedTuple):
-    """A target of which only the position is known.
+    """Holds a target of which only the position is known.
 
     Attributes:
         mean, covariance: (n,), (t, t); their entries of the position stand for none.
@@ -54,7 +54,7 @@ class Newborn(NamedTuple):
 
 
 def moving(stage: Stage) -> Steps:
-    """How tracks move: those of several modes as interacting multiple models do."""
+    """Describe how tracks move: those of several modes as interacting multiple models do."""
     if not stage.modes:
         return gaussian_filter(stage, linear_motion(stage), ())
     alone = (stage._replace(motion=motion, modes=()) for motion in stage.modes)
@@ -62,7 +62,7 @@ def moving(stage: Stage) -> Steps:
 
 
 def believing(stage: Stage) -> Function:
-    """`belief(run, tracks)`: the tracks of a run as the filters have them, first axis = place."""
+    """Make `belief(run, tracks)`: the tracks of a run as the filters have them, first axis = place."""
 
     def of_one(run: int, tracks: Tracks) -> Gaussian:
         return Gaussian(tracks.mean[run, :, 0], tracks.covariance[run, :, 0])
@@ -76,7 +76,7 @@ def believing(stage: Stage) -> Function:
 
 
 def choosing(functions: list[Function]) -> Function:
-    """`call(kind, ...)`: the function of this number."""
+    """Make `call(kind, ...)`: the function of this number."""
 
     def call(kind: int, *arguments: Any) -> Any:
         for number in range_of(1, len(functions)):
@@ -88,12 +88,12 @@ def choosing(functions: list[Function]) -> Function:
 
 
 def place_of(model: Model) -> tuple[int, int]:
-    """Where the position stands in the state."""
+    """Find where the position stands in the state."""
     names = list(model.state)
     return names.index("x_m"), names.index("y_m")
 
 
 def corner_of(model: Model) -> tuple[int, int]:
-    """Where the position stands in the tangent space."""
+    """Find where the position stands in the tangent space."""
     tangent = [name for name, _ in tangent_components(list(model.state), model.kinds)]
     return tangent.index("x_m"), tangent.index("y_m")

@@ -48,7 +48,7 @@ from replay.inference.model.settings import reading_settings
 
 
 def tracking(tracker: Tracker, read: Function) -> Function:
-    """The loop over the scans of one run, for `replay.engine.compiling.compile.compile_over_runs`.
+    """Make the loop over the scans of one run, for `replay.engine.compiling.compile.compile_over_runs`.
 
     `read(settings, sensor)` makes the parameters of motion, tracker and sensor.
     """
@@ -92,7 +92,7 @@ def tracking(tracker: Tracker, read: Function) -> Function:
 
 
 def advancing(tracker: Tracker) -> Function:
-    """`advance(run, time_ns, tracks, p, memory)`: the prediction of all tracks."""
+    """Make `advance(run, time_ns, tracks, p, memory)`: the prediction of all tracks."""
     belief_of, predict = believing(tracker.stage), moving(tracker.stage).predict
     wait, _, _ = MANAGEMENTS[tracker.management]
 
@@ -110,7 +110,7 @@ def advancing(tracker: Tracker) -> Function:
 
 
 def association_weights(tracker: Tracker) -> Function:
-    """`weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
+    """Make `weigh(run, scan, count, scans, tracks, p, memory)`: how well detections go with tracks."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     observe = choosing([observing(model, kind, tracker.names) for kind in kinds])
     compare = choosing([comparing(kind) for kind in kinds])
@@ -120,7 +120,7 @@ def association_weights(tracker: Tracker) -> Function:
     read_pair, read_state, target_in = tuple_of(2), tuple_of(model.size), target_of(model)
 
     def detectable(run: int, place: int, kind: int, origin: Any, tracks: Tracks, p: Any) -> float:
-        """How probable it is that a sensor detects a track's target."""
+        """Compute how probable it is that a sensor detects a track's target."""
         total = 0.0
         for mode in range(modes):
             target = target_in(read_state(tracks.mean[run, place, mode]))
@@ -171,7 +171,7 @@ def association_weights(tracker: Tracker) -> Function:
 
 
 def processing(tracker: Tracker) -> Function:
-    """`process(run, scan, count, scans, tracks, p, memory)`: the update by a scan's associations."""
+    """Make `process(run, scan, count, scans, tracks, p, memory)`: updates by a scan's associations."""
     model, kinds, modes = tracker.stage.model, tracker.kinds, tracker.sizes[0]
     update = choosing([updating(model, kind) for kind in kinds])
     _, judge, _ = MANAGEMENTS[tracker.management]
@@ -227,7 +227,7 @@ def _compiled(tracker: Tracker) -> Callable[..., None]:
 def track_scans(
     tracker: Tracker, scans: Scans, settings: Floats, newborn: Newborn, before: Tracks
 ) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
-    """The tracks after the scans; and by batch, its scans and what was said of them.
+    """Track scans: the tracks after them; and by batch, its scans and their outputs.
 
     `settings` (sensors, names) are the parameters for each sensor.
     """

@@ -16,7 +16,7 @@ NEVER = -1
 
 @varying(2)
 class Tracks(NamedTuple):
-    """The tracks of all runs, the oldest first: axes run and place, of which `used` are taken.
+    """Holds the tracks of all runs, the oldest first: axes run and place, of which `used` are taken.
 
     Attributes:
         used, met: (runs,), how many there are, and ever were, which numbers them.
@@ -55,7 +55,7 @@ class Tracks(NamedTuple):
 def no_tracks(
     runs: int, places: int, sizes: tuple[int, int, int], sensors: int, shared: Floats
 ) -> Tracks:
-    """Runs in which nothing was met yet, with room for so many tracks.
+    """Return runs in which nothing was met yet, with room for so many tracks.
 
     `sizes` are those of the modes, of the state and of its tangent space; `shared` (k, k) is how
     uncertain what all tracks share is at first.
@@ -103,7 +103,7 @@ def drop(run: int, place: int, tracks: Tracks) -> None:
 
 
 def expected(run: int, place: int, component: int, tracks: Tracks) -> float:
-    """A linear component of a track's mean over all modes."""
+    """Return a linear component of a track's mean over all modes."""
     total = 0.0
     for mode in range(tracks.mode.shape[2]):
         total += tracks.mode[run, place, mode] * tracks.mean[run, place, mode, component]
@@ -113,7 +113,7 @@ def expected(run: int, place: int, component: int, tracks: Tracks) -> float:
 def are_near(
     run: int, place: int, other: int, components: tuple[int, int], within: float, tracks: Tracks
 ) -> bool:
-    """Whether two components of two tracks' means, together, differ by less."""
+    """Tell whether two components of two tracks' means, together, differ by less."""
     x, y = components
     return (
         np.hypot(

@@ -139,6 +139,10 @@ def iterated_update(stage: Stage, number: int) -> Function:
     Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
     gate is tested at the prediction, and so is how much the measurement counts; innovation and
     likelihood are those of the last iterate.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
     """
     model, sensor = stage.model, stage.sensors[number]
     n, t, m = model.size, model.tangent, len(sensor.measured)
@@ -296,7 +300,7 @@ def _lacks_slopes(model: Model) -> str:
             try:
                 own = traced_sensor(model, sensor, number_fields(model.parameters))
                 sensor_derivative(model, own)(trial_state(model.kinds), reference, parameters, work)
-            except Exception:  # is said when the model is bound, see `model.check_sensor`
+            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
                 continue
             if np.linalg.matrix_rank(np.concatenate([rows, gain], axis=1)) < m:
                 return f"a regular linearisation of its sensor {sensor.topic}"
@@ -353,6 +357,11 @@ def named_filter(text: str, method: str, use: str) -> tuple[str, str]:
     """Split a filter's name such as "lrkf:s2kf-50" into name and variant, for a method that rests on it.
 
     Raises BadInput where there is no such filter; `use` says what for.
+
+    Args:
+        text: as it is given.
+        method: the method that rests on the filter.
+        use: in words, for the error.
     """
     name, _, variant = text.partition(":")
     if name not in FILTERS:

@@ -61,7 +61,14 @@ class SampleMemory(NamedTuple):
 def sample_memory(
     sets: SampleSets, kinds: Sequence[str], noises: int, outputs: Sequence[str]
 ) -> SampleMemory:
-    """Make memory for the regression of a function of a state and its noise."""
+    """Make memory for the regression of a function of a state and its noise.
+
+    Args:
+        sets: samples of N(0, I) in t + noises dimensions.
+        kinds: of the state's components.
+        noises: how many numbers of noise the function gets.
+        outputs: kinds of the function's values.
+    """
     _, count, dimension = sets.points.shape
     values = tangent_size(outputs)
     return SampleMemory(
@@ -196,6 +203,10 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     """Make the prediction by regression at the samples `work.samples[number]`.
 
     Noise of the control enters by the derivative at the mean, noise of the motion itself as a sample.
+
+    Args:
+        stage: the model as the method takes it.
+        number: of the samples in the workspace.
     """
     model, motion = stage.model, stage.motion
     entering = motion.noise if motion.noises else None
@@ -246,7 +257,13 @@ def moved_with_noise(motion: Motion) -> Function:
 
 
 def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
-    """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`."""
+    """Make `innovate(...)` of sensor `number` by regression at the samples `work.samples[samples]`.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        samples: the number of its samples in the workspace.
+    """
     model, sensor = stage.model, stage.sensors[number]
     kinds = tuple(sensor.measured.values())
     regress = regression(measured_with_noise(sensor), model.kinds, sensor.noises, kinds)

@@ -25,7 +25,8 @@ from replay.inference.linear_algebra.gaussian import (
     whiten,
     wrap,
 )
-from replay.inference.linear_algebra.linearization import Input, derivative
+from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
+from replay.inference.linear_algebra.sparse import Pattern, measuring_covariance, pattern_of
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.corrections import correcting, sloping
 from replay.inference.model.model import Model, Sensor
@@ -79,7 +80,12 @@ def sensor_noise(sensor: Sensor) -> Function:
 
 
 def sensor_derivative(model: Model, sensor: Sensor) -> Function:
-    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`."""
+    """Make `linearise(state, reference, parameters, work)`: fills `predicted`, `rows`, `noise_gain`.
+
+    Args:
+        model: the model, for the kinds of its state.
+        sensor: with n components of the state and m measured ones: `rows` (m, t).
+    """
     if sensor.jacobian is not None:
         measure, jacobian, fill = sensor.measure, sensor.jacobian, filling(len(sensor.measured))
 
@@ -100,11 +106,17 @@ def linear_sensor(stage: Stage, number: int) -> Function:
 
     Returns `innovate(mean, covariance, data, parameters, sample_index, work)`, which fills that of the
     sensor in `work.innovations`.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
     """
     sensor = stage.sensors[number]
     read_state, read = tuple_of(stage.model.size), reading(sensor)
     read_reference = read.reference
-    linearise, compare = sensor_derivative(stage.model, sensor), linear_innovation(sensor, number)
+    linearise = sensor_derivative(stage.model, sensor)
+    pattern = pattern_of(known_entries(linearise, "rows"), len(sensor.measured))
+    compare = linear_innovation(sensor, number, pattern)
 
     def innovate(
         mean: Floats,
@@ -121,34 +133,25 @@ def linear_sensor(stage: Stage, number: int) -> Function:
     return innovate
 
 
-def linear_innovation(sensor: Sensor, number: int) -> Function:
+def linear_innovation(sensor: Sensor, number: int, pattern: Pattern | None = None) -> Function:
     """Make the function that forms the innovation of a linearised measurement.
 
     Args:
         sensor: the sensor, with m measured components.
         number: its number, which says where its innovation stands in the workspace.
+        pattern: which entries of H are known; None where none are.
 
     Returns `compare(covariance, data, parameters, work)`: from the workspace's `predicted` h (m,) and
     `rows` H (m, t), it fills v = y - h, C = P H' and S = H C + R.
     """
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
-    add_noise = sensor_noise(sensor)
+    add_noise, measure_covariance = sensor_noise(sensor), measuring_covariance(pattern)
 
     def compare(covariance: Floats, data: Floats, parameters: Any, work: Workspace) -> None:
         difference, spread, cross = work.innovations[number]
-        rows = work.rows
         for i in range(m):
             difference[i] = wrap(data[i] - work.predicted[i], angular[i])
-            for row in range(len(covariance)):
-                entry = 0.0
-                for k in range(len(covariance)):
-                    entry += covariance[row, k] * rows[i, k]
-                cross[row, i] = entry
-            for j in range(i + 1):
-                entry = 0.0
-                for k in range(len(covariance)):
-                    entry += rows[j, k] * cross[k, i]
-                spread[i, j] = spread[j, i] = entry
+        measure_covariance(covariance, work.rows, cross, spread)
         add_noise(spread, data, parameters, work)
 
     return compare
@@ -266,7 +269,8 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         accepted = size > 0 and squared <= gate[size]
         factor = inflation(squared, size, parameters)
         if accepted:
-            inflate(innovation, size, factor)
+            if factor != 1.0:
+                inflate(innovation, size, factor)
             kalman_step(innovation, size, work.step)
             downdate(covariance, innovation.cross_covariance, size)
             find_slope(mean, covariance, work.slope)
@@ -290,6 +294,10 @@ def write_numbers(
     The NIS is that of the covariance as predicted, the likelihood of one that is `factor` times larger.
     """
     record.numbers[0] = squared
-    likelihood = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + np.log(factor)))
-    record.numbers[1] = likelihood if accepted else 0.0
+    record.numbers[1] = 0.0
     record.numbers[2] = 1.0 if accepted else 0.0
+    if accepted:
+        wider = 0.0
+        if factor != 1.0:
+            wider = np.log(factor)
+        record.numbers[1] = -0.5 * (squared / factor + determinant + size * (LOG_TWO_PI + wider))

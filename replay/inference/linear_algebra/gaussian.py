@@ -81,10 +81,15 @@ def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 
 
 def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
-    """Make X of B in place, A X = B, by Cholesky's factor of A, which goes into `factor`.
+    """Solve A X = B in place, by Cholesky's factor of A, which goes into `factor`.
 
     A pivot of zero, but for round-off, is what A knows exactly: its row of X is zero, a solution where B
     is in the range of A. False where A is not positive semidefinite.
+
+    Args:
+        matrix: A (n, n), symmetric.
+        right: B (n, m), which becomes X.
+        factor: (n, n) to work in.
     """
     size, columns = len(matrix), right.shape[1]
     if not semidefinite_cholesky(factor, matrix, size):
@@ -103,6 +108,33 @@ def solve_semidefinite(matrix: Floats, right: Floats, factor: Floats) -> bool:
                 right[row, column] -= factor[k, row] * right[k, column]
         for column in range(columns):
             right[row, column] *= scale
+    return True
+
+
+def invert(matrix: Floats, inverse: Floats, factor: Floats) -> bool:
+    """Fill the inverse of a symmetric matrix A by its Cholesky factor.
+
+    Args:
+        matrix: A (n, n), which stays as it is.
+        inverse: (n, n) filled.
+        factor: (n, n) filled with the lower factor L, A = L L'.
+
+    Returns False where A is not positive definite.
+    """
+    size = len(matrix)
+    if not cholesky(factor, matrix, size):
+        return False
+    for column in range(size):
+        for row in range(size):
+            entry = 1.0 if row == column else 0.0
+            for k in range(row):
+                entry -= factor[row, k] * inverse[k, column]
+            inverse[row, column] = entry / factor[row, row]
+        for row in range(size - 1, -1, -1):
+            entry = inverse[row, column]
+            for k in range(row + 1, size):
+                entry -= factor[k, row] * inverse[k, column]
+            inverse[row, column] = entry / factor[row, row]
     return True
 
 
@@ -136,6 +168,10 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
     """Turn v into L^-1 v and S into L, S = L L'; returns v' S^-1 v and log det S.
 
     The first is NaN where S is not positive definite.
+
+    Args:
+        innovation: v (m,) and S (m, m), changed in place.
+        size: how many components stand in front, see `drop_missing`.
     """
     difference, factor, _ = innovation
     if not cholesky(factor, factor, size):
@@ -168,9 +204,14 @@ def inflation(squared: float, size: int, parameters: Any) -> float:
       Gustafsson, ICASSP 2013. No less than 1: a small innovation makes no noise smaller;
     - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
 
+    Args:
+        squared: the NIS.
+        size: how many components the innovation has.
+        parameters: with the three options.
+
     >>> from types import SimpleNamespace
     >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)
-    >>> widening(36.0, 1, SimpleNamespace(**given)), widening(8.0, 1, SimpleNamespace(**given))
+    >>> inflation(36.0, 1, SimpleNamespace(**given)), inflation(8.0, 1, SimpleNamespace(**given))
     (4.0, 1.0)
     """
     factor = 1.0
@@ -263,6 +304,21 @@ def propagate_covariance(covariance: Floats, transition: Floats, product: Floats
             covariance[row, column] = covariance[column, row] = entry
 
 
+def measured_covariance(covariance: Floats, rows: Floats, cross: Floats, spread: Floats) -> None:
+    """Fill C = P H' and S = H C, with H in `rows`, of which there may be more than are measured."""
+    for i in range(len(spread)):
+        for row in range(len(covariance)):
+            entry = 0.0
+            for k in range(len(covariance)):
+                entry += covariance[row, k] * rows[i, k]
+            cross[row, i] = entry
+        for j in range(i + 1):
+            entry = 0.0
+            for k in range(len(covariance)):
+                entry += rows[j, k] * cross[k, i]
+            spread[i, j] = spread[j, i] = entry
+
+
 def predict_constant_velocity(
     mean: Floats,
     covariance: Floats,
@@ -274,6 +330,13 @@ def predict_constant_velocity(
 
     Axis a has its position at a * layout[0], and its velocity layout[1] further. To each the noise adds
     a variance of the position, a covariance of both, and a variance of the velocity.
+
+    Args:
+        mean: (n,).
+        covariance: (n, n).
+        duration_s: how long.
+        layout: see above.
+        noise: the three moments of every axis.
     """
     stride, apart = layout
     places = range(0, stride * (len(mean) // 2), stride)

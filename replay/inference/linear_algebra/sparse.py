@@ -8,7 +8,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.linear_algebra.gaussian import add_through, propagate_covariance
+from replay.inference.linear_algebra.gaussian import (
+    add_through,
+    measured_covariance,
+    propagate_covariance,
+)
 
 Pattern = tuple[tuple[tuple[int, float | None], ...], ...]
 
@@ -47,6 +51,29 @@ def propagating_covariance(pattern: Pattern | None) -> Function:
                 covariance[row, column] = covariance[column, row] = entry
 
     return move
+
+
+def measuring_covariance(pattern: Pattern | None) -> Function:
+    """`measure(covariance, rows, cross, spread)`: C = P H' and S = H C, with H in `rows`."""
+    if pattern is None:
+        return measured_covariance
+    rows_of = tuple(enumerate(pattern))
+
+    def measure(covariance: Floats, rows: Floats, cross: Floats, spread: Floats) -> None:
+        for i, entries in rows_of:
+            for row in range(len(covariance)):
+                entry = 0.0
+                for k, value in entries:
+                    entry += covariance[row, k] * (rows[i, k] if value is None else value)
+                cross[row, i] = entry
+        for j, entries in rows_of:
+            for i in range(j, len(spread)):
+                entry = 0.0
+                for k, value in entries:
+                    entry += (rows[j, k] if value is None else value) * cross[k, i]
+                spread[i, j] = spread[j, i] = entry
+
+    return measure
 
 
 def adding_through(pattern: Pattern | None) -> Function:

@@ -45,7 +45,7 @@ Start = Callable[[Mapping[str, Ragged]], Any]
 
 
 class Added(NamedTuple):
-    """What is estimated beside the state: parameters, then errors about points, and how each moves."""
+    """Holds what is added to the state: parameters, then errors about points, and how each moves."""
 
     parameters: Names
     errors: Errors
@@ -53,15 +53,20 @@ class Added(NamedTuple):
 
     @property
     def names(self) -> Names:
-        """The components, in their order."""
+        """Return the components, in their order."""
         return self.parameters + tuple(each.name for each in self.errors)
 
 
 def estimated(label: str, model: Model, parameters: Any) -> Added:
-    """What is to be estimated beside the state, as the settings say.
+    """Return what is to be estimated beside the state, as the settings say.
 
     Raises BadInput where what the model lists as `augmentable` is none of its parameters, it does not
     list one that is asked for, one stands twice, or has no sigma.
+
+    Args:
+        label: the estimator's, for errors.
+        model: whose parameters are asked for.
+        parameters: with `estimate` and its options.
     """
     check_augmentable(f"estimator {label}", model)
     asked = parameters.estimate or []
@@ -122,7 +127,7 @@ def check_augmentable(where: str, model: Model) -> None:
 
 
 def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
-    """The model with these parameters and errors in its state; the model itself where there are none.
+    """Add parameters and errors to a model's state; the model itself where there are none.
 
     >>> from replay.estimators.models.landmarks import ROBOT
     >>> list(augmented(ROBOT, ("bias_range_m",)).state)
@@ -133,7 +138,12 @@ def augmented(model: Model, names: Names, errors: Errors = ()) -> Model:
 
 
 def augmented_stage(stage: Stage, added: Added) -> Stage:
-    """The same of a model as a method takes it."""
+    """Return the same of a model as a method takes it.
+
+    Args:
+        stage: the model with the sensors at hand.
+        added: what is added to its state.
+    """
     names, errors = added.parameters, added.errors
     if names:
         model, sensors = stage.model, stage.sensors
@@ -149,7 +159,12 @@ def augmented_stage(stage: Stage, added: Added) -> Stage:
 
 
 def with_gauss_markov(settings: Floats, added: Added) -> Floats:
-    """Numbers of motion and sensors with those that an augmented model has beside them."""
+    """Return numbers of motion and sensors with those that an augmented model has beside them.
+
+    Args:
+        settings: (1 + sensors, fields).
+        added: what is added to the state.
+    """
     numbers = np.ravel(added.processes)
     return np.concatenate([settings, np.tile(numbers, (len(settings), 1))], axis=1)
 
@@ -157,10 +172,17 @@ def with_gauss_markov(settings: Floats, added: Added) -> Floats:
 def begin(
     label: str, topic: str, stage: Stage, added: Added, settings: Floats
 ) -> Callable[[Start], Start]:
-    """What makes of the start of an augmented model's filter one from the log's own prior on `topic`.
+    """Make the function that extends the log's own prior on `topic` to an augmented model's.
 
     `stage` and `settings` are those of the model itself. Raises BadInput where a parameter that is to be
     estimated has no value.
+
+    Args:
+        label: the estimator's, for errors.
+        topic: of the prior.
+        stage: of the model itself.
+        added: what is added to its state.
+        settings: (1 + sensors, fields), of the model itself.
     """
     fields = number_fields(stage.model.parameters)
     means = np.array(
@@ -212,7 +234,7 @@ def _augmented(model: Model, names: Names) -> Model:
 
 @lru_cache(maxsize=256)
 def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
-    """The motion, in which the parameters walk about or come back to what they were given as."""
+    """Return the motion, in which parameters are random walks or return to their given values."""
     n, t, noises = model.size, model.tangent, motion.noises
     given = motion.noise or _no_noise(t)
     state, parameters = trial_state(model.kinds), _traced(model)
@@ -230,7 +252,7 @@ def _augmented_motion(model: Model, motion: Motion, names: Names) -> Motion:
         moved = list(move_own(state, control, *own, duration_s, parameters))
         for index, name in enumerate(names):
             stay = state[n + index]
-            if not angular[index]:  # an angle has no mean to come back to
+            if not angular[index]:  # an angle has no mean to return to
                 share = remaining_share(name, duration_s, parameters)
                 stay = share * stay + (1.0 - share) * getattr(parameters, name)
             moved.append(stay + entering[0][noises + index] if noises else stay)
@@ -276,7 +298,7 @@ def _augmented_sensor(model: Model, sensor: Sensor, names: Names) -> Sensor:
 
 
 def _reading(model: Model, names: Names, function: Function) -> Function:
-    """A model's function of the augmented state, which reads the estimated parameters from there."""
+    """Make a model's function of the augmented state, which reads estimated parameters from there."""
     n, fields = model.size, number_fields(model.parameters)
     settings = settings_type(fields)
     places = tuple((field, n + names.index(field) if field in names else -1) for field in fields)

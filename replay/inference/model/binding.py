@@ -20,7 +20,7 @@ from replay.inference.model.model import (
 
 
 class Found(NamedTuple):
-    """Where a log has what a model needs.
+    """Holds where a log has what a model needs.
 
     Attributes:
         prefix: what the names of its topics begin with, as `/robot1`.
@@ -44,12 +44,12 @@ class Found(NamedTuple):
 
     @property
     def geodetic(self) -> tuple[Topic, ...]:
-        """The topics of fixes that are latitude and longitude."""
+        """Return the topics of fixes that are latitude and longitude."""
         return tuple(topic for _, topic in self.sensors if topic.schema_name == GEODETIC)
 
 
 def roles_of(model: Model) -> list[str]:
-    """The topics that a model asks for, by the names that it has for them."""
+    """Return the topics that a model asks for, by the names that it has for them."""
     control = [model.control, *model.control.fallbacks] if model.control else []
     maps = [each.topic for sensor in model.all_sensors for each in sensor.maps]
     sensors = [sensor.topic for sensor in model.all_sensors]
@@ -58,28 +58,28 @@ def roles_of(model: Model) -> list[str]:
 
 
 class UnderPrefix(NamedTuple):
-    """The topics under one prefix of a log; `names` gives a topic by the model's name for it."""
+    """Holds the topics under one prefix of a log; `names` gives a topic by the model's name for it."""
 
     topics: Mapping[str, Topic]
     prefix: str
     names: Mapping[str, str]
 
     def place(self, name: str) -> str:
-        """A topic's full name."""
+        """Return a topic's full name."""
         return resolved(self.names.get(name, name), self.prefix)
 
     def topic(self, name: str, schema: Schema) -> Topic | None:
-        """The topic of this name, if its messages are of the schema or serve as such."""
+        """Return the topic of this name, if its messages are of the schema or serve as such."""
         found = self.topics.get(self.place(name))
         return found if found is not None and found.schema_name in serving(schema) else None
 
     def has(self, name: str) -> bool:
-        """Whether there is a topic of this name, whatever it is."""
+        """Tell whether there is a topic of this name, whatever it is."""
         return self.place(name) in self.topics
 
 
 def serving(schema: Schema) -> tuple[str, ...]:
-    """The schemas, by their full names, whose messages a sensor of this schema takes."""
+    """Return the schemas, by their full names, whose messages a sensor of this schema takes."""
     geodetic = (GEODETIC,) if schema is schemas.POSITION_FIX else ()
     return (schema.full_name, *geodetic)
 
@@ -87,7 +87,13 @@ def serving(schema: Schema) -> tuple[str, ...]:
 def topics_of(
     model: Model, topics: Mapping[str, Topic], names: Mapping[str, str] | None = None
 ) -> list[Found]:
-    """Everything in a log that is of this model; `names` are topics by the model's names for them."""
+    """Find everything in a log that is of this model; `names` are topics by the model's names for them.
+
+    Args:
+        model: the model.
+        topics: of the log, by name.
+        names: see above.
+    """
     names = names or {}
     begins = [model.prior]
     if model.start is not None:
@@ -101,7 +107,7 @@ def topics_of(
 
 
 def _found(model: Model, here: UnderPrefix) -> Found | None:
-    """What there is of a model under one prefix; None where it does not fit."""
+    """Return what there is of a model under one prefix; None where it does not fit."""
     control = here.topic(model.control.topic, model.control.schema) if model.control else None
     if model.control is not None and control is None:
         return None
@@ -131,7 +137,7 @@ def _found(model: Model, here: UnderPrefix) -> Found | None:
 def _suffices(
     model: Model, here: UnderPrefix, sensors: Sequence[tuple[Sensor, Topic]], *, has_prior: bool
 ) -> bool:
-    """Whether a model can start from these sensors or the prior, and go on.
+    """Tell whether a model can start from these sensors or the prior, and go on.
 
     A log without the prior fits a model that can start without, if a sensor measures the state itself.
     One without sensors fits if it has no part of them, such as sightings whose map is missing.
@@ -149,5 +155,5 @@ def _suffices(
 
 
 def measures_state(model: Model, sensor: Sensor) -> bool:
-    """Whether a sensor measures components of the state by their names, with their covariance."""
+    """Tell whether a sensor measures components of the state by their names, with their covariance."""
     return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()

@@ -39,7 +39,7 @@ TURN = 2.0 * np.pi
 
 
 class _Call(NamedTuple):
-    """A model's function of a state and other inputs, as a method calls it.
+    """Holds a model's function of a state and other inputs, as a method calls it.
 
     Attributes:
         what: its name and place, for sentences.
@@ -202,7 +202,7 @@ def _check_derivatives(
 def _check_correction(
     correct: Correction, model: Model, state: Floats, rng: np.random.Generator
 ) -> None:
-    """A small correction moves every component by itself, and a step back is found again."""
+    """Check that a small correction moves every component by itself, and a step back is found again."""
     at, slope = tuple(state), rng.normal(size=model.tangent)
     slope /= np.dot(slope, correct.along(at))
     for moved in (correct.move, correct.back):
@@ -273,7 +273,7 @@ def _check_linear(call: _Call, is_linear: bool, by_state: list[Floats]) -> None:
 
 
 def _check_twins(call: _Call, states: Floats, rng: np.random.Generator) -> None:
-    """An angle a turn further, and the negative of a unit vector, are the same state."""
+    """Check that an angle a turn further, and the negative of a unit vector, are the same state."""
     names, outputs = list(call.state), tuple(call.outputs.values())
     for kind, first, *_ in manifold_blocks(tuple(call.state.values())):
         if kind == "linear":
@@ -304,7 +304,7 @@ def _check_length(call: _Call, value: Floats) -> None:
 
 
 def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
-    """A component declared linear that jumps by a turn along a path of states is an angle."""
+    """Find components declared linear that jump by a turn along a path: they are angles."""
     kinds = tuple(call.state.values())
     add, scales = boxplus(kinds), {"linear": 20.0, "angle": TURN, "axis": np.pi, "quaternion": TURN}
     linear = [index for index, kind in enumerate(call.outputs.values()) if kind == "linear"]
@@ -330,12 +330,12 @@ def _check_jumps(call: _Call, states: Floats, rng: np.random.Generator) -> None:
 
 
 def _check_period(name: str, index: int, model: Model, calls: list[_Call], states: Floats) -> None:
-    """A component declared linear that tells by sine and cosine alone is an angle."""
+    """Find components declared linear that act by sine and cosine alone: they are angles."""
     if model.kinds[index] != "linear":
         return
 
     def changes(shift: float) -> bool:
-        """Whether anything changes, beside the component itself, when it is shifted."""
+        """Tell whether anything changes, beside the component itself, when it is shifted."""
         for call in calls:
             zeros = [np.full(n, 0.0 if zero else 0.5) for n, zero in call.inputs.values()]
             for state in states:

@@ -27,9 +27,14 @@ Kinds = tuple[str, ...]
 
 
 def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) -> Function:
-    """`fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
+    """Make `fill(mean, covariance, slope)`: the tangent (t,) of a belief, see `model.Correction`.
 
     Where nothing bends it is left as it is.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
+        form: what stands for the covariance.
     """
     if correct is None:
 
@@ -54,10 +59,10 @@ def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) 
 def correcting(
     kinds: Kinds, correct: Correction | None, *, back: bool = False, form: Form = COVARIANCES
 ) -> Function:
-    """`move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
+    """Make `move(mean, covariance, work)`: moves the state by `work.step`, and the covariance with it.
 
     Where components bend together it is along `work.slope`, in the workspace's `state`, `transition` and
-    `product`. With `back` it is a step of a smoother's way back.
+    `product`. With `back` it is a step of a smoother's backward pass.
     """
     if correct is not None:
         step_together = _stepping(kinds, correct.back if back else correct.move)
@@ -85,10 +90,14 @@ def correcting(
 
 
 def comparing(kinds: Kinds, correct: Correction | None) -> Function:
-    """`compare(origin, mean, covariance, work)`: the step that `correcting` takes back, found again.
+    """Make `compare(origin, mean, covariance, work)`: it finds the step that `correcting` takes back.
 
     Fills `work.change[0]` with the step from the origin (n,) to the mean, and carries the covariance
     from the mean's tangent space to the origin's.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
     """
     if correct is not None:
         t, read_state = tangent_size(kinds), tuple_of(len(kinds))
@@ -126,7 +135,7 @@ def comparing(kinds: Kinds, correct: Correction | None) -> Function:
 
 
 def relinearising(model: Model) -> tuple[Function, Function]:
-    """Where an iterated update linearises, and the chain rule back to the mean.
+    """Find where an iterated update linearises, and the chain rule back to the mean.
 
     `step_to(mean, work)` fills `work.state` with the mean moved by `work.step`; after it
     `chain(rows, work)` makes of a Jacobian (m, t) at that state one by the step.
@@ -162,7 +171,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
 
 
 def _stepping(kinds: Kinds, move: Function) -> Function:
-    """`step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
+    """Make `step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
     straight = ("linear",) * tangent_size(kinds)
     inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
     arguments = (len(each.kinds) for each in inputs)
@@ -176,7 +185,7 @@ def _stepping(kinds: Kinds, move: Function) -> Function:
 
 
 def correcting_more(model: Model, more: int) -> Correction | None:
-    """How a model is corrected whose state gets so many more components, which move by themselves."""
+    """Extend a model's correction to more components of the state, which move by themselves."""
     if model.correct is None:
         return None
     n, t, correct = model.size, model.tangent, model.correct

@@ -7,7 +7,7 @@ state of every model that gives what the method needs.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 from recorders.log import Schema, Stream, schemas
@@ -31,8 +31,8 @@ class Map:
         number: the field that numbers them.
         point: the vector field of the point.
         components: of the point, by name.
-        of: the measurement's field that says which point; where it names none, the measurement says
-            nothing of the state.
+        of: the measurement's field that says which point; where it names none, the measurement has
+            no information on the state.
     """
 
     topic: str
@@ -61,7 +61,7 @@ class Control:
         interpolated: the control is linear between two messages, and the motion over a step gets the
             mean of its two ends; else a message holds until the next one.
         initial: what holds before the first message; zeros unless given.
-        gap: the parameter that says how long, in s, an interpolated control may be silent: what is
+        gap: the parameter that says how long, in s, an interpolated control may be missing: what is
             estimated ends there, or is unknown until it speaks again, see `Motion.gap_noise`.
         delay: the parameter that says how long before its stamp, in s, a message was measured.
         estimates: whether there are estimates at its stamps too, not at those of sensors alone.
@@ -145,8 +145,8 @@ class Sensor:
         schema: of its messages. A GeodeticFix serves for a PositionFix, through the log's origin.
         measured: the components by name, with their kinds ("linear" or "angle").
         measure: (state, reference, parameters) -> what it measures; `reference` is the point of the map,
-            or empty. With `noises`, (state, noise, reference, parameters). A component that says nothing
-            of this state, or has no derivative there, is NaN: as if the message lacked it.
+            or empty. With `noises`, (state, noise, reference, parameters). A component without
+            information of this state, or has no derivative there, is NaN: as if the message lacked it.
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
             with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
             has neither is passed over, and counted.
@@ -250,7 +250,7 @@ class Correction:
         along: state -> d (t,).
         move: (state, step, slope) -> the state after an update's step (t,) of its tangent space.
         step: (state, target, slope) -> the step that `back` takes from the state to the target.
-        back: (state, step, slope) -> the state after a step of a smoother's way back.
+        back: (state, step, slope) -> the state after a step of a smoother's backward pass.
     """
 
     along: Function
@@ -287,6 +287,7 @@ class Model:
 
     A thing on a line, whose range from the origin is measured:
 
+    >>> import numpy as np
     >>> from recorders.log import schemas
     >>> class OnALine(ModelParameters):
     ...     sigma_m: float = 0.1
@@ -333,7 +334,7 @@ class Model:
     takes_fixes: bool = True
     by_name: bool = False
 
-    @property
+    @cached_property
     def all_sensors(self) -> tuple[Sensor, ...]:
         """List the sensors, with that of position fixes unless the model has one of its own."""
         names = [name for name in POSITION if self.state.get(name) == "linear"]
@@ -349,7 +350,7 @@ class Model:
         """Tell whether the model finds its own start, see `Start.find`."""
         return self.start is not None and self.start.find is not None
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[str, ...]:
         """List the kinds of the state's components."""
         return tuple(self.state.values())
@@ -359,7 +360,7 @@ class Model:
         """Count the components of the state."""
         return len(self.state)
 
-    @property
+    @cached_property
     def tangent(self) -> int:
         """Count those of its tangent space: an orientation has four components and three."""
         return tangent_size(self.kinds)

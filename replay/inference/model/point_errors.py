@@ -29,14 +29,14 @@ Names = tuple[str, ...]
 
 
 class PointError(NamedTuple):
-    """The error of what is `measured` about the points with these numbers, one of each map."""
+    """Holds the error of what is `measured` about the points with these numbers, one of each map."""
 
     measured: str
     numbers: tuple[int, ...]
 
     @property
     def name(self) -> str:
-        """The component of the state."""
+        """Return the component of the state."""
         return "_".join(["error", self.measured, *map(str, self.numbers)])
 
 
@@ -44,11 +44,16 @@ Errors = tuple[PointError, ...]
 
 
 def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
-    """The errors that an entry of `estimate` names; none where it names a parameter.
+    """Return the errors that an entry of `estimate` names; none where it names a parameter.
 
     `range_m[3]` is the error of what is measured as range_m about point 3, `range_m[0:8]` are those
     about points 0 to 7, `range_m[0:8,0:3]` those of all pairs with points 0 to 2 of the second map.
     Raises BadInput where the model measures nothing of the kind.
+
+    Args:
+        where: the estimator and option, for errors.
+        model: with the sensors whose errors they are.
+        asks: the entry, such as `range_m[0:8]`.
     """
     found = re.fullmatch(r"(\w+)\[([^\[\]]*)\]", asks)
     if found is None:
@@ -67,7 +72,7 @@ def point_errors(where: str, model: Model, asks: str) -> list[PointError]:
 
 @lru_cache(maxsize=64)
 def with_point_errors(model: Model, errors: Errors) -> Model:
-    """The model with these errors in its state."""
+    """Return the model with these errors in its state."""
     kinds = {name: kind for each in model.sensors for name, kind in each.measured.items()}
     return replace(
         model,
@@ -83,7 +88,7 @@ def with_point_errors(model: Model, errors: Errors) -> Model:
 
 @lru_cache(maxsize=256)
 def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
-    """The motion, beside which each error goes its own way."""
+    """Return the motion, beside which each error goes its own way."""
     n, t = model.size, model.tangent
     noises, names, inner, noise_of = motion.noises, _names(errors), motion.move, motion.noise
     given = noise_of(trial_state(model.kinds), 1.0, trial_parameters(model)) if noise_of else ()
@@ -115,7 +120,7 @@ def motion_with_errors(model: Model, motion: Motion, errors: Errors) -> Motion:
 
 @lru_cache(maxsize=256)
 def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
-    """The sensor, to whose measurements the errors about their points are added."""
+    """Return the sensor, to whose measurements the errors about their points are added."""
     own = [
         (model.size + index, list(sensor.measured).index(each.measured), each.numbers)
         for index, each in enumerate(errors)

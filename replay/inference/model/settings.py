@@ -62,7 +62,13 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
 
     What is not given is looked for in the channels of the control, the prior and the sensors; a sensor
     looks in its own first. Raises BadInput where none states a number that is used, or one that the
-    parameter does not allow, and where the model is not what it says.
+    parameter does not allow, and where the model is not what it declares.
+
+    Args:
+        label: the estimator's, for errors.
+        stage: the model with the sensors at hand.
+        found: its topics.
+        parameters: as given by the user.
     """
     model = stage.model
     names = number_fields(model.parameters)
@@ -112,7 +118,14 @@ def _stating(found: Found) -> list[Topic]:
 
 
 def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
-    """List the parameters that are assumed, since a log without a prior does not state them."""
+    """List the parameters that are assumed, since a log without a prior does not state them.
+
+    Args:
+        label: the estimator's, for errors.
+        stage: the model with the sensors at hand.
+        found: its topics.
+        parameters: as given by the user.
+    """
     start = stage.model.start
     if found.has_prior or start is None:
         return {}

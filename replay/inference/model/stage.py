@@ -14,7 +14,7 @@ Part = TypeVar("Part")
 
 
 class Stage(NamedTuple):
-    """A model as a method takes it: its motion, and the sensors that the log has.
+    """Holds a model as a method takes it: its motion, and the sensors that the log has.
 
     `modes` are the motions of all modes, in their order, for a method that takes all of them. Made by
     `stage_of`: the functions are traced.
@@ -33,7 +33,7 @@ def stage_of(
     modes: Sequence[Motion] = (),
     names: tuple[str, ...] | None = None,
 ) -> Stage:
-    """A model with one of its motions, some of its sensors, and perhaps all its modes, traced.
+    """Return a model with one of its motions, some of its sensors, and perhaps all its modes, traced.
 
     `names` are the parameters that functions may read, the model's own unless given.
 
@@ -49,9 +49,13 @@ def stage_of(
 
 
 def title_of(model: Model, summary: str) -> str:
-    """What the kernel of a method with this summary is called while one waits until it is compiled.
+    """Name the kernel of a method with this summary, for messages while it is compiled.
 
     The model has its registered name where it is one of those that are loaded, which imports nothing.
+
+    Args:
+        model: whose summary is part of it.
+        summary: the method's.
     """
     found = (
         (name, getattr(sys.modules.get(entry.module), entry.attr, None))
@@ -62,7 +66,7 @@ def title_of(model: Model, summary: str) -> str:
 
 
 def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motion:
-    """A motion whose functions are traced."""
+    """Return a motion whose functions are traced."""
     n, t, controls = model.size, model.tangent, model.controls
     entering = (motion.noises,) if motion.noises else ()
     driven = (controls, None, names)
@@ -78,7 +82,7 @@ def traced_motion(model: Model, motion: Motion, names: tuple[str, ...]) -> Motio
 
 
 def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Sensor:
-    """A sensor whose functions are traced."""
+    """Return a sensor whose functions are traced."""
     n, t, m, reference = model.size, model.tangent, len(sensor.measured), sensor.reference_size
     entering = (sensor.noises,) if sensor.noises else ()
     filled = (Shape((m,)), Shape((m, m)), Shape((t, m)))
@@ -93,7 +97,7 @@ def traced_sensor(model: Model, sensor: Sensor, names: tuple[str, ...]) -> Senso
 
 
 def traced_model(model: Model, names: tuple[str, ...]) -> Model:
-    """A model whose switching is traced; its motion and sensors are as they were."""
+    """Return a model whose switching is traced; its motion and sensors are as they were."""
     if model.switching is None:
         return model
     switching = _with_traced(model.switching, rates=(names,))
@@ -111,7 +115,7 @@ _KNOWN: dict[Any, tuple[Any, Any]] = {}
 
 
 def _same_again(part: Part, **changes: Any) -> Part:
-    """The part with these changes: one object as long as they are the same ones."""
+    """Return the part with these changes: one object as long as they are the same ones."""
     key = id(part), *((name, id(each)) for name, each in changes.items())
     known = _KNOWN.get(key)
     if known is None:

@@ -15,7 +15,7 @@ class Start:
     """Describes what is assumed of a log that has no prior: it was not made for the model.
 
     It begins at the first message that measures components of the state by their names, a fix or a pose
-    with its covariance. What that does not measure is zero, and as uncertain as is said here. With no
+    with its covariance. What that does not measure is zero, and as uncertain as is stated here. With no
     sensor at all the thing begins at zero, which is where its frame is. Sensors that do not measure the
     state itself need a prior.
 
@@ -23,15 +23,16 @@ class Start:
         sigmas: standard deviations of the state's components, linear ones and angles.
         parameters: numbers that no channel of such a log states.
         align: (path, places, covariances, span_s, parameters) -> mean and covariance of the state, or
-            None where these do not tell it yet. The path (k, n) is where the control alone leads from
-            zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much time.
-            The state is that at the last of them, and begins just after it: they are used up. For a
-            state of which a position tells too little.
+            None where these do not determine it yet. The path (k, n) is where the control alone leads
+            from zero, at the first k fixes (k, 2) with their covariances (k, 2, 2), which span so much
+            time. The state is that at the last of them, and begins just after it: they are used up. For
+            a state that a position does not determine.
         find: (streams, parameters) -> `Started`, in place of all that, of the first messages of a run by
             the model's names for their topics, and the maps; for a state that is found from several
-            messages together. Raises BadInput where they do not tell it. Such a model needs a sensor.
+            messages together. Raises BadInput where they do not determine it. Such a model needs a
+            sensor.
         check_prior: (streams, parameters) -> sentences: what looks wrong in these messages where the log
-            has a prior. It is only said.
+            has a prior. It is only reported.
     """
 
     sigmas: Mapping[str, float]

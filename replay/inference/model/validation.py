@@ -25,6 +25,12 @@ def check_motion(where: str, model: Model, motion: Motion, parameters: Any) -> N
 
     `parameters` has a number for every parameter. Raises BadInput where a function fails, or
     returns what the model denies.
+
+    Args:
+        where: the estimator, for errors.
+        model: whose motion it is.
+        motion: one of its motions.
+        parameters: that record what is read.
     """
     state, control = trial_state(model.kinds), (0.0,) * model.controls
     sizes = (model.tangent, motion.triangle(model.tangent))
@@ -65,9 +71,14 @@ def check_switching(where: str, model: Model, parameters: Any) -> None:
 
 
 def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Floats]:
-    """The rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
+    """Return the rates (M (M - 1),) between a model's modes and their initial probabilities (M,).
 
     Raises BadInput where a rate is negative, or the probabilities are none.
+
+    Args:
+        where: the estimator, for errors.
+        model: of M modes.
+        parameters: of its functions.
     """
     assert model.modes
     assert model.switching
@@ -92,7 +103,14 @@ def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Flo
 
 
 def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> None:
-    """Call a sensor's functions once, uncompiled; see `check_motion`."""
+    """Call a sensor's functions once, uncompiled; see `check_motion`.
+
+    Args:
+        where: the estimator, for errors.
+        model: whose sensor it is.
+        sensor: one of its sensors.
+        parameters: that record what is read.
+    """
     where, size = f"{where}, sensor {sensor.topic}", len(sensor.measured)
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
@@ -116,7 +134,7 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
 
 
 def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:
-    """A state at which to try functions: numbers that differ, unit vectors."""
+    """Return a state at which to try functions: numbers that differ, unit vectors."""
     found: list[float] = []
     while len(found) < len(kinds):
         kind = kinds[len(found)]

@@ -65,7 +65,7 @@ class GaussianSumParameters(UnscentedParameters, RegressionParameters):
 
 
 class GaussianSumBelief(NamedTuple):
-    """What is believed of the states, first axis = run: those of M Gaussians that are left, in front.
+    """Holds the Gaussians of all runs, first axis = run: those of M that are left, in front.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
@@ -83,7 +83,7 @@ class GaussianSumBelief(NamedTuple):
 
 
 class GaussianSumMemory(NamedTuple):
-    """What the steps of one core work in; see `imm.GaussianSumMemory`, and `factor` (t, t)."""
+    """Holds what the steps of one core work in; see `mixing.InteractingMemory`, and `factor` (t, t)."""
 
     filters: tuple[Any]
     centre: Floats
@@ -96,7 +96,13 @@ class GaussianSumMemory(NamedTuple):
 
 
 def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
-    """Make the steps of a Gaussian sum of so many of these filters."""
+    """Make the steps of a Gaussian sum of so many of these filters.
+
+    Args:
+        stage: the model with the sensors at hand.
+        inner: the steps of the filter of one member.
+        members: how many there are at most.
+    """
     n, t = stage.model.size, stage.model.tangent
     innovation_size = len(innovation_components(stage.sensors))
     most = max((len(sensor.measured) for sensor in stage.sensors), default=0)
@@ -225,9 +231,13 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
 
 
 def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
-    """The direction (t,) in which a covariance (t, t) is widest of all turns, and its variance there.
+    """Find the direction (t,) in which a covariance (t, t) is widest of all turns, and its variance.
 
     Where it is as wide in several, these are the first thing's, and nearest to the first of its axes.
+
+    Args:
+        kinds: of the state's components.
+        covariance: (t, t), in the tangent space.
     """
     direction, variance, begin = np.zeros(len(covariance)), -1.0, 0
     for kind, _ in manifold_blocks(kinds):
@@ -245,7 +255,7 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
 
 
 def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) -> tuple[Floats, ...]:
-    """A Gaussian as a row of narrower ones, across its widest turn.
+    """Return a Gaussian as a row of narrower ones, across its widest turn.
 
     Returns:
         the weights (members,), zero where there is no member; the means (members, n); the covariance
@@ -267,16 +277,16 @@ def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int
 
 
 class GaussianSumFilter(MixtureFilter):
-    """A bank of filters; the probabilities of its members are on the topic `modes`."""
+    """Runs a bank of filters; the probabilities of its members are on the topic `modes`."""
 
     @property
     def names(self) -> Sequence[str]:
-        """How far each member is turned from the prior's mean."""
+        """Compute how far each member is turned from the prior's mean."""
         count = self.parameters.members
         return [f"turned_{360.0 * (each - count // 2) / count:g}_deg" for each in range(count)]
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """The state at every run's prior, which is split; see `Filter.start`."""
+        """Return the state at every run's prior, which is split; see `Filter.start`."""
         state, members = super().start(static), self.parameters.members
         mean, covariance = state.carried.belief
         runs = len(mean)
@@ -309,7 +319,7 @@ def _lacks(model: Model, inner: Method) -> str:
 
 @lru_cache(maxsize=64)
 def _gaussian_sum(name: str, variant: str, members: int) -> Method:
-    """The method of so many filters of this name."""
+    """Make the method of so many filters of this name."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:

@@ -74,7 +74,12 @@ class InteractingParameters(UnscentedParameters, RegressionParameters):
 
 
 def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
-    """The steps of an interacting multiple model whose modes have these filters."""
+    """Make the steps of an interacting multiple model whose modes have these filters.
+
+    Args:
+        stage: the model with all its modes, and the sensors at hand.
+        filters: the steps of every mode's filter, in the order of the modes.
+    """
     model, switching = stage.model, stage.model.switching
     assert switching is not None
     modes, n, t = len(filters), model.size, model.tangent
@@ -175,22 +180,22 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
 
 
 class InteractingFilter(MixtureFilter):
-    """A filter of all modes of a model."""
+    """Runs a filter of all modes of a model."""
 
     @property
     def names(self) -> Sequence[str]:
-        """The modes."""
+        """Return the modes."""
         return tuple(self.stage.model.modes or ())
 
     @cached_property
     def chain(self) -> tuple[Floats, Floats]:
-        """The rates between the modes (M (M - 1),), and their initial probabilities (M,)."""
+        """Return the rates between the modes (M (M - 1),), and their initial probabilities (M,)."""
         model = self.stage.model
         parameters = reading_settings(number_fields(model.parameters))(self.settings, 0)
         return switching_of(f"estimator {self.name}", model, parameters)
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """The state at every run's prior, the same in all modes; see `Filter.start`."""
+        """Return the state at every run's prior, the same in all modes; see `Filter.start`."""
         state, (_, initial) = super().start(static), self.chain
         mean, covariance = (
             np.repeat(each[:, None], len(initial), axis=1) for each in state.carried.belief
@@ -215,12 +220,12 @@ class InteractingFilter(MixtureFilter):
         return after, made
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """What waited for a control, and, where asked for, the modes' probabilities given all data."""
+        """Filter what waited for a control, and smooth the modes' probabilities where asked for."""
         state, made = self.ended(state)
         return [*made, self.smoothed(join(state.kept))] if state.kept else made
 
     def smoothed(self, modes: Ragged) -> Ragged:
-        """The probabilities of all modes given all data."""
+        """Return the probabilities of all modes given all data."""
         (rates, _), count = self.chain, len(self.stage.modes)
         time_ns, probability = modes.stream.publish_time_ns, modes["probability"].copy()
         arguments = (modes.offsets, time_ns, rates, probability)
@@ -241,7 +246,7 @@ def _lacks(model: Model, inner: Method) -> str:
 
 @lru_cache(maxsize=64)
 def _interacting(name: str, variant: str) -> Method:
-    """The method that gives every mode this filter."""
+    """Make the method that gives every mode this filter."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:

@@ -23,7 +23,7 @@ Matrix = tuple[tuple[float, ...], ...]  # its rows
 
 
 class InteractingMemory(NamedTuple):
-    """What the steps of one core work in.
+    """Holds what the steps of one core work in.
 
     Attributes:
         filters: the memory of every mode's filter.
@@ -52,7 +52,7 @@ class InteractingMemory(NamedTuple):
 
 @lru_cache(maxsize=16)
 def transition_matrix(modes: int) -> Function:
-    """`fill_transition(rates, duration_s, transition)`: fills Pi = expm(rates dt), by uniformisation.
+    """Make `fill_transition(rates, duration_s, transition)`: Pi = expm(rates dt), by uniformisation.
 
     With L dt added to its diagonal, L the fastest rate at which a mode is left, the matrix has no
     negative entry, so that no digit is lost; exp(-L dt) takes it back. The duration is halved until the
@@ -96,7 +96,7 @@ def transition_matrix(modes: int) -> Function:
 
 
 def matrix_product(left: Matrix, right: Matrix) -> Matrix:
-    """The product of two matrices."""
+    """Compute the product of two matrices."""
     return tuple(
         tuple(
             total(tuple(row[k] * right[k][j] for k in range(len(right)))) for j in range(len(right[0]))
@@ -106,9 +106,9 @@ def matrix_product(left: Matrix, right: Matrix) -> Matrix:
 
 
 def mixing_weights(modes: int) -> Function:
-    """`fill_weights(probability, log_probability, memory)`: the probabilities become c.
+    """Make `fill_weights(probability, log_probability, memory)`: the probabilities become c.
 
-    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still tell
+    Row j of the memory's weights becomes mu_(i|j). Where c_j is next to nothing, logarithms still hold
     it; a mode that none with any probability leads to keeps its own Gaussian.
     """
 
@@ -193,7 +193,7 @@ def mixing(kinds: tuple[str, ...], form: Form = COVARIANCES) -> tuple[Function, 
 
 
 def likeliest_of(probability: Floats) -> int:
-    """The first mode than which none is more probable."""
+    """Return the first mode than which none is more probable."""
     likeliest = 0
     for mode in range(1, len(probability)):
         if probability[mode] > probability[likeliest]:

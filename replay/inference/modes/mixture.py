@@ -20,7 +20,7 @@ from replay.inference.run.recursion import Estimates, Innovations
 
 
 class ModeBelief(NamedTuple):
-    """What is believed of the states, first axis = run: a Gaussian for each of M modes.
+    """Holds what is believed of the states, first axis = run: a Gaussian for each of M modes.
 
     Attributes:
         mean, covariance: (runs, M, n), (runs, M, t, t).
@@ -34,7 +34,7 @@ class ModeBelief(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """Estimates as the filter fills them in, see `recursion.Estimates`; and the modes' probabilities."""
+    """Holds estimates as the filter fills them in, see `recursion.Estimates`, and probabilities."""
 
     end: Integers
     time_ns: Integers
@@ -44,7 +44,7 @@ class Mixtures(NamedTuple):
 
 
 def predicting(filters: Sequence[Steps]) -> Function:
-    """`predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
+    """Make `predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
     predictions = tuple(each.predict for each in filters)
 
     def predict(
@@ -68,12 +68,17 @@ def predicting(filters: Sequence[Steps]) -> Function:
 
 
 def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function:
-    """The update of several Gaussians by sensor `number`, and of the probabilities of their modes.
+    """Make the update of several Gaussians by sensor `number`, and of the probabilities of their modes.
 
     `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
     measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
-    do not compare. The innovation that is told is that of the mixture, whose covariance has the spread
-    of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
+    do not compare. The innovation that is recorded is that of the mixture, whose covariance has the
+    spread of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+        update_mode: the update of one Gaussian by it, see `Steps.updates`.
     """
     components, measured = list(innovation_components(stage.sensors)), stage.sensors[number].measured
     places = tuple(components.index(name) for name in measured)
@@ -160,26 +165,26 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
 
 
 class MixtureFilter(Filter, ABC):
-    """A filter whose belief are several Gaussians, which tells their probabilities beside the state."""
+    """Runs a filter whose belief is several Gaussians; puts out their probabilities beside the state."""
 
     @property
     @abstractmethod
     def names(self) -> Sequence[str]:
-        """What the Gaussians are of."""
+        """Return what the Gaussians are of."""
 
     def no_results(self, due: Integers, recorded: Integers, components: int) -> tuple[Any, Innovations]:
-        """Estimates and innovations to be filled in."""
+        """Return estimates and innovations to be filled in."""
         (end, time_ns, mean, covariance), innovations = super().no_results(due, recorded, components)
         probability = np.empty((len(mean), len(self.names)))
         return Mixtures(end, time_ns, mean, covariance, probability), innovations
 
     def output_streams(self, mixtures: Mixtures, offsets: Integers, /) -> list[Ragged]:
-        """The streams of the state and of the modes' probabilities."""
+        """Return the streams of the state and of the modes' probabilities."""
         modes = self.modes("modes", mixtures.time_ns, mixtures.probability, offsets)
         return [self.states(Estimates(*mixtures[:4]), offsets), modes]
 
     def modes(self, name: str, time_ns: Integers, probability: Floats, offsets: Integers) -> Ragged:
-        """The stream of the modes' probabilities (n, M)."""
+        """Return the stream of the modes' probabilities (n, M)."""
         stream = make_stream(
             f"/estimates/{self.name}/{name}",
             schemas.MODE_PROBABILITIES,

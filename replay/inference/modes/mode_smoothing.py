@@ -14,14 +14,14 @@ from replay.inference.modes.mixing import transition_matrix
 
 
 class SmoothingMemory(NamedTuple):
-    """What smoothing of one core works in: Pi (M, M), and the ratios of smoothed and predicted (M,)."""
+    """Holds what one core works in: Pi (M, M), and the ratios of smoothed and predicted (M,)."""
 
     transition: Floats
     ratio: Floats
 
 
 def smoothing_memory(modes: int) -> SmoothingMemory:
-    """Memory for the smoothing of so many modes' probabilities."""
+    """Make memory for the smoothing of so many modes' probabilities."""
     return SmoothingMemory(np.empty((modes, modes)), np.empty(modes))
 
 
@@ -32,7 +32,7 @@ def smoothing_over_runs(modes: int) -> Function:
 
 
 def smoothing(modes: int) -> Function:
-    """`smooth(run, ...)`: probabilities (n, M) given the data so far become those given all of the run.
+    """Make `smooth(run, ...)`: probabilities (n, M) given data so far become those given all of the run.
 
     mu_i(k|T) = mu_i(k) sum_j Pi_ij mu_j(k+1|T) / c_j(k+1), with c = Pi' mu(k).
     """

@@ -58,7 +58,13 @@ class ParticleParameters(MethodParameters):
 
 
 def particle_steps(stage: Stage, particles: int, resample_below: float) -> Steps:
-    """The steps of a bootstrap filter."""
+    """Make the steps of a bootstrap filter.
+
+    Args:
+        stage: the model as the method takes it.
+        particles: how many.
+        resample_below: the share of them; they are resampled where fewer are effective.
+    """
     model, motion, sensors = stage.model, stage.motion, stage.sensors
     n, t = model.size, model.tangent
     by_control = model.controls if motion.control_noise else 0
@@ -102,10 +108,10 @@ _draw_normals = compiled(fill_normals, allocates=False)
 
 
 class ParticleFilter(Filter):
-    """A filter whose runs begin when their first measurement, which seeds them, is there."""
+    """Runs a filter whose runs begin when their first measurement, which seeds them, is there."""
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """The state at every run's prior, see `Filter.start`."""
+        """Return the state at every run's prior, see `Filter.start`."""
         state = super().start(static)
         prior, particles = state.carried.belief, self.parameters.particles
         runs, n = prior.mean.shape
@@ -163,7 +169,10 @@ class ParticleFilter(Filter):
         return [Ragged(stream, np.searchsorted([*first], np.arange(runs + 1)))]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """What waited for a control or a measurement that did not come; then the prior seeds the run."""
+        """Filter what waited for a control or a measurement that did not come.
+
+        Then the prior seeds the run.
+        """
         state, made = self.ended(state)
         if state.kept is None:
             return made
@@ -173,7 +182,7 @@ class ParticleFilter(Filter):
         return [*made, *super().follow(after._replace(kept=None), state.kept)[1]]
 
     def begun(self, state: FilterState, seeds: Mapping[int, list[Any]]) -> FilterState:
-        """The state with particles drawn from the priors of some runs, each seeded by its data."""
+        """Draw particles from the priors of some runs, each seeded by its data."""
         if not seeds:
             return state
         carried = state.carried
@@ -200,7 +209,7 @@ class ParticleFilter(Filter):
         return Clouds(end, times, mean, covariance, np.empty(rows), states, weight), innovations
 
     def output_streams(self, clouds: Clouds, offsets: Integers, /) -> list[Ragged]:
-        """The streams of estimates and of the effective number, and where they are wanted particles."""
+        """Make the streams of estimates, of the effective number and, where wanted, of particles."""
         model, (rows, particles) = self.stage.model, clouds.weight.shape
         stem = f"/estimates/{self.name}"
         effective = make_stream(
@@ -259,7 +268,7 @@ def _made_for(parameters: ParticleParameters) -> Method:
 
 
 def _lacks_likelihood(model: Model) -> str:
-    """A sensor whose noise enters other than linearly, and which states no likelihood."""
+    """Return a sensor whose noise enters other than linearly, and which states no likelihood."""
     parameters = trial_parameters(model)
     for sensor in model.sensors:
         if not sensor.noises or sensor.log_likelihood is not None:
@@ -274,7 +283,7 @@ def _lacks_likelihood(model: Model) -> str:
                     )
                     for k in range(3)
                 ]
-            except Exception:  # is said when the model is bound, see `model.check_sensor`
+            except Exception:  # is reported when the model is bound, see `validation.check_sensor`
                 continue
         if not np.allclose(at[2] - at[1], at[1] - at[0], rtol=1e-9, atol=1e-9, equal_nan=True):
             return f"a likelihood of its sensor {sensor.topic}"

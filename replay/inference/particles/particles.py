@@ -32,7 +32,7 @@ from replay.sampling.resampling import choose_systematically
 
 
 class Cloud(NamedTuple):
-    """The particles of all runs; first axis = run.
+    """Holds the particles of all runs; first axis = run.
 
     Attributes:
         prior: what they are drawn from.
@@ -53,7 +53,7 @@ class Cloud(NamedTuple):
 
 
 class Clouds(NamedTuple):
-    """Estimates as the recursion fills them in (`recursion.Estimates`), with all particles or none.
+    """Holds estimates as the recursion fills them in (`recursion.Estimates`), with particles or none.
 
     `effective` (n,) is the effective number of particles.
     """
@@ -68,7 +68,7 @@ class Clouds(NamedTuple):
 
 
 class SensorMemory(NamedTuple):
-    """What the update by one sensor of m components works in.
+    """Holds what the update by one sensor of m components works in.
 
     Attributes:
         innovation: of the cloud as a whole.
@@ -86,7 +86,7 @@ class SensorMemory(NamedTuple):
 
 
 class ParticleMemory(NamedTuple):
-    """What the steps of one core work in.
+    """Holds what the steps of one core work in.
 
     Attributes:
         least_effective: the effective number below which particles are resampled.
@@ -114,7 +114,7 @@ class ParticleMemory(NamedTuple):
 
 
 def moving(stage: Stage, by_control: int) -> Function:
-    """The prediction: every particle moves with noise of its own, after resampling where that is due.
+    """Make the prediction: every particle moves with noise of its own, after resampling where due.
 
     The first `by_control` draws of a particle are errors of the control.
     """
@@ -150,7 +150,15 @@ def moving(stage: Stage, by_control: int) -> Function:
 
 
 def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
-    """Resample where the effective number of particles is too small; returns the counter after it."""
+    """Resample where the effective number of particles is too small; returns the counter after it.
+
+    Args:
+        states: (N, n).
+        weight: (N,).
+        key: (2,) of the run.
+        counter: of its generator.
+        memory: to work in.
+    """
     if not effective_number(weight) < memory.least_effective:
         return counter
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
@@ -165,7 +173,7 @@ def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: P
 
 
 def effective_number(weight: Floats) -> float:
-    """How many particles of equal weight are worth as much as these (N,): 1 / sum w^2."""
+    """Count how many particles of equal weight are worth as much as these (N,): 1 / sum w^2."""
     squared = 0.0
     for i in range(len(weight)):
         squared += weight[i] * weight[i]
@@ -173,7 +181,7 @@ def effective_number(weight: Floats) -> float:
 
 
 def _driving(stage: Stage) -> Function:
-    """`drive(control, drawn, duration_s, parameters, memory)`: what drives a particle, as a tuple."""
+    """Make `drive(control, drawn, duration_s, parameters, memory)`: a particle's control, as a tuple."""
     controls, variances = stage.model.controls, stage.motion.control_noise
     read, fill = tuple_of(controls), filling(controls)
     if variances is None:
@@ -197,7 +205,7 @@ def _driving(stage: Stage) -> Function:
 
 
 def _moved(stage: Stage, first: int) -> Function:
-    """`moved(state, driven, drawn, duration_s, parameters, memory)`: a state after the motion."""
+    """Make `moved(state, driven, drawn, duration_s, parameters, memory)`: a state after the motion."""
     move, variances, noises = stage.motion.move, stage.motion.noise, stage.motion.noises
     if not noises:
 
@@ -238,7 +246,7 @@ def _no_noise(
 
 
 def _additive_noise(stage: Stage, first: int) -> Function:
-    """`spread(states, offsets, duration_s, parameters, memory)`: draws of the additive noise.
+    """Make `spread(states, offsets, duration_s, parameters, memory)`: draws of the additive noise.
 
     They are tangent vectors, at the states before they move. Noise is factored anew only where it is
     not that of the particle before. False where a covariance is not positive semidefinite.
@@ -277,7 +285,7 @@ def _additive_noise(stage: Stage, first: int) -> Function:
 
 
 def summing_up(model: Model) -> Function:
-    """The estimate: intrinsic mean and covariance of the weighted particles, and these where wanted."""
+    """Make the estimate: intrinsic mean and covariance of weighted particles, and these where wanted."""
     n, t = model.size, model.tangent
     subtract, settle, moments = boxminus(model.kinds), settling(model.kinds), moments_of(0, t)
     weighted_mean, straight = weighted_mean_of(n), set(model.kinds) <= {"linear"}

@@ -28,11 +28,15 @@ from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMe
 
 
 def weighing(stage: Stage, number: int) -> Function:
-    """The update by sensor `number`: every particle is weighed by the likelihood of what was measured.
+    """Make the update by sensor `number`: it weighs particles by the likelihood of the measurement.
 
-    What is told of the innovation, its NIS and the gate are of the cloud's first two moments; the
+    The innovation that is recorded, its NIS and the gate are of the cloud's first two moments; the
     log-likelihood is that of the weighted particles. A component that no particle predicts is left out,
-    and a particle that lacks another one keeps its share of the weight: nothing is said of it.
+    and a particle that lacks another one keeps its share of the weight.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
     """
     sensor = stage.sensors[number]
     m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
@@ -77,7 +81,7 @@ def weighing(stage: Stage, number: int) -> Function:
 
 
 def _comparing(stage: Stage, number: int) -> Function:
-    """`compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
+    """Make `compare(states, data, parameters, memory)`: fills a sensor's differences and its noise."""
     model, sensor = stage.model, stage.sensors[number]
     m, measure = len(sensor.measured), sensor.measure
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
@@ -138,7 +142,7 @@ def keep_predicted(own: SensorMemory) -> int:
 
 
 def is_told(own: SensorMemory, i: int, size: int) -> bool:
-    """Whether a particle predicts all components that are used."""
+    """Tell whether a particle predicts all components that are used."""
     for a in range(size):
         if np.isnan(own.differences[i, own.kept[a]]):
             return False
@@ -149,6 +153,12 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
     """Fill the innovation of the cloud: mean and covariance of the differences, and the noise.
 
     The differences are taken from that of the first particle which has one, where no angle is cut.
+
+    Args:
+        weight: (N,).
+        own: the sensor's memory, with differences and noise.
+        size: how many components are used.
+        angular: (m,) which are angles.
     """
     mean, spread, _ = own.innovation
     for j in range(len(mean)):
@@ -184,7 +194,7 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
 
 
 def factor_kept(own: SensorMemory, size: int) -> None:
-    """Make of the noise of the components that are used its factor, at the front, and log det.
+    """Factor the noise of the components that are used, at the front, with log det.
 
     That is NaN where the covariance is not positive definite.
     """
@@ -202,9 +212,9 @@ def factor_kept(own: SensorMemory, size: int) -> None:
 
 
 def _likelihood(stage: Stage, number: int) -> Function:
-    """`likelihood(states, i, data, parameters, own, size)`: log p of what was measured, at particle i.
+    """Make `likelihood(states, i, data, parameters, own, size)`: log p of the measurement at particle i.
 
-    The model's own, or that of Gaussian noise; NaN where the particle says nothing of it.
+    The model's own, or that of Gaussian noise; NaN where the particle does not predict it.
     """
     sensor = stage.sensors[number]
     if sensor.log_likelihood is None:
@@ -223,7 +233,7 @@ def _likelihood(stage: Stage, number: int) -> Function:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
 ) -> float:
-    """See `_likelihood`; the difference becomes L^-1 v. The noise itself widens, see `inflation`."""
+    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v."""
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):

@@ -45,7 +45,12 @@ class Points:
 
 
 def points_of(ragged: Ragged, asked: Map) -> Points:
-    """Collect the points of all runs; raises BadInput where they lack a component."""
+    """Collect the points of all runs; raises BadInput where they lack a component.
+
+    Args:
+        ragged: the messages of a map's topic, in all runs.
+        asked: the map as the model describes it.
+    """
     places = read_vectors(ragged.stream, asked.point, asked.components)
     run = np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
     keys = (run << 32) + ragged[asked.number]

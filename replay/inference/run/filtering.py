@@ -59,7 +59,7 @@ class FilterState(NamedTuple):
         generators: of the randomised samples, for every sampled function and run.
         waiting: events that wait for the next message of an interpolated control.
         unsettled: events that wait for others which were measured before them and come later.
-        kept: what a smoother keeps for its way back, or a filter for late messages.
+        kept: what a smoother keeps for its backward pass, or a filter for late messages.
         next_output: (runs,) the number of the next extra estimate.
     """
 
@@ -89,7 +89,13 @@ def _compiled(stage: Stage, method: Method) -> tuple[Function, Steps]:
 
 
 def samplers_of(stage: Stage, method: Method, parameters: Any) -> tuple[Sampler, ...]:
-    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size."""
+    """Make a sampler for each sampled function; raises BadInput where the sampling has no such size.
+
+    Args:
+        stage: the model as the method takes it.
+        method: whose `sampling` chooses samples.
+        parameters: the method's.
+    """
     if method.sampling is None:
         return ()
     sampling = method.sampling(parameters)

@@ -54,7 +54,13 @@ def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floa
 def first_of_runs(
     ragged: Ragged, clock: Clock, usable: Booleans | None
 ) -> tuple[Integers, Booleans, Integers]:
-    """Find the first usable message of every run (runs,): its stamp, whether there is one, its row."""
+    """Find the first usable message of every run (runs,): its stamp, whether there is one, its row.
+
+    Args:
+        ragged: the messages of a topic, in all runs.
+        clock: by which the stamps are taken.
+        usable: (n,) which of them may be used; all where it is None.
+    """
     every = np.arange(len(ragged)) if usable is None else np.flatnonzero(usable)
     place = np.searchsorted(every, ragged.offsets)
     has_one = place[1:] > place[:-1]

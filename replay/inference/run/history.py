@@ -94,7 +94,12 @@ class History(NamedTuple):
 
 
 def no_history(stage: Stage, carried: RecursionState) -> History:
-    """Make the history before all messages: the priors alone."""
+    """Make the history before all messages: the priors alone.
+
+    Args:
+        stage: the model with the sensors at hand.
+        carried: the state at the priors.
+    """
     runs, innovation_size, (width, _) = (
         len(carried.time_ns),
         len(innovation_components(stage.sensors)),
@@ -117,7 +122,13 @@ def no_history(stage: Stage, carried: RecursionState) -> History:
 
 
 def most_within(history: History, events: FilterEvents, window_ns: int) -> int:
-    """Count the most messages of a run that lie within a window, of those kept and those that come."""
+    """Count the most messages of a run that lie within a window, of those kept and those that come.
+
+    Args:
+        history: of all runs.
+        events: those that come now.
+        window_ns: its length.
+    """
     most, kept_ns, kept = 0, history.kept.time_ns[history.rows], history.offsets
     for run, (begin, end) in enumerate(zip(events.offsets[:-1], events.offsets[1:], strict=True)):
         before_ns = kept_ns[kept[run] + 1 : kept[run + 1]]

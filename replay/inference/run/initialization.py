@@ -1,6 +1,6 @@
 """Initializes a filter in a log without a prior, and finds the origin of its plane.
 
-A log without a prior gets one at the first message that measures the state, see `model.Start`. It is so
+A log without a prior gets one at the first message that measures the state, see `start.Start`. It is so
 much wider than that message that the message itself, used like any other, is what counts. The origin of
 a plane that no channel states is the first geodetic fix. All of it is told, on the topic `started`.
 """
@@ -301,7 +301,7 @@ class Initializer:
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"
     ) -> "Fact":
-        """Begin runs just after the first fixes that, with the path between them, tell all."""
+        """Begin runs just after first fixes that, with the path between them, determine the state."""
         numbers = [number for number, _, _ in self._measuring]
         sensors = tuple(self.found.sensors[number] for number in numbers)
         found = self.found._replace(sensors=sensors)

@@ -201,7 +201,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
 class OutOfSequenceFilter:
     """Runs a filter that reprocesses up to `window_ns`: `start`, `run` and `finish` as of `Filter`.
 
-    `inner` is an `estimators.Filter`, and the states are of its type.
+    `inner` is an `filtering.Filter`, and the states are of its type.
     """
 
     inner: Any
@@ -282,6 +282,11 @@ def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragge
     """Stamp estimates with the log times at which the events that called for them arrived.
 
     Every run has one for each event that is due, from its prior's stamp on, or only the first of these.
+
+    Args:
+        estimates: as the filter put them out.
+        events: of the block, with their arrivals.
+        start_ns: (runs,) stamps of the priors.
     """
     if not events.arrival.shape[1]:
         return estimates

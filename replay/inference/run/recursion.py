@@ -43,7 +43,7 @@ class FilterEvents(NamedTuple):
         offsets: (runs + 1,).
         time_ns: (n,).
         source: (n,) a sensor's number, CONTROL or NOTHING.
-        data: (n, width) the numbers of the message, see `steps.reading`; the control's where that is
+        data: (n, width) the numbers of the message, see `update.reading`; the control's where that is
             interpolated.
         wants_estimate: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
@@ -108,6 +108,12 @@ def no_results(
 
     All columns lie in one piece of memory, which is there at once: of many pieces, a system hands out
     every page by itself, and that takes as long as half of a small filter.
+
+    Args:
+        due: (runs + 1,) offsets of the estimates.
+        recorded: (runs + 1,) offsets of the innovations.
+        model: the model, for the sizes of its state and tangent space.
+        innovation_size: how many components the sensors measure together.
     """
     n, t = model.size, model.tangent
     shapes = [
@@ -132,7 +138,12 @@ def no_results(
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
-    """Cut results down to what was filled in, laid end to end, and return their offsets."""
+    """Cut results down to what was filled in, laid end to end, and return their offsets.
+
+    Args:
+        results: estimates or innovations, with the `end` that each run has reached.
+        offsets: (runs + 1,) where the runs began.
+    """
     end, *columns = results
     rows, kept = filled_rows(offsets, end)
     if isinstance(rows, slice):
@@ -236,6 +247,15 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     """Make the loop over the events of one run, for `replay.engine.compiling.compile.compile_over_runs`.
 
     `settings_of(settings, row)` makes a row's parameters: 0 is the motion's, the others the sensors'.
+
+    Args:
+        stage: the model as the method takes it.
+        steps: the method's steps for it.
+        settings_of: see above.
+
+    Returns `follow(run, events, settings, gates, carried, estimates, innovations, memory)`, with
+    settings (runs, 1 + sensors, fields) and gates (sensors + 1, m + 1); it changes what is carried in
+    place.
     """
     process, estimate = processing(stage, steps, settings_of), steps.estimate
 
@@ -272,7 +292,12 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def fault_of(mean: Floats, covariance: Floats) -> int:
-    """Find why an estimate is none: it is not finite, or a variance is negative; else ALL_WELL."""
+    """Find why an estimate is none: it is not finite, or a variance is negative; else ALL_WELL.
+
+    Args:
+        mean: (n,).
+        covariance: (t, t).
+    """
     total = 0.0
     for row in range(len(mean)):
         total += mean[row]
@@ -288,7 +313,11 @@ def fault_of(mean: Floats, covariance: Floats) -> int:
 
 
 def choosing(updates: tuple[Function, ...]) -> Function:
-    """Make `update(source, ...)`: it calls the update of the sensor with this number."""
+    """Make `update(source, ...)`: it calls the update of the sensor with this number.
+
+    Args:
+        updates: one for each sensor.
+    """
 
     def update(source: int, *arguments: Any) -> int:
         for number in range_of(len(updates)):

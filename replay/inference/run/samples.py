@@ -14,7 +14,14 @@ from replay.sampling.sets import SampleSets, seeded_by_data, sets_by_runs
 def seeded_generators(
     generators: tuple[Any, ...], events: FilterEvents, count: int, seed: int
 ) -> tuple[Any, ...]:
-    """Seed generators of every sampled function and run, by the seed and the run's first data."""
+    """Seed generators of every sampled function and run, by the seed and the run's first data.
+
+    Args:
+        generators: those of the block before, by function and run; empty before the first.
+        events: of all runs.
+        count: how many functions are sampled.
+        seed: the parameter.
+    """
     runs = len(events.offsets) - 1
     before = generators or ((None,) * runs,) * count
     return tuple(
@@ -26,7 +33,13 @@ def seeded_generators(
 def sample_sets(
     samplers: Sequence[Sampler], generators: tuple[Any, ...], offsets: Integers
 ) -> Iterator[tuple[slice, tuple[SampleSets, ...]]]:
-    """Iterate over runs and their samples; the largest random function says how many runs at once."""
+    """Iterate over runs and their samples; the largest random function says how many runs at once.
+
+    Args:
+        samplers: one for each sampled function.
+        generators: by function and run, see `seeded_generators`.
+        offsets: (runs + 1,) of the events.
+    """
     drawn = [index for index, each in enumerate(samplers) if each.redrawn]
     if not drawn:
         sets = tuple(next(sets_by_runs(each, (), offsets))[1] for each in samplers)

@@ -30,6 +30,10 @@ def delays_of(stage: Stage, settings: Floats) -> Integers:
     """Compute how long before their stamps messages were measured, in ns, by an event's source.
 
     (sensors + 2,): the sensors', then that of NOTHING, which is 0, and of the CONTROL.
+
+    Args:
+        stage: the model with the sensors at hand.
+        settings: (1 + sensors, fields), see `settings_of`.
     """
     names, control = number_fields(stage.model.parameters), stage.model.control
     asked = [(number + 1, sensor.delay) for number, sensor in enumerate(stage.sensors)]
@@ -45,6 +49,12 @@ def compensate_delays(
 
     What is less than the longest of `delays_of` before a run's last stamp waits, unless this is the end:
     something older may come.
+
+    Args:
+        stage: the model with the sensors at hand.
+        events: by their stamps, in order.
+        delays_ns: (sensors + 2,), see `delays_of`.
+        is_end: whether no more events come.
     """
     runs = len(events.offsets) - 1
     run = np.repeat(np.arange(runs), np.diff(events.offsets))
@@ -68,7 +78,14 @@ def last_of_stamps(events: FilterEvents) -> Booleans:
 def output_times(
     offsets: Integers, time_ns: Integers, width: int, *, wants_estimate: bool
 ) -> FilterEvents:
-    """Make events that are only times: run r owns offsets[r]:offsets[r + 1]."""
+    """Make events that are only times: run r owns offsets[r]:offsets[r + 1].
+
+    Args:
+        offsets: (runs + 1,).
+        time_ns: (n,) the times.
+        width: how many numbers the events have beside which they stand.
+        wants_estimate: whether there is an estimate at each.
+    """
     count = len(time_ns)
     nothing = np.full(count, NOTHING), np.full((count, width), np.nan)
     reference, arrival = np.zeros(count, np.int64), np.empty((count, 0), np.int64)
@@ -108,6 +125,11 @@ def interpolate_control(
 
     What comes after a run's last control message waits for the next, with that message before it. From
     one message that comes more than a gap before the next, up to that, the control is NaN.
+
+    Args:
+        events: in order, with the control in their last columns where they are its messages.
+        controls: how many components the control has.
+        gap_ns: how long the control may be missing.
     """
     data, is_control = events.data.copy(), events.source == CONTROL
     ready, waiting = np.zeros(len(data), bool), np.ones(len(data), bool)
@@ -142,6 +164,11 @@ def hold_control(events: FilterEvents, initial: Sequence[float], gap_ns: float =
     """Hold the last control for events that wait for one that does not come, for up to a gap.
 
     `initial` holds in a run in which there was none.
+
+    Args:
+        events: that wait, the last message of the control first where there was one.
+        initial: the control before its first message.
+        gap_ns: how long the control may be missing.
     """
     data = events.data.copy()
     for begin, end in pairwise(events.offsets):
@@ -161,6 +188,14 @@ def add_output_times(
 
     From the prior on, or, where that is more than EARLY such times before the run's first event, from
     there on.
+
+    Args:
+        events: in order.
+        start_ns: (runs,) stamps of the priors.
+        next_output: (runs,) the number of the next time.
+        every_ns: how far apart the times are; they are its multiples.
+
+    Returns the events, and the next numbers (runs,).
     """
     times, runs, next_outputs = [], [], next_output.copy()
     for number, (begin, end) in enumerate(pairwise(events.offsets)):

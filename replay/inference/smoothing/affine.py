@@ -47,7 +47,7 @@ NOTHING_LEFT = 1e-12  # of a variance, beside what other components say of it
 
 
 class Factors(NamedTuple):
-    """Covariances of steps as `factor_by_pivots` gives them, first axis = step.
+    """Holds covariances of steps as `factor_by_pivots` gives them, first axis = step.
 
     Attributes:
         factor, order, rank: (steps, t, t), (steps, t), (steps,); a rank of -1 where none is known.
@@ -59,12 +59,12 @@ class Factors(NamedTuple):
 
 
 def no_factors(count: int, t: int) -> Factors:
-    """Of so many steps none is known."""
+    """Make factors of so many steps, of which none is known."""
     return Factors(np.empty((count, t, t)), np.empty((count, t), np.int64), np.full(count, -1))
 
 
 class Trajectory(NamedTuple):
-    """Where everything is linearised, and what a pass over it finds.
+    """Holds where everything is linearised, and what a pass over it finds.
 
     Attributes:
         mean: (nodes, n) the states.
@@ -96,7 +96,7 @@ class Trajectory(NamedTuple):
 
 
 def affine_steps(stage: Stage) -> Steps:
-    """The steps of the affine filter about a `Trajectory`, the only one of `memory`'s sets."""
+    """Make the steps of the affine filter about a `Trajectory`, the only one of `memory`'s sets."""
     sensors = tuple(affine_sensor(stage, number) for number in range(len(stage.sensors)))
     steps = gaussian_filter(stage, affine_motion(stage), sensors, partial(workspace, stage))
     chained = smoothing_steps(stage, steps)
@@ -178,7 +178,7 @@ def affine_motion(stage: Stage) -> Function:
 
 
 def carrying(kinds: tuple[str, ...]) -> Function:
-    """`carry(offset, rows, step)`: E(-offset) times rows (t, m), by way of `step`.
+    """Make `carry(offset, rows, step)`: E(-offset) times rows (t, m), by way of `step`.
 
     Takes tangent vectors at one state to those at the state that lies `offset` from it.
     """
@@ -194,7 +194,7 @@ def carrying(kinds: tuple[str, ...]) -> Function:
 
 
 def reaching(kinds: tuple[str, ...]) -> Function:
-    """`reach(trajectory, node, origin)`: how far a state is from where it comes from; False if unknown.
+    """Make `reach(trajectory, node, origin)`: how far a state is from its origin; False if unknown.
 
     Fills `offset`, and adds its square in units of the noise to the costs. Where noise has no part the
     state is moved to what it can reach.
@@ -233,7 +233,7 @@ def reaching(kinds: tuple[str, ...]) -> Function:
 
 
 def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Floats) -> float:
-    """The square of an offset in units of a noise, where that has a part; fills `whitened`."""
+    """Compute the square of an offset in units of a noise, where that has a part; fills `whitened`."""
     factor, order, squared = factors.factor[step], factors.order[step], 0.0
     for k in range(factors.rank[step]):
         entry = offset[order[k]]
@@ -278,7 +278,7 @@ def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floa
 
 
 def affine_sensor(stage: Stage, number: int) -> Function:
-    """The update of the tangent vector by sensor `number`, one component after the other."""
+    """Make the update of the tangent vector by sensor `number`, one component after the other."""
     model, sensor = stage.model, stage.sensors[number]
     read_state, read_reference = tuple_of(model.size), reading(sensor).reference
     linearise, whiten_residual = sensor_derivative(model, sensor), whitening(sensor, number)
@@ -326,7 +326,7 @@ def affine_sensor(stage: Stage, number: int) -> Function:
 
 
 def robust(squared: float, loss: Floats) -> tuple[float, float]:
-    """The cost of a residual whose square is given, and the weight that has its derivative."""
+    """Compute the cost of a residual whose square is given, and the weight that has its derivative."""
     bound = loss[1] ** 2
     if loss[0] == 1.0 and squared > bound:
         length = np.sqrt(squared)

@@ -39,7 +39,7 @@ FOREVER_NS = np.iinfo(np.int64).max
 
 
 class Chain(NamedTuple):
-    """What is believed of the states, and of how they came from the last node; first axis = run.
+    """Holds what is believed of the states, and of how they came from the last node; first axis = run.
 
     Attributes:
         mean, covariance: the filter's, (runs, n) and (runs, t, t).
@@ -59,7 +59,7 @@ class Chain(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Estimates as the filter fills them in, and how each came from the one before; see `Chain`."""
+    """Holds estimates as the filter fills them in, and how each came from the last; see `Chain`."""
 
     end: Integers
     time_ns: Integers
@@ -72,7 +72,7 @@ class Nodes(NamedTuple):
 
 
 class ForwardMemory(NamedTuple):
-    """What the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
+    """Holds what the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
 
     filter: Any
     rest: Floats
@@ -82,7 +82,12 @@ class ForwardMemory(NamedTuple):
 
 
 def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
-    """The steps of a filter that leaves nodes; its `predict` fills `Workspace.product`."""
+    """Make the steps of a filter that leaves nodes; its `predict` fills `Workspace.product`.
+
+    Args:
+        stage: the model as the method takes it.
+        steps: those of the filter that goes forward.
+    """
     model, t, predict_filter = stage.model, stage.model.tangent, steps.predict
     retrace, to_covariance = steps.form.retrace, steps.form.to_covariance
     find_slope = sloping(model.kinds, model.correct, steps.form)
@@ -154,7 +159,16 @@ def _with_memory(update: Function) -> Function:
 def compose(
     gain: Floats, rest: Floats, predictions: int, next_gain: Floats, next_rest: Floats, product: Floats
 ) -> None:
-    """Make one step of the steps so far and the next, which it uses up: G G1, and A + G A1 G'."""
+    """Compose the steps so far with the next, which is used up: G G1, and A + G A1 G'.
+
+    Args:
+        gain: G (t, t) of the steps so far, changed in place.
+        rest: A (t, t) of the steps so far, changed in place.
+        predictions: how many steps there are so far; of none the next one is copied.
+        next_gain: G1 (t, t).
+        next_rest: A1 (t, t), used up.
+        product: (t, t) to work in.
+    """
     t = len(gain)
     if predictions == 0:
         for row in range(t):
@@ -170,18 +184,18 @@ def compose(
             gain[row, column] = product[row, column]
 
 
-# The way back
+# The backward pass
 
 
 class Later(NamedTuple):
-    """The node behind a piece: in which runs there is one, and these, smoothed, a row for each run."""
+    """Holds the node behind a piece: the runs that have one, and these, smoothed, a row for each run."""
 
     is_there: Integers
     nodes: Nodes
 
 
 class BackMemory(NamedTuple):
-    """What the way back of one core works in: a Gaussian, what carries it, and a step's vectors."""
+    """Holds what the backward pass of one core works in: a Gaussian, its gain, and a step's vectors."""
 
     mean: Floats
     covariance: Floats
@@ -196,14 +210,19 @@ class BackMemory(NamedTuple):
 
 @lru_cache(maxsize=64)
 def backward_pass_over_runs(kinds: Kinds, correct: Correction | None = None) -> Function:
-    """The same over all runs, compiled; see `backward_pass`."""
+    """Compile the same over all runs; see `backward_pass`."""
     return compile_over_runs(
         backward_pass(kinds, correct), allocates=False, title="a smoother's way back"
     )
 
 
 def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
-    """The loop over the nodes of one run, from its last to its first."""
+    """Make the loop over the nodes of one run, from its last to its first.
+
+    Args:
+        kinds: of the state's components.
+        correct: the model's own correction, if it has one.
+    """
     move, compare = correcting(kinds, correct, back=True), comparing(kinds, correct)
     find_slope, t = sloping(kinds, correct), tangent_size(kinds)
 
@@ -273,12 +292,15 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
 
 
 def no_later(runs: int, n: int, t: int) -> Later:
-    """Where nothing lies behind a piece, for so many runs of states with n components; see `Later`."""
+    """Make memory where nothing lies behind a piece, for runs of states with n components.
+
+    See `Later`.
+    """
     wide = (np.empty((runs, *shape)) for shape in ((n,), (t, t), (n,), (t,), (t, t), (t, t)))
     return Later(np.zeros(runs, bool), Nodes(np.arange(runs), np.empty(runs, np.int64), *wide))
 
 
 def back_memory(n: int, t: int) -> BackMemory:
-    """Memory for the way back of states with n components, and t in the tangent space."""
+    """Make memory for the backward pass of states with n components, and t in the tangent space."""
     shapes = (n,), (t, t), (t, t), (t, t), (1, t), (n,), (t, t), (t,), (t,)
     return BackMemory(*(np.empty(shape) for shape in shapes))

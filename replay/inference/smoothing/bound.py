@@ -39,7 +39,7 @@ class BoundParameters(MethodParameters):
 
 
 class BackMemory(NamedTuple):
-    """What the way back of one core works in: four matrices (t, t)."""
+    """Holds what the backward pass of one core works in: four matrices (t, t)."""
 
     predicted: Floats
     turned: Floats
@@ -48,7 +48,7 @@ class BackMemory(NamedTuple):
 
 
 def back_memory(t: int) -> BackMemory:
-    """Memory for the way back of states with t components in the tangent space."""
+    """Make memory for the backward pass of states with t components in the tangent space."""
     return BackMemory(*(np.empty((t, t)) for _ in BackMemory._fields))
 
 
@@ -94,7 +94,7 @@ def smooth(
 
 
 class BoundHistory(NamedTuple):
-    """What is kept: the truths of all runs, which came to a node (runs,), and nodes to smooth."""
+    """Holds what is kept: the truths of all runs, which came to a node (runs,), and nodes to smooth."""
 
     truth: Ragged
     has_begun: Booleans
@@ -102,10 +102,10 @@ class BoundHistory(NamedTuple):
 
 
 class BoundFilter(Filter):
-    """A filter that knows the truth, and tells of every step of it."""
+    """Runs a filter that knows the truth, and puts out every step of it."""
 
     def static(self, topics: Mapping[str, Topic]) -> tuple[str, ...]:
-        """The topics of a log that it starts from; raises BadInput where it has no truth."""
+        """Return the topics of a log that it starts from; raises BadInput where it has no truth."""
         if self.truth not in topics:
             raise BadInput(
                 f"estimator {self.name}: a bound needs the true states, and there is no topic "
@@ -119,7 +119,7 @@ class BoundFilter(Filter):
         return "a bound is that of all messages in the order of their stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """The state at every run's prior, see `Filter.start`."""
+        """Return the state at every run's prior, see `Filter.start`."""
         state = super().start(static)
         _, covariance = state.carried.belief
         runs, t, _ = covariance.shape
@@ -130,7 +130,7 @@ class BoundFilter(Filter):
         return state._replace(carried=state.carried._replace(belief=trajectory), kept=kept)
 
     def truths(self, truth: Ragged, time_ns: Integers, offsets: Integers) -> Floats:
-        """The true states (n, components) at stamps of the runs; NaN where there is none."""
+        """Return the true states (n, components) at stamps of the runs; NaN where there is none."""
         components = self.stage.model.state
         columns = match_components(truth.stream.metadata, components, f"topic {self.truth}")
         found = np.full((len(time_ns), len(components)), np.nan)
@@ -152,13 +152,13 @@ class BoundFilter(Filter):
         return after._replace(generators=()), nodes, failures
 
     def sets(self, generators: tuple[Any, ...], events: FilterEvents) -> Any:
-        """All runs, and the truths."""
+        """Return all runs, and the truths."""
         yield slice(0, len(events.offsets) - 1), generators
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Any, Innovations]:
-        """Nodes and innovations to be filled in."""
+        """Return nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         steps = (np.empty_like(estimates.covariance) for _ in range(3))
         return Nodes(*estimates, *steps), innovations
@@ -176,14 +176,14 @@ class BoundFilter(Filter):
         return after._replace(kept=kept), made
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """What waited for a control that does not come any more, and what is smoothed."""
+        """Return what waited for a control that does not come any more, and what is smoothed."""
         state, made = self.ended(state)
         if self.parameters.of == "smoother" and state.kept.nodes:
             made.append(self.smoothed(state.kept.nodes))
         return made
 
     def smoothed(self, pieces: Sequence[tuple[Nodes, Integers]]) -> Ragged:
-        """The estimates at all nodes, run by run."""
+        """Return the estimates at all nodes, run by run."""
         runs, t = len(pieces[0][1]) - 1, self.stage.model.tangent
         parts = [
             [column[rows[run] : rows[run + 1]] for column in nodes[1:6]]
@@ -196,7 +196,7 @@ class BoundFilter(Filter):
         return self.states(Estimates(offsets[1:], times, mean, covariance), offsets)
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
-        """The stream of true states, each with what is known of it there."""
+        """Return the stream of true states, each with what is known of it there."""
         found = super().states(estimates, offsets)
         metadata = {**found.stream.metadata, "bound": self.parameters.of}
         return Ragged(replace(found.stream, metadata=metadata), found.offsets)
@@ -204,7 +204,7 @@ class BoundFilter(Filter):
     def begun(
         self, before: RecursionState, kept: BoundHistory, nodes: Nodes, offsets: Integers
     ) -> tuple[BoundHistory, Ragged]:
-        """The steps to the priors of runs that come to their first node: from nothing.
+        """Make the steps to the priors of runs that come to their first node: from nothing.
 
         The noise of such a step is the prior's covariance. Where the first node has the prior's stamp,
         it is the one that comes from nothing.
@@ -222,7 +222,7 @@ class BoundFilter(Filter):
         return kept._replace(has_begun=kept.has_begun | is_new), self.steps_told(steps, rows)
 
     def steps_told(self, nodes: Nodes, offsets: Integers) -> Ragged:
-        """The stream of the steps to nodes."""
+        """Return the stream of the steps to nodes."""
         t = self.stage.model.tangent
         stream = make_stream(
             f"/estimates/{self.name}/step",

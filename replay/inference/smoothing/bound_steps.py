@@ -30,7 +30,7 @@ from replay.inference.model.stage import Stage
 
 
 class TrueTrajectory(NamedTuple):
-    """What is carried along the true trajectories; first axis = run.
+    """Holds what is carried along the true trajectories; first axis = run.
 
     Attributes:
         mean: (runs, n) the true state.
@@ -47,7 +47,7 @@ class TrueTrajectory(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """Estimates as the recursion fills them in, with the step to each; see `TrueTrajectory`."""
+    """Holds estimates as the recursion fills them in, with the step to each; see `TrueTrajectory`."""
 
     end: Integers
     time_ns: Integers
@@ -59,7 +59,7 @@ class Nodes(NamedTuple):
 
 
 class BoundMemory(NamedTuple):
-    """What one core works in: the true states at all events (events, n), and noise (m, m) by sensor."""
+    """Holds what one core works in: true states at events (events, n), and noise (m, m) by sensor."""
 
     truth: Floats
     noise: tuple[Floats, ...]
@@ -67,7 +67,7 @@ class BoundMemory(NamedTuple):
 
 
 def bound_steps(stage: Stage) -> Steps:
-    """The steps of an extended Kalman filter that knows where it is."""
+    """Make the steps of an extended Kalman filter that knows where it is."""
     model, motion = stage.model, stage.motion
     n, t = model.size, model.tangent
     read_state, read_control = tuple_of(n), tuple_of(model.controls)
@@ -116,7 +116,7 @@ def bound_steps(stage: Stage) -> Steps:
 
 
 def bound_update(stage: Stage, number: int) -> Function:
-    """The update by sensor `number` as if it had measured what is predicted: nothing moves."""
+    """Make the update by sensor `number` as if it had measured what is predicted: nothing moves."""
     innovate, add_noise = linear_sensor(stage, number), sensor_noise(stage.sensors[number])
     m = len(stage.sensors[number].measured)
 

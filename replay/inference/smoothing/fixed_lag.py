@@ -17,7 +17,7 @@ from replay.inference.smoothing.backward_pass import BackMemory, Nodes, compose
 
 
 class Window(NamedTuple):
-    """The steps within the lag of the first node that is not smoothed yet, as two stacks.
+    """Holds the steps within the lag of the first node that is not smoothed yet, as two stacks.
 
     Of the steps to the nodes up to `turned`, each node's row holds the composition of its own and all
     behind it, up to there; those from there up to `through` are composed here. First axis = run; nodes
@@ -34,18 +34,18 @@ class Window(NamedTuple):
 
 @lru_cache(maxsize=64)
 def sliding_over_runs(kinds: tuple[str, ...]) -> Function:
-    """The same over all runs, compiled; see `sliding`."""
+    """Compile the same over all runs; see `sliding`."""
     return compile_over_runs(sliding(kinds), allocates=False, title="a smoother with a fixed lag")
 
 
 def sliding(kinds: tuple[str, ...]) -> Function:
-    """The loop over the nodes of one run in flat space, from its first to its last, a lag behind."""
+    """Make the loop over the nodes of one run in flat space, from first to last, a lag behind."""
     add, subtract = boxplus(kinds), boxminus(kinds)
 
     def take_in(
         row: int, is_first: bool, nodes: Nodes, window: Window, run: int, work: BackMemory
     ) -> None:
-        """The step to a node behind those of the window: its row gets b in place of the prediction."""
+        """Add the step to a node behind those of the window: its row gets b, not the prediction."""
         shift, change = nodes.predicted[row], work.change[0]
         subtract(nodes.mean[row], shift, work.change, 0)
         for i in range(len(shift)):

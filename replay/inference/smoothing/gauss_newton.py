@@ -48,7 +48,7 @@ LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e12
 
 
 class Plan(NamedTuple):
-    """What a search is given: the prior (first axis = run), what drives before the first control.
+    """Holds what a search is given: the prior (first axis = run), what drives before the first control.
 
     And the first damping, and the most passes.
     """
@@ -61,7 +61,7 @@ class Plan(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How the searches ended: passes, and whether converged (runs,).
+    """Describes how the searches ended: passes, and whether converged (runs,).
 
     Of every pass the cost, the damping and the largest step in standard deviations (runs, passes, 3).
     """
@@ -73,7 +73,7 @@ class Ended(NamedTuple):
 
 @lru_cache(maxsize=64)
 def searching(stage: Stage) -> tuple[Function, Steps]:
-    """The compiled search, and the steps that make its memory."""
+    """Return the compiled search, and the steps that make its memory."""
     steps = affine_steps(stage)
     settings_of = reading_settings(number_fields(stage.model.parameters))
     title = title_of(stage.model, "iterated smoother")
@@ -81,7 +81,7 @@ def searching(stage: Stage) -> tuple[Function, Steps]:
 
 
 def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
-    """The search of one run's trajectory, for `replay.engine.compiling.compile.compile_over_runs`."""
+    """Make the search of one run's trajectory, for `compile_over_runs`."""
     kinds, n, t = stage.model.kinds, stage.model.size, stage.model.tangent
     follow, go_back = recursion(stage, steps, settings_of), backward_pass(("linear",) * t)
     add, reach, turn = boxplus(kinds), reaching(kinds), by_right_jacobian(kinds)

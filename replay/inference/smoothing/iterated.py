@@ -58,7 +58,7 @@ class IteratedParameters(SmootherParameters):
 
 
 class Way(NamedTuple):
-    """Runs from their priors to their ends, as the extended smoother has them.
+    """Holds runs from their priors to their ends, as the extended smoother has them.
 
     Attributes:
         events: the events up to the last node, without those that a gate kept out.
@@ -79,11 +79,11 @@ class Way(NamedTuple):
 
 
 class IteratedSmoother(Smoother):
-    """A smoother that keeps the events of the whole run, and at the end searches their trajectory."""
+    """Runs a smoother that keeps the events of a run, and at the end searches its trajectory."""
 
     @cached_property
     def lag_ns(self) -> int:
-        """The whole run."""
+        """Return the whole run."""
         return FOREVER_NS
 
     def follow(self, state: FilterState, events: FilterEvents) -> tuple[FilterState, list[Ragged]]:
@@ -91,7 +91,7 @@ class IteratedSmoother(Smoother):
         return state._replace(kept=(*state.kept, events)), []
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """The best trajectory, and how the search for it ended."""
+        """Return the best trajectory, and how the search for it ended."""
         state, _ = self.ended(state)
         if not state.kept:
             return []
@@ -109,7 +109,7 @@ class IteratedSmoother(Smoother):
         return [states, *way.made, *self._told(ended, way)]
 
     def smoothed_once(self, state: FilterState) -> "Way":
-        """The extended smoother's states at all stamps, from the prior's on."""
+        """Return the extended smoother's states at all stamps, from the prior's on."""
         events = reduce(join_events, (*self._first(state), *state.kept))
         run = np.repeat(np.arange(len(state.next_output)), np.diff(events.offsets))
         asked, start_ns = events.wants_estimate, state.carried.time_ns
@@ -128,7 +128,7 @@ class IteratedSmoother(Smoother):
         return Way(used, node[known], nodes, offsets, states, wanted, made)
 
     def _moved(self, state: FilterState, way: "Way") -> Floats:
-        """The prior's means, moved along all of every run as if nothing was measured."""
+        """Return the prior's means, moved along all of every run as if nothing was measured."""
         unseen = np.where(way.events.source >= 0, NOTHING, way.events.source)
         _, (moved, reached), _ = self.filtered(state, way.events._replace(source=unseen))
         if not np.array_equal(reached, way.offsets):
@@ -139,7 +139,7 @@ class IteratedSmoother(Smoother):
         return moved.mean
 
     def _first(self, state: FilterState) -> list[FilterEvents]:
-        """The prior's time as an event; an interpolated control has made one already."""
+        """Return the prior's time as an event; an interpolated control has made one already."""
         control = self.stage.model.control
         if control is not None and control.interpolated:
             return []
@@ -149,7 +149,7 @@ class IteratedSmoother(Smoother):
     def _accepted(
         self, events: FilterEvents, start_ns: Integers, made: Sequence[Ragged]
     ) -> FilterEvents:
-        """Events without the measurements that the gate kept out on the way forward."""
+        """Return events without the measurements that the gate kept out on the way forward."""
         if self.parameters.gate_probability == 1.0:
             return events
         source = events.source.copy()
@@ -219,7 +219,7 @@ class IteratedSmoother(Smoother):
         return ended
 
     def _told(self, ended: Ended, way: Way) -> list[Ragged]:
-        """How the searches ended, and every pass of each, at the last node of its run."""
+        """Describe how the searches ended, and every pass of each, at the last node of its run."""
         asked, some = self.parameters, np.diff(way.offsets) > 0
         last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]
         passes, one = ended.passes, np.arange(len(some))
@@ -257,7 +257,7 @@ class IteratedSmoother(Smoother):
 
 
 def _solved_at_the_end(stage: Stage) -> Steps:
-    """The way to the start: the extended filter's."""
+    """Return the way to the start: the extended filter's."""
     return smoothing_steps(stage, FILTERS["ekf"].steps(stage))
 
 

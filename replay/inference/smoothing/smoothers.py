@@ -59,7 +59,7 @@ class SmootherParameters(UnscentedParameters, RegressionParameters):
 
 
 class Forward(NamedTuple):
-    """A filter's name, its variant, and the lag, FOREVER_NS for the whole run."""
+    """Holds a filter's name, its variant, and the lag, FOREVER_NS for the whole run."""
 
     name: str
     variant: str
@@ -67,7 +67,7 @@ class Forward(NamedTuple):
 
 
 def parse_forward(text: str) -> Forward:
-    """What `SmootherParameters.forward` says; raises BadInput where it says nothing."""
+    """Parse `SmootherParameters.forward`; raises BadInput where it has another form."""
     before, has_lag, lag = text.rpartition("lag=") if "lag=" in text else (text, "", "")
     rest_on = before.removesuffix(":")
     name, variant = named_filter(rest_on, "smoother", "that a smoother goes back over")
@@ -86,14 +86,14 @@ def parse_forward(text: str) -> Forward:
 
 
 class Piece(NamedTuple):
-    """Nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+    """Holds nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
 
     nodes: Nodes
     offsets: Integers
 
 
 class Stored:
-    """A piece on disk, in a temporary file that is gone when nobody refers to it any more."""
+    """Represents a piece on disk, in a temporary file that is gone when nobody refers to it any more."""
 
     def __init__(self, piece: Piece) -> None:
         self.offsets = piece.offsets
@@ -103,40 +103,40 @@ class Stored:
             np.save(self._file, column)
 
     def read(self) -> Piece:
-        """The piece, in memory."""
+        """Return the piece, in memory."""
         self._file.seek(0)
         return Piece(Nodes(*(np.load(self._file) for _ in Nodes._fields)), self.offsets)
 
 
 def stored(pieces: Sequence[Piece | Stored], new: Piece) -> Piece | Stored:
-    """A piece, on disk where it is too much beside those in memory."""
+    """Return a piece, on disk where it is too much beside those in memory."""
     in_memory = [new, *(piece for piece in pieces if isinstance(piece, Piece))]
     size = sum(column.nbytes for piece in in_memory for column in piece.nodes)
     return new if size <= IN_MEMORY_BYTES else Stored(new)
 
 
 class Waiting(NamedTuple):
-    """The nodes within the lag, and the steps between them."""
+    """Holds the nodes within the lag, and the steps between them."""
 
     piece: Piece
     window: Window
 
 
 class Smoother(Filter):
-    """A filter that keeps its nodes, and at the end, or a lag behind, goes back over them."""
+    """Runs a filter that keeps its nodes, and smooths them at the end, or a lag behind."""
 
     @cached_property
     def lag_ns(self) -> int:
-        """How much later a message may be that an estimate uses."""
+        """Compute how much later a message may be that an estimate uses."""
         return parse_forward(self.parameters.forward).lag_ns
 
     @property
     def why_in_sequence(self) -> str:
-        """A smoother has its estimates from what came later in any case."""
+        """Explain that a smoother uses later messages in any case."""
         return "a smoother uses later messages in any case; replay it in the order of the stamps"
 
     def start(self, static: Mapping[str, Ragged]) -> FilterState:
-        """The state at every run's prior, see `Filter.start`."""
+        """Return the state at every run's prior, see `Filter.start`."""
         state = super().start(static)
         mean, covariance = state.carried.belief
         gain, rest = (np.empty_like(covariance) for _ in range(2))
@@ -147,7 +147,7 @@ class Smoother(Filter):
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Any, Innovations]:
-        """Nodes and innovations to be filled in."""
+        """Return nodes and innovations to be filled in."""
         estimates, innovations = super().no_results(due, recorded, innovation_size)
         end, times, mean, covariance = estimates
         predicted, slope = np.empty_like(mean), np.empty(covariance.shape[:2])
@@ -173,7 +173,7 @@ class Smoother(Filter):
         return after._replace(kept=Waiting(_rows_from(piece, stop), window)), [smoothed, *made]
 
     def finish(self, state: FilterState) -> list[Ragged]:
-        """What waited for later messages, and what those say of all before them."""
+        """Filter what waited for later messages, and smooth all nodes that are left."""
         state, made = self.ended(state)
         if self.lag_ns == FOREVER_NS:
             return [*made, self.states(*self.gone_back(state.kept))]
@@ -183,7 +183,7 @@ class Smoother(Filter):
         return [*made, self.states(*self.lagging(piece, window, piece.offsets[1:]))]
 
     def lagging(self, piece: Piece, window: Window, stop: Integers) -> tuple[Estimates, Integers]:
-        """The estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
+        """Return the estimates before row stop[run]; run r owns offsets[r]:offsets[r + 1].
 
         Changes the nodes, and the window, which then begins at row stop[run].
         """
@@ -206,7 +206,7 @@ class Smoother(Filter):
     def gone_back(
         self, pieces: Sequence[Piece | Stored], stop: Integers | None = None
     ) -> tuple[Estimates, Integers]:
-        """The estimates at the nodes of all pieces, or of one those before row stop[run].
+        """Return the estimates at the nodes of all pieces, or of one those before row stop[run].
 
         Run r owns offsets[r]:offsets[r + 1].
         """
@@ -234,7 +234,7 @@ def _no_estimates(offsets: Integers, n: int, t: int) -> Estimates:
 
 
 def _joined(pieces: Sequence[Piece]) -> Piece:
-    """Pieces as one, each run's nodes together."""
+    """Return pieces as one, each run's nodes together."""
     if len(pieces) == 1:
         return pieces[0]
     runs = np.arange(len(pieces[0].offsets) - 1)
@@ -246,7 +246,7 @@ def _joined(pieces: Sequence[Piece]) -> Piece:
 
 
 def _rows_from(piece: Piece, begin: Integers) -> Piece:
-    """The nodes of every run from row begin[run] on."""
+    """Return the nodes of every run from row begin[run] on."""
     counts = piece.offsets[1:] - begin
     rows = np.arange(piece.offsets[-1]) >= np.repeat(begin, np.diff(piece.offsets))
     columns: Any = (column[rows] for column in piece.nodes[1:])
@@ -259,7 +259,7 @@ def _rows_from(piece: Piece, begin: Integers) -> Piece:
 
 @lru_cache(maxsize=64)
 def _smoother_of(name: str, variant: str) -> Method:
-    """The method that smooths what a filter estimates."""
+    """Make the method that smooths what a filter estimates."""
     inner = filter_with(name, variant)
 
     def steps(stage: Stage) -> Steps:

@@ -1,6 +1,10 @@
-"""The truth at the stamps of estimates, read along with them: memory holds what they are at."""
+"""The truth at the stamps of estimates, read along with them: memory holds what they are at.
+
+A truth that is stated twice, by one topic or by two, is doubtful; what is read is looked at for that.
+"""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +13,17 @@ from recorders.log import Stream, schemas
 from recorders.log.streams import concatenate
 from replay.engine.streams.sources import Source
 
+Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 BLOCK_MESSAGES = 1 << 16
+
+
+class Doubt(NamedTuple):
+    """What is doubtful about a truth of so many messages."""
+
+    messages: int
+    why: str
 
 
 class Truths:
@@ -24,6 +36,10 @@ class Truths:
             for topic in source.topics.values()
             if topic.schema_name == schemas.TRUTH_STATE.full_name
         ]
+        self._beside: dict[str, list[str]] = {}
+        for topic in self.topics:
+            self._beside.setdefault(topic.rpartition("/")[0], []).append(topic)
+        self._apart: dict[tuple[str, str], dict[str, float]] = {}
         self._begin()
 
     def _begin(self) -> None:
@@ -56,11 +72,49 @@ class Truths:
         self._reached[topic, reader] = last_ns
         return self._parts[topic]
 
+    @property
+    def doubts(self) -> dict[str, Doubt]:
+        """How a truth by which estimates are judged is stated twice: at one stamp, or by two topics."""
+        found: dict[str, list[str]] = {}
+        judging = {topic for topic, _ in self._reached} | self._forgotten
+        for (topic, other), apart in self._apart.items():
+            if topic not in judging or not apart:
+                continue
+            name = max(apart, key=apart.__getitem__)
+            if topic != other:
+                what = f"{other} states the truth of the same thing, and is not used"
+            elif apart[name]:
+                what = "a truth is stated twice at one stamp"
+            else:
+                continue
+            found.setdefault(topic, []).append(f"{what}: {name} differs by up to {apart[name]:.3g}")
+        topics = self.source.topics
+        return {topic: Doubt(topics[topic].messages, "; ".join(said)) for topic, said in found.items()}
+
+    def _note_twice(self, block: dict[str, Stream]) -> None:
+        """Note how far truths of one thing are apart in a block, by linear component."""
+        for topic, stream in block.items():
+            again = np.flatnonzero(np.diff(stream.publish_time_ns) == 0)
+            if len(again):
+                states = _states(stream).items()
+                apart = {name: np.abs(np.diff(state)[again]) for name, state in states}
+                self._note_apart(topic, topic, apart)
+        for topic in {topic for topic, _ in self._reached} & block.keys():
+            for other in self._beside[topic.rpartition("/")[0]]:
+                if other != topic and other in block:
+                    self._note_apart(topic, other, _apart(block[topic], block[other]))
+
+    def _note_apart(self, topic: str, other: str, apart: dict[str, Floats]) -> None:
+        kept = self._apart.setdefault((topic, other), {})
+        for name, values in apart.items():
+            kept[name] = max(kept.get(name, 0.0), float(np.fmax.reduce(values, initial=0.0)))
+
     def _read_block(self, blocks: Iterator[dict[str, Stream]]) -> None:
         block = next(blocks, None)
         if block is None:
             self._blocks = None
             return
+        self._note_twice(block)
         for topic, stream in block.items():
             kept = self._current(topic)
             self._parts[topic] = concatenate([kept, stream]) if len(kept) else stream
@@ -76,3 +130,24 @@ class Truths:
             return held
         self._forgotten.add(topic)
         return held.take(slice(first, None))
+
+
+def _states(truth: Stream) -> dict[str, Floats]:
+    """The linear components (n,) of a truth, by their names."""
+    names = truth.components
+    kinds = truth.metadata.get("kinds", "").split(",") if truth.metadata.get("kinds") else []
+    columns = truth["state"].reshape(len(truth), -1).T
+    named = zip(names, columns, kinds or ["linear"] * len(names), strict=False)
+    return {name: column for name, column, kind in named if kind == "linear"}
+
+
+def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
+    """How far two truths are apart, by component, at the first's stamps that lie among the other's."""
+    time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
+    both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
+    own, others = _states(truth), _states(other)
+    return {
+        name: np.abs(own[name] - np.interp(time_ns, there_ns, others[name]))[both]
+        for name in own
+        if name in others
+    }

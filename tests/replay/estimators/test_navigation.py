@@ -22,7 +22,6 @@ from replay.engine.vectors.tangent import difference
 from replay.estimators.navigation.alignment import align
 from replay.estimators.navigation.navigation import INERTIAL, NavigationParameters
 from replay.estimators.navigation.turning import move, move_back
-from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 # --- the mathematics -------------------------------------------------------------------------------
@@ -71,11 +70,6 @@ def test_a_body_on_a_circle_stays_on_it():
     for _ in range(10000):
         state = strapdown(state, force, rate, seconds / 10000, place)
     assert_allclose(state[:6], (radius, 0.0, 0.0, 0.0, speed, 0.0), atol=1e-3)
-
-
-@pytest.mark.paper
-def test_the_model_is_what_it_says():
-    check_model(INERTIAL, {"origin_latitude_deg": 40.0})
 
 
 # --- where it starts -------------------------------------------------------------------------------
@@ -344,6 +338,6 @@ def test_a_heading_that_nothing_ties_turns_alone():
     ],
 )
 def test_a_start_without_a_prior_is_no_surer_than_it_may_be(method: str, given: dict[str, Any]):
-    """Where the heading is next to unknown, by a bank: of 20 runs, which err alike for long."""
-    nees, _ = aligned_nees(method, 20, prior={"is_told": False}, **given)
+    """Where the heading is next to unknown, by a bank: of 10 runs, which err alike for long."""
+    nees, _ = aligned_nees(method, 10, prior={"is_told": False}, **given)
     assert 10.0 < nees.mean() < 20.0

@@ -157,7 +157,7 @@ def test_biases_of_simulated_robots_are_recovered_within_their_sigma() -> None:
 
 
 @pytest.mark.parametrize(
-    ("estimable", "words"),
+    ("augmentable", "words"),
     [
         (("delay_s",), "estimator test: augmentable is a tuple; it is a mapping from parameter to kind"),
         ({"dellay_s": "linear"}, "'dellay_s' is no parameter of the model; did you mean 'delay_s'"),

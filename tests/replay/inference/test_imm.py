@@ -137,7 +137,7 @@ def test_the_sheets_states_and_smoothed_modes(uncompiled: None) -> None:
 @pytest.mark.parametrize("name", ["ekf", "ukf", "lrkf:s2kf-50"])
 def test_compiled_loops_do_the_same(name: str, request: pytest.FixtureRequest) -> None:
     """Of filters that linearise, and that take samples."""
-    source = vehicle_a.source(vehicle_a.simulate(8)[0])
+    source = vehicle_a.source(vehicle_a.simulate(8)[0][:60])
     settings = {"filter": name, "smoothed_modes": True, "gate_probability": 0.99}
     compiled = outputs(SWITCHING_A, "imm", [source], **settings)
     request.getfixturevalue("uncompiled")

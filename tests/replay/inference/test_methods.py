@@ -319,11 +319,16 @@ def test_attitude_with_the_reset(
     assert_allclose(found["innovation"]["log_likelihood"].sum(), likelihood, rtol=EXACT)
 
 
+@cache
+def sixty_attitudes() -> list[Any]:
+    return [attitude.simulate(seed) for seed in range(5000, 5060)]
+
+
 @pytest.mark.paper
 @pytest.mark.parametrize(("name", "nees", "error"), [("EKF", 6.77, 0.37), ("IEKF", 6.06, 0.25)])
 def test_attitude_is_consistent_over_sixty_runs(name: str, nees: float, error: float) -> None:
     """Mean NEES of all steps of all runs, one ensemble: without the reset they are 9.37 and 6.56."""
-    runs = [attitude.simulate(seed) for seed in range(5000, 5060)]
+    runs = sixty_attitudes()
     sources = [source for source, *_ in runs]
     found = outputs(ATTITUDE, FILTERS[name][0], sources, every_s=attitude.STEP_S)["state"]
     means = []

@@ -17,7 +17,7 @@ KNOWN = 64  # sizes up to this are part of a kernel
 
 
 class KnownArray(NamedTuple):
-    """How an array lies in memory: NumPy's letter of its numbers, its sizes (None where they vary)."""
+    """Describes how an array lies in memory: NumPy's letter of its numbers, and its sizes or None."""
 
     letter: str
     shape: tuple[int | None, ...]
@@ -27,6 +27,9 @@ class KnownArray(NamedTuple):
 _LETTERS: dict[str, str] = {np.dtype(stored).char: stored for stored in STORED}
 _LETTERS["q"] = _LETTERS["l"] = "<i8"
 _LETTERS["Q"] = _LETTERS["L"] = "<u8"
+# bits of NumPy's flags: in C's order, aligned
+_PACKED, _ALIGNED = 0x0001, 0x0100
+_LAYOUT = _PACKED | _ALIGNED
 # where NumPy's own structure of an array has what (PyArrayObject_fields), behind the head of an object
 _DATA, _SHAPE, _STRIDES = (object.__basicsize__ + offset for offset in (0, 16, 24))
 
@@ -37,9 +40,8 @@ def describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> N
     So many first axes of an array vary, unless its NamedTuple says otherwise (`varying`).
     """
     if isinstance(value, np.ndarray):
-        flags, dtype = value.flags, value.dtype
-        is_usual = flags.aligned and dtype.isnative
-        kinds.append((dtype.char, value.ndim, value.shape[varies:], flags.c_contiguous, is_usual))
+        shape = value.shape
+        kinds.append((value.dtype, len(shape), shape[varies:], value.flags.num & _LAYOUT))
         numbers.append(id(value))
     elif isinstance(value, tuple):
         kinds.append((type(value), len(value)))
@@ -56,17 +58,18 @@ def describe(value: Any, varies: int, kinds: list[Any], numbers: list[Any]) -> N
 
 
 def with_types(value: Any, kinds: Iterator[Any]) -> Any:
-    """An argument in full, as `value_of` takes it: from what it is and its part of the key."""
+    """Return an argument in full, as `value_of` takes it: from what it is and its part of the key."""
     kind = next(kinds)
     if isinstance(value, tuple):
         return type(value), tuple(with_types(each, kinds) for each in value)
     if isinstance(value, np.ndarray):
-        letter, axes, known, is_packed, is_usual = kind
-        if letter not in _LETTERS or not is_usual:
+        dtype, axes, known, layout = kind
+        is_usual = layout & _ALIGNED and dtype.isnative
+        if dtype.char not in _LETTERS or not is_usual:
             why = "" if is_usual else ", unaligned or in another machine's order"
             raise BadInput(f"a kernel takes numbers of 64 bits, not an array of {value.dtype}{why}")
         shape = (*(None,) * (axes - len(known)), *(n if n <= KNOWN else None for n in known))
-        return KnownArray(letter, shape, is_packed)
+        return KnownArray(dtype.char, shape, bool(layout & _PACKED))
     for types, name in _SCALARS:
         if issubclass(kind, types):
             return name
@@ -82,7 +85,7 @@ _SCALARS: tuple[tuple[Any, str], ...] = (
 
 
 def letters(kind: Any) -> str:
-    """How the numbers of an argument are packed into words."""
+    """Describe how the numbers of an argument are packed into words."""
     if isinstance(kind, KnownArray):
         return "q"
     if isinstance(kind, tuple):
@@ -91,7 +94,7 @@ def letters(kind: Any) -> str:
 
 
 def value_of(kind: Any, emitter: Emitter, words: Iterator[int]) -> Any:
-    """The value that a described argument is in the kernel: loaded from its words."""
+    """Return the value that a described argument is in the kernel: loaded from its words."""
     if isinstance(kind, KnownArray):
         return _array_of(kind, emitter, _word("ptr", emitter, next(words)))
     if isinstance(kind, tuple):
@@ -114,7 +117,7 @@ def _loaded_from(kind: str, emitter: Emitter, address: str, offset: int) -> str:
 
 
 def _array_of(kind: KnownArray, emitter: Emitter, structure: str) -> Array:
-    """An array of NumPy's: where its numbers are, and the sizes that are not known."""
+    """Return an array of NumPy's: where its numbers are, and the sizes that are not known."""
     dtype = _LETTERS[kind.letter]
     sizes = _loaded_from("ptr", emitter, structure, _SHAPE)
     shape: list[Any] = [

@@ -38,7 +38,7 @@ _MAKERS = {np.empty: False, np.empty_like: False, np.zeros: True, np.zeros_like:
 
 
 class Expressions(Scope):
-    """One function while its expressions are lowered."""
+    """Represents one function while its expressions are lowered."""
 
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
         """`yes if condition else no`."""
@@ -47,7 +47,7 @@ class Expressions(Scope):
     # --- expressions ---
 
     def value(self, node: ast.expr) -> Any:
-        """What an expression gives."""
+        """Return what an expression gives."""
         self.line = getattr(node, "lineno", self.line)
         return getattr(self, f"of_{type(node).__name__}", self.unknown)(node)
 
@@ -56,15 +56,15 @@ class Expressions(Scope):
         raise TypeError(f"a kernel has no {type(node).__name__}: {ast.unparse(node)}")
 
     def of_Constant(self, node: ast.Constant) -> Any:  # noqa: N802
-        """A number or a text."""
+        """Return a number or a text."""
         return node.value
 
     def of_Name(self, node: ast.Name) -> Any:  # noqa: N802
-        """A variable, a parameter, or something from outside."""
+        """Return a variable, a parameter, or something from outside."""
         return self.lookup(node.id)
 
     def of_Tuple(self, node: ast.Tuple) -> Any:  # noqa: N802
-        """A tuple."""
+        """Return a tuple."""
         return tuple(self.listed(node.elts))
 
     def listed(self, nodes: list[ast.expr]) -> Iterator[Any]:
@@ -76,7 +76,7 @@ class Expressions(Scope):
                 yield self.value(node)
 
     def of_GeneratorExp(self, node: ast.GeneratorExp) -> Any:  # noqa: N802
-        """Values for every one of what is known, as a tuple."""
+        """Return values for every one of what is known, as a tuple."""
         before = dict(self.known)
         found = tuple(self._generated(node, list(node.generators)))
         self.known = before
@@ -100,7 +100,7 @@ class Expressions(Scope):
                 self._bind(each, part)
 
     def iterated(self, node: ast.expr) -> list[Any]:
-        """The values that a loop goes over, where they are known."""
+        """Return the values that a loop goes over, where they are known."""
         found = self.value(node)
         parts = entries(found)
         if parts is not None:
@@ -114,7 +114,7 @@ class Expressions(Scope):
         return self.operation(node.op, self.value(node.left), self.value(node.right))
 
     def operation(self, node: ast.operator, left: Any, right: Any) -> Any:
-        """The result of an operator."""
+        """Return the result of an operator."""
         operation = OPERATORS[type(node)]
         if is_known(left) and is_known(right):
             both = as_python(left), as_python(right)
@@ -128,7 +128,7 @@ class Expressions(Scope):
         return binary(self.emitter, operation, self.scalar(left), self.scalar(right))
 
     def scalar(self, value: Any) -> Any:
-        """A number; raises TypeError where it is none."""
+        """Return a number; raises TypeError where it is none."""
         if isinstance(value, Number) or is_static(value):
             return value
         if isinstance(value, Array) and not value.shape:
@@ -146,7 +146,7 @@ class Expressions(Scope):
         return value
 
     def truth(self, value: Any) -> Any:
-        """Whether something holds: known, or a number at run time."""
+        """Tell whether something holds: known, or a number at run time."""
         if isinstance(value, Number):
             return self.emitter.truth(value)
         if isinstance(value, Array):
@@ -179,7 +179,7 @@ class Expressions(Scope):
         return found
 
     def compared(self, operation: Any, left: Any, right: Any) -> Any:
-        """The result of one comparison."""
+        """Return the result of one comparison."""
         if is_known(left) and is_known(right):
             return bool(operation(as_python(left), as_python(right)))
         if operation in (operator.is_, operator.is_not):
@@ -215,11 +215,11 @@ class Expressions(Scope):
         return self.value(node.body if condition else node.orelse)
 
     def of_Attribute(self, node: ast.Attribute) -> Any:  # noqa: N802
-        """A field of a NamedTuple, the shape of an array, something of a module."""
+        """Return a field of a NamedTuple, the shape of an array, something of a module."""
         return self.attribute(self.value(node.value), node.attr)
 
     def attribute(self, owner: Any, name: str) -> Any:
-        """What something has under a name."""
+        """Return what something has under a name."""
         if isinstance(owner, Record) and name in owner.type._fields:
             return owner.get(name)
         if isinstance(owner, Array):
@@ -234,7 +234,7 @@ class Expressions(Scope):
         raise TypeError(f"a {type(owner).__name__} has no {name} in a kernel")
 
     def of_Subscript(self, node: ast.Subscript) -> Any:  # noqa: N802
-        """A number of an array, a part of it, or an entry of a tuple."""
+        """Return a number of an array, a part of it, or an entry of a tuple."""
         owner = self.value(node.value)
         parts = entries(owner)
         if parts is None:
@@ -250,7 +250,7 @@ class Expressions(Scope):
         return parts[int(index)] if is_static(index) else self.entry(parts, index)
 
     def entry(self, parts: tuple[Any, ...], index: Number) -> Number:
-        """An entry of a tuple of numbers, by an index that is not known."""
+        """Return an entry of a tuple of numbers, by an index that is not known."""
         if not all(isinstance(each, Number) or is_static(each) for each in parts):
             raise TypeError("an entry of this tuple is found by an index that is known")
         if all(map(is_static, parts)):
@@ -264,7 +264,7 @@ class Expressions(Scope):
         return load(self.emitter, part_of(self.emitter, kept, (index,)))
 
     def element(self, node: ast.Subscript, owner: Any = None) -> Array:
-        """The place in an array, or the part of one, that a subscript stands for."""
+        """Return the place in an array, or the part of one, that a subscript stands for."""
         owner = self.value(node.value) if owner is None else owner
         if isinstance(owner, np.ndarray):
             owner = self.constant_array(owner)
@@ -276,7 +276,7 @@ class Expressions(Scope):
         return part_of(self.emitter, owner, tuple(self._index(each) for each in index))
 
     def constant_array(self, array: np.ndarray) -> Array:
-        """An array from outside, which a kernel reads: one that nobody can write to."""
+        """Return an array from outside, which a kernel reads: one that nobody can write to."""
         if array.flags.writeable:
             raise TypeError("an array that could change is part of a kernel; pass it as an argument")
         return self.program.table(array)
@@ -296,7 +296,7 @@ class Expressions(Scope):
     # --- calls ---
 
     def of_Call(self, node: ast.Call) -> Any:  # noqa: N802
-        """A function, a NamedTuple, or something that writes its own instructions."""
+        """Make a function, a NamedTuple, or something that writes its own instructions."""
         if isinstance(node.func, ast.Attribute) and node.func.attr == "_replace":
             owner = self.value(node.func.value)
             new = {each.arg: self.value(each.value) for each in node.keywords}
@@ -310,7 +310,7 @@ class Expressions(Scope):
         return self.called(function, arguments, named)
 
     def called(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
-        """What a call gives."""
+        """Return what a call gives."""
         write = getattr(function, "lowered", None)
         if write is not None:  # it knows how, see replay.tracing
             return write(self.program, self.emitter, arguments)
@@ -364,7 +364,7 @@ class Expressions(Scope):
         raise NotImplementedError
 
     def _worked_out(self, function: Any, arguments: list[Any], named: dict[str, Any]) -> Any:
-        """The result of a function whose arguments are all known: Python has it."""
+        """Return the result of a function whose arguments are all known: Python has it."""
         known = [as_python(each) for each in arguments]
         with np.errstate(all="ignore"):
             return from_python(
@@ -383,7 +383,7 @@ def _whole(size: int | str) -> Any:
 
 
 def _given(function: FunctionType, arguments: list[Any], named: dict[str, Any]) -> list[Any]:
-    """All arguments in their places, with defaults."""
+    """Return all arguments in their places, with defaults."""
     code = function.__code__
     names = code.co_varnames[: code.co_argcount]
     defaults = dict(zip(names[::-1], (function.__defaults__ or ())[::-1], strict=False))

@@ -22,11 +22,11 @@ from replay.engine.compiling.kernels.variables import placed_names
 
 
 class Wider(Exception):
-    """A variable has to hold numbers of another kind than its first value."""
+    """Raised where a variable has to hold numbers of another kind than its first value."""
 
 
 class Frame(Expressions):
-    """One function's blocks of instructions, and the places of its variables."""
+    """Represents one function's blocks of instructions, and the places of its variables."""
 
     def __init__(
         self, program: Program, function: FunctionType, arguments: list[Any], kinds: dict[str, str]
@@ -70,7 +70,7 @@ class Frame(Expressions):
     # --- places in memory ---
 
     def place(self, value: Any) -> Any:
-        """A place for values like this one: its leaves are addresses."""
+        """Return a place for values like this one: its leaves are addresses."""
         return rebuilt(value, iter([self.emitter.memory(kind) for kind, _ in leaves(value)]))
 
     def write(self, place: Any, value: Any) -> None:
@@ -79,7 +79,7 @@ class Frame(Expressions):
             self.emitter.add(f"store {kind} {code}, ptr {address}")
 
     def read(self, place: Any) -> Any:
-        """The value at a place."""
+        """Return the value at a place."""
         names = []
         for kind, address in leaves(place):
             names.append(self.emitter.fresh())
@@ -97,14 +97,14 @@ class Frame(Expressions):
         self.write(self.places[name], value)
 
     def fitting(self, name: str, value: Any) -> Any:
-        """The value as one that its place holds; raises `Wider` where the place has to be another."""
+        """Return the value as its place holds it; raises `Wider` where the place has to be another."""
         value = self.widened(name, unsure(at_run_time(value)))
         if name in self.places:
             value = self.converted(name, value, self.places[name])
         return value
 
     def widened(self, name: str, value: Any) -> Any:
-        """The value with the kinds of numbers that its place was found to need."""
+        """Return the value with the kinds of numbers that its place was found to need."""
         if isinstance(value, Number):
             kind = self.kinds.get(name, value.kind)
             return self.emitter.as_kind(value, common_kind(value, Number(kind, "")))
@@ -115,7 +115,10 @@ class Frame(Expressions):
         return Record(value.type, made) if isinstance(value, Record) else made
 
     def converted(self, name: str, value: Any, place: Any) -> Any:
-        """A number, or a tuple's numbers, as those of the place; `Wider` where it cannot hold them."""
+        """Convert a number, or a tuple's numbers, to the place's kinds.
+
+        `Wider` where it cannot hold them.
+        """
         if signature(value) == signature(place):
             return value
         if isinstance(value, Number) and isinstance(place, Number):
@@ -138,19 +141,19 @@ class Frame(Expressions):
         return rebuilt(place, iter([code for each in made for _, code in leaves(each)]))
 
     def lookup(self, name: str) -> Any:
-        """What a name stands for."""
+        """Return what a name stands for."""
         if name in self.places:
             return self.read(self.places[name])
         return super().lookup(name)
 
 
 def unsure(value: Any) -> Any:
-    """A number of which it is not known whether it is negative."""
+    """Return a number of which it is not known whether it is negative."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
 def common_value(one: Any, other: Any) -> Any:
-    """The one value, with numbers of the kinds that hold the other's too."""
+    """Return the one value, with numbers of the kinds that hold the other's too."""
     if isinstance(one, Number) and isinstance(other, Number):
         return one._replace(kind=common_kind(one, other))
     parts, others = entries(one), entries(other)

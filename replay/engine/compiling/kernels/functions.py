@@ -27,7 +27,7 @@ from replay.engine.compiling.kernels.numbers import (
 
 
 def absolute(emitter: Emitter, x: Scalar) -> Number:
-    """`abs(x)`."""
+    """Make `abs(x)`."""
     if kind_of(x) == REAL:
         return emitter.call("llvm.fabs.f64", emitter.as_kind(x, REAL))
     whole = emitter.as_kind(x, WHOLE)

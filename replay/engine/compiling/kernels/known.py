@@ -48,7 +48,7 @@ OPERATORS: dict[type[ast.AST], Any] = {
 
 
 def is_known(value: Any) -> bool:
-    """Whether nothing of a value exists at run time only."""
+    """Tell whether nothing of a value exists at run time only."""
     if isinstance(value, Number | Array):
         return False
     parts = entries(value)
@@ -56,14 +56,14 @@ def is_known(value: Any) -> bool:
 
 
 def as_python(value: Any) -> Any:
-    """What is known, as Python has it."""
+    """Return what is known, as Python has it."""
     if isinstance(value, Record):
         return value.type(*map(as_python, value.values))
     return tuple(map(as_python, value)) if isinstance(value, tuple) else value
 
 
 def from_python(value: Any) -> Any:
-    """What Python has, as it is known while lowering."""
+    """Return what Python has, as it is known while lowering."""
     if isinstance(value, tuple) and hasattr(value, "_fields"):
         return Record(type(value), tuple(map(from_python, value)))
     if isinstance(value, tuple | list):

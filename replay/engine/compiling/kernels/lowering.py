@@ -35,14 +35,14 @@ from replay.engine.compiling.kernels.values import (
 
 
 class _Loop(NamedTuple):
-    """Where `break` and `continue` of a loop lead."""
+    """Holds where `break` and `continue` of a loop lead."""
 
     end: str
     next: str
 
 
 def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tuple[Emitter, Any]:
-    """The body of a function for these arguments, and what it returns."""
+    """Return the body of a function for these arguments, and what it returns."""
     kinds: dict[str, str] = {}
     while True:
         lowering = _Lowering(program, function, arguments, kinds)
@@ -99,7 +99,7 @@ class _Lowering(Frame):
         """Do nothing."""
 
     def do_Expr(self, statement: ast.Expr) -> None:  # noqa: N802
-        """A call, or a docstring."""
+        """Return a call, or a docstring."""
         if not isinstance(statement.value, ast.Constant):
             self.value(statement.value)
 
@@ -167,7 +167,7 @@ class _Lowering(Frame):
             write(index)
 
     def do_Return(self, statement: ast.Return) -> None:  # noqa: N802
-        """Where no branch is open, what is returned may be known; else all of it is a place."""
+        """Return a value: where no branch is open it may be known, else all of it is a place."""
         value = None if statement.value is None else self.value(statement.value)
         if is_local(value):
             raise TypeError("it returns an array that it has made; pass one that it fills")
@@ -184,7 +184,7 @@ class _Lowering(Frame):
         self.go(self._exit)
 
     def do_If(self, statement: ast.If) -> None:  # noqa: N802
-        """Both sides, or the one that is known to be taken."""
+        """Return both sides, or the one that is known to be taken."""
         condition = self.truth(self.value(statement.test))
         if not isinstance(condition, Number):
             self.statements(statement.body if condition else statement.orelse)
@@ -204,7 +204,7 @@ class _Lowering(Frame):
             self.begin(after)
 
     def do_While(self, statement: ast.While) -> None:  # noqa: N802
-        """A loop, tested at its head."""
+        """Make a loop, tested at its head."""
         head, body, after = (self.label(name) for name in ("while", "body", "after"))
         self.go(head)
         self.begin(head)
@@ -222,7 +222,7 @@ class _Lowering(Frame):
             self.ended = True
 
     def inside(self, body: Sequence[ast.stmt], loop: _Loop, then: str) -> None:
-        """The statements of a loop, after which it goes on at `then`."""
+        """Return the statements of a loop, after which it goes on at `then`."""
         self._loops.append(loop)
         self._depth += 1
         self.statements(body)
@@ -240,7 +240,7 @@ class _Lowering(Frame):
         self.go(self._loops[-1].next)
 
     def do_For(self, statement: ast.For) -> None:  # noqa: N802
-        """A loop over a range of numbers, or written out over what is known."""
+        """Make a loop over a range of numbers, or written out over what is known."""
         call = statement.iter
         if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range":
             bounds = [self.value(each) for each in call.args]
@@ -261,7 +261,7 @@ class _Lowering(Frame):
         self.begin(after)
 
     def counted(self, start: Number, stop: Number, step: int) -> Iterator[Number]:
-        """The number of a loop's round, once: between the loop's head and its end."""
+        """Return the number of a loop's round, once: between the loop's head and its end."""
         if not is_static(step) or step == 0:
             raise TypeError("the step of a range is a number that is known")
         head, inner, following, after = (self.label(name) for name in ("for", "body", "next", "after"))

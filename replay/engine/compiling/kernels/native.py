@@ -45,7 +45,7 @@ _MADE_BY = "a kernel that fuselog compiled"
 
 
 class Kernel:
-    """A function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
+    """Represents a function of one run as a loop over runs: `kernel.of(arguments)(first, end)`.
 
     `title` says what it is, to who waits for it.
     """
@@ -60,7 +60,7 @@ class Kernel:
     def of(
         self, arguments: Sequence[Any], scratch: Sequence[Any] = (), varies: int = 1
     ) -> Callable[[int, int], None]:
-        """The loop over the runs from `first` up to `end` for these arguments, which it holds.
+        """Make the loop over the runs from `first` up to `end` for these arguments, which it holds.
 
         So many first axes of arrays vary, none of those in `scratch`; see `describe`.
         """
@@ -98,7 +98,7 @@ class Kernel:
 
 
 def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function that makes no arrays, for Python; no size of the arrays that it is given is known.
+    """Make a function that makes no arrays, for Python; no size of the arrays that it is given is known.
 
     It returns nothing, or a number of the kind that its annotation says.
     """
@@ -134,7 +134,7 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool = False) -> Program:
-    """The kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
+    """Make the kernel in LLVM's text: `kernel(first, end, words)` calls the function for every run.
 
     It returns 0, or where indices are checked the number of the first fault.
     """
@@ -170,7 +170,7 @@ def program_of(function: FunctionType, kinds: Sequence[Any], *, is_checked: bool
 
 
 def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., None]:
-    """The kernel's entry, which raises IndexError where an index is beyond its array; it is not kept."""
+    """Make the kernel's entry that raises IndexError for an index beyond its array; it is not kept."""
     with compiling(title):
         program = program_of(function, kinds, is_checked=True)
         kernel = _loaded(object_code(program.text()))
@@ -184,7 +184,7 @@ def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -
 
 
 def _entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., int]:
-    """The kernel's entry: kept, or made."""
+    """Make the kernel's entry: kept, or made."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
     path = None
@@ -205,7 +205,7 @@ def _entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callab
 
 
 def _kept(path: Path, key: str) -> bytes | None:
-    """The object code that a file holds; None where it is damaged, or another kernel's."""
+    """Return the object code that a file holds; None where it is damaged, or another kernel's."""
     found = read_checked(path)
     own = key.encode()
     return found.removeprefix(own) if found is not None and found.startswith(own) else None
@@ -220,7 +220,7 @@ def _keep(path: Path, code: bytes) -> None:
 
 
 def _named(kinds: Any) -> Any:
-    """Kinds of arguments in words that are the same in every process."""
+    """Return kinds of arguments in words that are the same in every process."""
     if isinstance(kinds, type):
         return f"{kinds.__module__}.{kinds.__qualname__}", getattr(kinds, "_fields", ())
     return tuple(map(_named, kinds)) if isinstance(kinds, tuple) else kinds
@@ -228,7 +228,7 @@ def _named(kinds: Any) -> Any:
 
 @cache
 def _surroundings() -> str:
-    """What beside a kernel's own sources its code depends on."""
+    """Return what beside a kernel's own sources its code depends on."""
     machine = _machine()
     return "\n".join(
         [
@@ -242,7 +242,7 @@ def _surroundings() -> str:
 
 
 def _machine() -> tuple[str, str]:
-    """The processor and its features: this one's, or those that are asked for as numba's are."""
+    """Return the processor and its features: this one's, or those that are asked for as numba's are."""
     name = os.environ.get("NUMBA_CPU_NAME")
     features = os.environ.get("NUMBA_CPU_FEATURES")
     if features is None:
@@ -262,7 +262,7 @@ def _new_target() -> Any:
 
 
 def _made(function: FunctionType, kinds: Sequence[Any]) -> bytes:
-    """The kernel's object code."""
+    """Make the kernel's object code."""
     with _without_garbage():
         return object_code(program_of(function, kinds).text())
 
@@ -286,7 +286,7 @@ _ENGINES: list[Any] = []  # what is loaded stays
 
 
 def _loaded(code: bytes) -> Callable[..., int]:
-    """The entry of a kernel's object code; the engine owns its target."""
+    """Return the entry of a kernel's object code; the engine owns its target."""
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _new_target())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -297,7 +297,7 @@ def _loaded(code: bytes) -> Callable[..., int]:
 
 @contextmanager
 def _without_garbage() -> Iterator[None]:
-    """A compiler makes very many objects and little garbage: nobody looks for it meanwhile."""
+    """Return a compiler makes very many objects and little garbage: nobody looks for it meanwhile."""
     collecting = gc.isenabled()
     gc.disable()
     try:

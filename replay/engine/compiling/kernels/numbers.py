@@ -17,7 +17,7 @@ _WIDTH = {TRUTH: 0, WHOLE: 1, WORD: 2, REAL: 3}
 
 
 class Number(NamedTuple):
-    """A number while a kernel is lowered: its kind, and the name or constant that LLVM knows it by.
+    """Holds a number while a kernel is lowered: its kind, and its name or constant in LLVM's text.
 
     `natural` numbers are known not to be negative.
     """
@@ -37,7 +37,7 @@ Scalar = Number | Static
 
 
 def constant(value: Any) -> Number:
-    """A number that is known, as LLVM writes it; real ones bit by bit."""
+    """Return a number that is known, as LLVM writes it; real ones bit by bit."""
     if isinstance(value, bool | np.bool_):
         return Number(TRUTH, "true" if value else "false")
     if isinstance(value, np.unsignedinteger):
@@ -48,7 +48,7 @@ def constant(value: Any) -> Number:
 
 
 def is_static(value: Any) -> TypeGuard[Static]:
-    """Whether it is a number that is known while lowering."""
+    """Tell whether it is a number that is known while lowering."""
     return isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating)
 
 
@@ -67,7 +67,7 @@ class Emitter:
         self._names = count()
 
     def fresh(self) -> str:
-        """A name that is not taken."""
+        """Return a name that is not taken."""
         return f"%v{next(self._names)}"
 
     def add(self, line: str) -> None:
@@ -75,19 +75,19 @@ class Emitter:
         self.lines.append(f"  {line}")
 
     def memory(self, kind: str, size: int = 1) -> str:
-        """The address of memory for some numbers."""
+        """Return the address of memory for some numbers."""
         name = self.fresh()
         self.allocated.append(f"  {name} = alloca {kind}, i64 {size}")
         return name
 
     def number(self, kind: str, text: str) -> Number:
-        """The result of an instruction."""
+        """Return the result of an instruction."""
         name = self.fresh()
         self.add(f"{name} = {text}")
         return Number(kind, name)
 
     def call(self, name: str, *arguments: Number) -> Number:
-        """What a function of real numbers returns, such as `llvm.sqrt.f64` or `atan2`."""
+        """Return what a function of real numbers returns, such as `llvm.sqrt.f64` or `atan2`."""
         parameters = ", ".join([REAL] * len(arguments))
         self.declared.add(f"declare double @{name}({parameters}) #0")
         given = ", ".join(f"double {each.code}" for each in arguments)
@@ -108,7 +108,7 @@ class Emitter:
     # --- conversions ---
 
     def as_kind(self, value: Scalar, kind: str) -> Number:
-        """A number as one of another kind, as Python and NumPy convert it."""
+        """Return a number as one of another kind, as Python and NumPy convert it."""
         if not isinstance(value, Number):
             if kind == REAL:
                 return constant(float(value))
@@ -129,7 +129,7 @@ class Emitter:
         return Number(kind, value.code)
 
     def truth(self, value: Scalar) -> Number:
-        """Whether a number is other than zero."""
+        """Tell whether a number is other than zero."""
         if not isinstance(value, Number):
             return constant(bool(value))
         if value.kind == TRUTH:
@@ -139,7 +139,7 @@ class Emitter:
         return self.number(TRUTH, f"icmp ne i64 {value.code}, 0")
 
     def select(self, condition: Number, yes: Number, no: Number) -> Number:
-        """One of two numbers of one kind."""
+        """Return one of two numbers of one kind."""
         if yes.code == no.code:
             return yes
         text = f"select i1 {condition.code}, {yes.type} {yes.code}, {no.type} {no.code}"
@@ -147,12 +147,15 @@ class Emitter:
 
 
 def kind_of(value: Scalar) -> str:
-    """The kind of a number."""
+    """Return the kind of a number."""
     return value.kind if isinstance(value, Number) else constant(value).kind
 
 
 def common_kind(*values: Scalar) -> str:
-    """The kind of a result of these numbers; a signed and an unsigned integer together make none."""
+    """Find the kind of a result of these numbers.
+
+    A signed and an unsigned integer together have none.
+    """
     kinds = {kind_of(each) for each in values}
     if {WORD, WHOLE} <= kinds:
         raise TypeError("signed and unsigned integers together; convert one of them")
@@ -176,7 +179,7 @@ _ORDERED = {
 
 
 def binary(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Number:
-    """The result of an operator of Python's."""
+    """Return the result of an operator of Python's."""
     if operation is operator.pow:
         return power(emitter, left, right)
     kind = common_kind(left, right)
@@ -243,7 +246,7 @@ def _divided(emitter: Emitter, operation: Any, x: Number, y: Number) -> Number:
 
 
 def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
-    """A power; of an integer that is known by multiplication."""
+    """Return a power; of an integer that is known by multiplication."""
     if isinstance(exponent, int):
         kind = REAL if exponent < 0 or kind_of(base) == REAL else WHOLE
         square, rest = emitter.as_kind(base, kind), abs(int(exponent))
@@ -260,7 +263,7 @@ def power(emitter: Emitter, base: Scalar, exponent: Scalar) -> Number:
 
 
 def compare(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Number:
-    """The result of a comparison; false with NaN, but for `!=`."""
+    """Return the result of a comparison; false with NaN, but for `!=`."""
     kind = common_kind(left, right)
     kind = WHOLE if kind == TRUTH else kind
     x, y = (emitter.as_kind(each, kind) for each in (left, right))

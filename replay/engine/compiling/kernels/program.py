@@ -28,11 +28,11 @@ FEW = 30  # lines of a function that is always written where it is called
 
 
 class DoesNotCompile(BadInput):
-    """What a kernel cannot be made of, and in which line."""
+    """Holds what a kernel cannot be made of, and in which line."""
 
 
 class Instance(NamedTuple):
-    """A function lowered for some arguments: its name, the type of what it returns, and that value.
+    """Holds a function lowered for some arguments: its name, the type of its result, and that value.
 
     One that `can_fail` returns the number of its fault too, 0 for none.
     """
@@ -44,7 +44,7 @@ class Instance(NamedTuple):
 
 
 class Program:
-    """The text of a kernel while it grows.
+    """Represents the text of a kernel while it grows.
 
     Where indices are checked, `faults` are the lines at which one can be beyond its array.
     """
@@ -67,24 +67,24 @@ class Program:
         self._kept: list[Any] = []  # whose ids are keys
 
     def text(self) -> str:
-        """The whole module."""
+        """Return the whole module."""
         tables = [text for text, _ in self.tables.values()]
         attributes = "attributes #0 = { nounwind willreturn memory(none) }"
         return "\n".join([*tables, *self.functions, *sorted(self.declared), attributes, ""])
 
     def name(self, stem: str) -> str:
-        """A name that no other function or table has."""
+        """Return a name that no other function or table has."""
         return f"@{re.sub('[^0-9A-Za-z]', '_', stem)}_{next(self._names)}"  # as of a lambda
 
     def table(self, numbers: np.ndarray) -> Array:
-        """A constant array."""
+        """Return a constant array."""
         key = numbers.dtype.str, numbers.shape, numbers.tobytes()
         if key not in self.tables:
             self.tables[key] = table(self.name("table"), numbers)
         return self.tables[key][1]
 
     def call(self, emitter: Emitter, function: FunctionType, arguments: Sequence[Any]) -> Any:
-        """What a function returns for these arguments; it is lowered where that was not done yet."""
+        """Call a function with these arguments; it is lowered where that was not done yet."""
         key = (id(function), *map(signature, arguments))
         if key not in self.instances:
             if id(function) in self._open:
@@ -132,14 +132,14 @@ class Program:
         return Instance(name, kind, returned, body.can_fail)
 
     def _parameter(self, index: int, value: Any) -> tuple[Any, list[tuple[str, str]]]:
-        """An argument as the function that it is given to knows it, and its leaves there."""
+        """Return an argument as the function that it is given to knows it, and its leaves there."""
         found = [(kind, f"%a{index}_{place}") for place, (kind, _) in enumerate(leaves(value))]
         known = placed(_unsure(value), is_local=False)
         return rebuilt(known, iter([code for _, code in found])), found
 
 
 def _unsure(value: Any) -> Any:
-    """An integer that may be negative in another call of the function."""
+    """Return an integer that may be negative in another call of the function."""
     return value._replace(natural=False) if isinstance(value, Number) else value
 
 
@@ -163,7 +163,7 @@ def called(emitter: Emitter, instance: Instance, arguments: Sequence[Any]) -> An
 
 @cache
 def definition_of(function: FunctionType) -> tuple[ast.FunctionDef, str, int]:
-    """A function's source, its file, and the line before its first one."""
+    """Make a function's source, its file, and the line before its first one."""
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError) as error:

@@ -15,7 +15,7 @@ from replay.engine.compiling.kernels.program import Program, definition_of
 
 
 class Scope:
-    """One function while it is lowered: where it is, and what its names stand for."""
+    """Represents one function while it is lowered: where it is, and what its names stand for."""
 
     def __init__(self, program: Program, function: FunctionType) -> None:
         self.program = program
@@ -28,21 +28,21 @@ class Scope:
         self._labels = count()
 
     def place_in_source(self) -> str:
-        """The file and the line at work."""
+        """Return the file and the line at work."""
         _, file, above = definition_of(self.function)
         return f"{file}, line {above + self.line}"
 
     def fault(self) -> int:
-        """The number that stands for an index of the line at work that is beyond its array."""
+        """Return the number that stands for an index of the line at work that is beyond its array."""
         self.program.faults.append(f"{self.function.__qualname__} ({self.place_in_source()})")
         return len(self.program.faults)
 
     def label(self, stem: str) -> str:
-        """A name for a block."""
+        """Return a name for a block."""
         return f"{stem}{next(self._labels)}"
 
     def lookup(self, name: str) -> Any:
-        """What a name stands for."""
+        """Return what a name stands for."""
         if name in self.known:
             return self.known[name]
         if name in self._outside:

@@ -45,7 +45,7 @@ STORED = {
 
 @dataclass(frozen=True)
 class Array:
-    """An array: how its numbers are stored, where, and its sizes and strides, in numbers.
+    """Represents an array: how its numbers are stored, where, and its sizes and strides, in numbers.
 
     `is_local`: whether it is gone when the function that made it returns.
     """
@@ -64,25 +64,25 @@ class Array:
 
 @dataclass(frozen=True)
 class Record:
-    """A NamedTuple of values."""
+    """Represents a NamedTuple of values."""
 
     type: type[Any]
     values: tuple[Any, ...]
 
     def get(self, name: str) -> Any:
-        """A field."""
+        """Return a field."""
         return self.values[self.type._fields.index(name)]
 
 
 def entries(value: Any) -> tuple[Any, ...] | None:
-    """The values that a tuple or NamedTuple holds; None of anything else."""
+    """Return the values that a tuple or NamedTuple holds; None of anything else."""
     if isinstance(value, Record):
         return value.values
     return value if isinstance(value, tuple) and not isinstance(value, Number) else None
 
 
 def leaves(value: Any) -> Iterator[Leaf]:
-    """What of a value exists at run time."""
+    """Return what of a value exists at run time."""
     if isinstance(value, Number):
         yield value.type, value.code
     elif isinstance(value, Array):
@@ -96,7 +96,7 @@ def leaves(value: Any) -> Iterator[Leaf]:
 
 
 def rebuilt(value: Any, names: Iterator[str]) -> Any:
-    """The same value with other names for its leaves."""
+    """Return the same value with other names for its leaves."""
     if isinstance(value, Number):
         return Number(value.kind, next(names), value.natural)
     if isinstance(value, Array):
@@ -111,7 +111,7 @@ def rebuilt(value: Any, names: Iterator[str]) -> Any:
 
 
 def signature(value: Any) -> Any:
-    """What a value is, but for the names of its leaves; what is known counts as it is."""
+    """Return what a value is, but for the names of its leaves; what is known counts as it is."""
     if isinstance(value, Number):
         return value.kind
     if isinstance(value, Array):
@@ -127,7 +127,7 @@ def signature(value: Any) -> Any:
 
 
 def at_run_time(value: Any) -> Any:
-    """The value with every number that is known as one at run time."""
+    """Return the value with every number that is known as one at run time."""
     if is_static(value):
         return constant(value)
     if isinstance(value, Record):
@@ -141,7 +141,7 @@ def at_run_time(value: Any) -> Any:
 
 
 def whole(size: Size | Scalar) -> Scalar:
-    """A size as a number."""
+    """Return a size as a number."""
     return Number(WHOLE, size, natural=True) if isinstance(size, str) else size
 
 
@@ -150,7 +150,7 @@ def _size(number: Scalar) -> Size:
 
 
 def combined(emitter: Emitter, operation: Any, left: Size, right: Size) -> Size:
-    """The sum, product or difference of two sizes."""
+    """Compute the sum, product or difference of two sizes."""
     if isinstance(left, int) and isinstance(right, int):
         return int(operation(left, right))
     if operation is operator.mul and 1 in (left, right):
@@ -161,7 +161,7 @@ def combined(emitter: Emitter, operation: Any, left: Size, right: Size) -> Size:
 
 
 def place_in(emitter: Emitter, index: Scalar, size: Size) -> Size:
-    """Where an index points to, counted from the end where it is negative; checked if that is asked."""
+    """Find where an index points to, counted from the end where negative; checked if that is asked."""
     place = _counted(emitter, index, size)
     if emitter.fault is not None:
         code, end = (emitter.as_kind(whole(each), WHOLE).code for each in (place, size))
@@ -182,7 +182,7 @@ def _counted(emitter: Emitter, index: Scalar, size: Size) -> Size:
 
 
 def part_of(emitter: Emitter, array: Array, index: tuple[Any, ...]) -> Array:
-    """A part of an array, by numbers and slices (pairs of bounds, None where open)."""
+    """Return a part of an array, by numbers and slices (pairs of bounds, None where open)."""
     offset: Size = 0
     shape: list[Size] = []
     strides: list[Size] = []
@@ -204,7 +204,7 @@ def part_of(emitter: Emitter, array: Array, index: tuple[Any, ...]) -> Array:
 
 
 def _within(emitter: Emitter, bound: Scalar, size: Size) -> Size:
-    """A bound of a slice: no further than the end."""
+    """Return a bound of a slice: no further than the end."""
     place = _counted(emitter, bound, size)
     if isinstance(place, int) and isinstance(size, int):
         return min(max(place, 0), size)
@@ -222,7 +222,7 @@ def _moved(emitter: Emitter, array: Array, offset: Size) -> str:
 
 
 def load(emitter: Emitter, place: Array) -> Number:
-    """The number at a place: an array without axes."""
+    """Return the number at a place: an array without axes."""
     stored, kind = STORED[place.dtype]
     found = emitter.number(kind, f"load {stored}, ptr {place.pointer}")
     if stored == "i8" and kind == TRUTH:
@@ -262,25 +262,25 @@ def table(name: str, numbers: np.ndarray) -> tuple[str, Array]:
 
 
 def packed(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The strides of an array whose numbers lie close to each other."""
+    """Return the strides of an array whose numbers lie close to each other."""
     return tuple(prod(shape[axis + 1 :]) for axis in range(len(shape)))
 
 
 def made(emitter: Emitter, shape: tuple[int, ...], dtype: str) -> Array:
-    """Memory for an array of known sizes, until the function returns."""
+    """Make memory for an array of known sizes, until the function returns."""
     memory = emitter.memory(STORED[dtype][0], max(1, prod(shape)))
     return Array(dtype, memory, shape, packed(shape), is_local=True)
 
 
 def is_local(value: Any) -> bool:
-    """Whether there is an array in it that is gone when its function returns."""
+    """Tell whether there is an array in it that is gone when its function returns."""
     if isinstance(value, Array):
         return value.is_local
     return any(map(is_local, entries(value) or ()))
 
 
 def placed(value: Any, *, is_local: bool) -> Any:
-    """The value with arrays that are, or are not, gone when the function at hand returns.
+    """Return the value with arrays that are, or are not, gone when the function at hand returns.
 
     What a function is given stays when it returns, and may be part of what that is.
     """

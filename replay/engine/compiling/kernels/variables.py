@@ -7,7 +7,7 @@ from typing import Any
 
 
 class _Names(ast.NodeVisitor):
-    """Where names are given values and where they are used: branches and loops, and the order."""
+    """Holds where names are given values and where they are used: branches and loops, and the order."""
 
     def __init__(self) -> None:
         self.given: dict[str, list[tuple[tuple[Any, ...], int]]] = {}
@@ -63,7 +63,7 @@ class _Names(ast.NodeVisitor):
 
 @cache
 def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
-    """The names that are no single value: given one more than once, or used where that may not be."""
+    """Find the names that are no single value: given one twice, or used where that may not be."""
     names = _Names()
     for argument in ast.walk(definition.args):
         if isinstance(argument, ast.arg):
@@ -78,7 +78,7 @@ def placed_names(definition: ast.FunctionDef) -> frozenset[str]:
 def _is_placed(
     given: list[tuple[tuple[Any, ...], int]], used: list[tuple[tuple[Any, ...], int]]
 ) -> bool:
-    """Whether some use may see another value than the one that stands nearest before it."""
+    """Tell whether some use may see another value than the one that stands nearest before it."""
     for region, order in used:
         before = [each for each in given if each[1] < order]
         if not before or before[-1][0] != region[: len(before[-1][0])]:

@@ -1,0 +1,76 @@
+"""The estimates of one label as a source of its own, under the name that a comparison has for it."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from recorders.log import Clock, RunMetadata, Stream, Topic
+from replay.engine.streams.sources import Source
+
+
+@dataclass(frozen=True)
+class Renamed:
+    """The estimates of one label alone, under another name: a source that is read as it is needed."""
+
+    estimates: Source
+    label: str
+    of: str
+
+    @property
+    def name(self) -> str:
+        """What the estimates are called."""
+        return self.estimates.name
+
+    @property
+    def run(self) -> RunMetadata:
+        """What the run was."""
+        return self.estimates.run or RunMetadata("unknown", epoch_ns=self.epoch_ns)
+
+    @property
+    def epoch_ns(self) -> int:
+        """The run's time zero."""
+        return self.estimates.epoch_ns
+
+    @property
+    def start_ns(self) -> int | None:
+        """Where the span begins."""
+        return self.estimates.start_ns
+
+    @cached_property
+    def topics(self) -> Mapping[str, Topic]:
+        """The label's topics."""
+        return {
+            self._new(name): replace(topic, name=self._new(name))
+            for name, topic in self.estimates.topics.items()
+            if name.startswith(f"/estimates/{self.label}/")
+        }
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Whole topics, in publish-time order."""
+        return self._renamed(self.estimates.read([self._old(topic) for topic in topics]))
+
+    def empty(self, topic: str) -> Stream:
+        """The topic without its messages."""
+        return replace(self.estimates.empty(self._old(topic)), topic=topic)
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Topics in blocks that follow one another in time."""
+        own = [self._old(topic) for topic in topics]
+        return map(self._renamed, self.estimates.blocks(own, order, block_messages))
+
+    def whole(self) -> "Renamed":
+        """The run without a span."""
+        return replace(self, estimates=self.estimates.whole())
+
+    def _renamed(self, streams: Mapping[str, Stream]) -> dict[str, Stream]:
+        return {
+            self._new(name): replace(stream, topic=self._new(name)) for name, stream in streams.items()
+        }
+
+    def _new(self, topic: str) -> str:
+        return f"/estimates/{self.of}/{topic.removeprefix(f'/estimates/{self.label}/')}"
+
+    def _old(self, topic: str) -> str:
+        return f"/estimates/{self.label}/{topic.removeprefix(f'/estimates/{self.of}/')}"

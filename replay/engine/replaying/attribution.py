@@ -1,0 +1,132 @@
+"""Which topic each innovation is of, where an estimator takes several: that with a message of its stamp.
+
+Innovations do not say it. Where messages of several topics have one stamp, and as many innovations have
+it, these are of them in the order of the file. Where they are fewer or more, or have another stamp, as
+those of an estimator that shifts its messages by their delay, the topics are counted together.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Clock
+from replay.engine.streams.blocks import Ragged
+
+Integers = NDArray[np.int64]
+# Messages that no innovation has passed, of a run that ended, are let go from so many on.
+MOST_WAITING = 1 << 18
+
+
+class _Messages(NamedTuple):
+    """Messages (n,): of which run, when, the place in its file, the number of the topic."""
+
+    run: Integers
+    time_ns: Integers
+    position: Integers
+    topic: Integers
+
+
+@dataclass
+class Attribution:
+    """Innovations by topic, for one estimator.
+
+    Attributes:
+        used, gated: how many were taken, and how many refused, by topic.
+        is_known: whether every innovation was of one topic.
+    """
+
+    used: Counter[str] = field(default_factory=Counter)
+    gated: Counter[str] = field(default_factory=Counter)
+    is_known: bool = True
+    _waiting: list[_Messages] = field(default_factory=list)
+    _topics: list[str] = field(default_factory=list)
+
+    def note_given(self, streams: Mapping[str, Ragged], order: Clock) -> None:
+        """Take in a block of measurements; all blocks have the same topics."""
+        if not self.is_known or not streams:
+            return
+        self._topics = list(streams)
+        parts = [
+            _Messages(
+                _run_of(ragged),
+                ragged.stream.times(order),
+                ragged.stream.position,
+                np.full(len(ragged), number),
+            )
+            for number, ragged in enumerate(streams.values())
+        ]
+        self._waiting.append(_joined(parts))
+        while sum(len(each.run) for each in self._waiting[1:]) > MOST_WAITING:
+            self._waiting.pop(0)
+
+    def note_innovations(self, innovations: Ragged) -> None:
+        """Count a block of innovations."""
+        if not self.is_known or not len(innovations):
+            return
+        there, run, time_ns = (
+            _joined(self._waiting),
+            _run_of(innovations),
+            innovations.stream.publish_time_ns,
+        )
+        topic = _topic_of(there, run, time_ns)
+        if topic is None:
+            self.end(is_known=False)
+            return
+        accepted = innovations["accepted"] != 0
+        for number, name in enumerate(self._topics):
+            own = accepted[topic == number]
+            self.used[name] += int(own.sum())
+            self.gated[name] += int((~own).sum())
+        reached_ns = np.full(innovations.runs, -1)
+        np.maximum.at(reached_ns, run, time_ns)
+        left = there.time_ns > reached_ns[there.run]
+        self._waiting = [_Messages(*(column[left] for column in there))]
+
+    def end(self, *, is_known: bool = True) -> None:
+        """Let go of the messages that no innovation has passed."""
+        self.is_known &= is_known
+        self._waiting.clear()
+
+    def merge(self, other: "Attribution") -> None:
+        """Take in what was counted over other runs."""
+        self.used.update(other.used)
+        self.gated.update(other.gated)
+        self.is_known &= other.is_known
+
+
+def _run_of(ragged: Ragged) -> Integers:
+    return np.repeat(np.arange(ragged.runs), np.diff(ragged.offsets))
+
+
+def _joined(parts: list[_Messages]) -> _Messages:
+    if not parts:
+        return _Messages(*(np.empty(0, np.int64) for _ in _Messages._fields))
+    return _Messages(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _topic_of(there: _Messages, run: Integers, time_ns: Integers) -> Integers | None:
+    """The number (n,) of the topic that each innovation is of; None where that is not known of all."""
+    stamps, stamp = np.unique(np.concatenate([there.time_ns, time_ns]), return_inverse=True)
+    of_run = np.concatenate([there.run, run]) * len(stamps) + stamp
+    moments, moment = np.unique(of_run, return_inverse=True)
+    of_message, of_innovation = moment[: len(there.run)], moment[len(there.run) :]
+    messages, innovations = (
+        np.bincount(each, minlength=len(moments)) for each in (of_message, of_innovation)
+    )
+    order = np.lexsort((there.position, of_message))
+    begin = np.cumsum(messages) - messages
+    topic = np.append(there.topic[order], -1)
+    changes = np.flatnonzero(np.diff(topic[:-1]) * (np.diff(of_message[order]) == 0))
+    are_several = np.zeros(len(moments), bool)
+    are_several[of_message[order][changes]] = True
+    if np.any((innovations > 0) & ((messages == 0) | (are_several & (messages != innovations)))):
+        return None
+    by_moment = np.argsort(of_innovation, kind="stable")
+    before = (np.cumsum(innovations) - innovations)[of_innovation[by_moment]]
+    place = np.empty(len(run), np.int64)
+    place[by_moment] = np.arange(len(run)) - before
+    return topic[begin[of_innovation] + np.where(are_several[of_innovation], place, 0)]

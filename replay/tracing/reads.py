@@ -1,0 +1,149 @@
+"""What a function reads beside its arguments, so that one can tell whether it would do the same again.
+
+That is known where all of it is seen and nothing of it can change unseen: its code, its defaults, its
+closure, and the globals and attributes of modules that its bytecode names; each of them a number, a
+word, a tuple of these, a function that keeps nothing, or a Python function of which the same is true. A
+list, an array, an attribute of an object, a file and a clock may change unseen.
+"""
+
+import builtins
+import dis
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from types import CellType, CodeType, FunctionType, ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_IMMUTABLE = {
+    *(bool, int, float, complex, str, bytes, type(None), type(Ellipsis)),
+    *(np.bool_, np.float64, np.float32, np.int64, np.int32),
+}
+_OF_PYTHON = (
+    "abs all any bool divmod enumerate float int len list map max min pow range reversed round slice "
+    "sorted sum tuple zip"
+)
+_OF_NUMPY = (
+    "array asarray atleast_1d atleast_2d choose clip concatenate cross diag dot eye full hstack "
+    "identity inner interp ones outer prod reshape round around searchsorted sinc stack sum trace "
+    "transpose vstack where zeros float64"
+)
+# Functions whose results follow from their arguments: held here, so that their ids stay theirs.
+_PURE = {
+    id(each): each
+    for each in (
+        *(getattr(builtins, name) for name in _OF_PYTHON.split()),
+        *(each for each in vars(math).values() if callable(each)),
+        *(each for each in vars(np).values() if isinstance(each, np.ufunc)),
+        *(getattr(np, name) for name in _OF_NUMPY.split()),
+        np.linalg.norm,
+    )
+}
+_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
+_ABSENT = object()
+
+
+class Reads(NamedTuple):
+    """What a function reads: each place, and what was there.
+
+    Attributes:
+        functions: it and those that it calls, with their code and defaults.
+        cells: of closures.
+        names: globals and attributes of modules.
+    """
+
+    functions: list[tuple[FunctionType, CodeType, Any]]
+    cells: list[tuple[CellType, Any]]
+    names: list[tuple[Mapping[str, Any], str, Any]]
+
+    def are_unchanged(self) -> bool:
+        """Whether there is the same at every place."""
+        for function, code, defaults in self.functions:
+            if function.__code__ is not code or function.__defaults__ is not defaults:
+                return False
+            if function.__kwdefaults__ or function.__dict__:
+                return False
+        try:
+            if not all(cell.cell_contents is value for cell, value in self.cells):
+                return False
+        except ValueError:  # nothing is in the cell any more
+            return False
+        return all(scope.get(name, _ABSENT) is value for scope, name, value in self.names)
+
+
+def reads_of(function: Any) -> Reads | None:
+    """What a function reads; None where something of that may change unseen."""
+    reads = Reads([], [], [])
+    return reads if _sees(reads, function) else None
+
+
+def _sees(reads: Reads, value: Any) -> bool:
+    """Note what a value reads; returns whether nothing of that, nor of the value, can change unseen."""
+    if type(value) in _IMMUTABLE or id(value) in _PURE:
+        return True
+    if type(value) is tuple:
+        return all(_sees(reads, each) for each in value)
+    if type(value) is not FunctionType or value.__kwdefaults__ or value.__dict__:
+        return False
+    if any(each is value for each, _, _ in reads.functions):
+        return True
+    reads.functions.append((value, value.__code__, value.__defaults__))
+    chains = _chains(value.__code__)
+    if chains is None:
+        return False
+    try:
+        contents = [(cell, cell.cell_contents) for cell in value.__closure__ or ()]
+    except ValueError:
+        return False
+    reads.cells.extend(contents)
+    inside = (*(value.__defaults__ or ()), *(content for _, content in contents))
+    return all(_sees(reads, each) for each in inside) and all(
+        _sees(reads, _found(reads, value, chain)) for chain in chains
+    )
+
+
+def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
+    """What a chain of names such as `np.linalg.norm` leads to, in modules; each step is noted."""
+    name, *attributes = chain
+    scope: Any = function.__globals__
+    if name not in scope:
+        reads.names.append((scope, name, _ABSENT))
+        scope = vars(builtins)
+    value = scope.get(name, _ABSENT)
+    reads.names.append((scope, name, value))
+    for attribute in attributes:
+        if type(value) is not ModuleType:
+            break
+        scope = vars(value)
+        value = scope.get(attribute, _ABSENT)
+        reads.names.append((scope, attribute, value))
+    return value
+
+
+@lru_cache(maxsize=1024)
+def _chains(code: CodeType) -> tuple[tuple[str, ...], ...] | None:
+    """The globals that code names, with the attributes behind them; None where it does more with names.
+
+    So do imports, classes, what sets a global or an attribute, and `__attributes__`.
+    """
+    instructions = [each for each in dis.get_instructions(code) if each.opname != "EXTENDED_ARG"]
+    chains: list[list[str]] = []
+    is_open = False  # whether an attribute that follows is one of the last chain
+    for each in instructions:
+        if each.opname == "LOAD_GLOBAL":
+            chains.append([each.argval])
+        elif each.opname in _ATTRIBUTE and not each.argval.startswith("__"):
+            if is_open:
+                chains[-1].append(each.argval)
+        elif each.opcode in dis.hasname:
+            return None
+        is_open = each.opname == "LOAD_GLOBAL" or (is_open and each.opname in _ATTRIBUTE)
+    found = dict.fromkeys(map(tuple, chains))
+    for inner in code.co_consts:
+        if isinstance(inner, CodeType):
+            more = _chains(inner)
+            if more is None:
+                return None
+            found |= dict.fromkeys(more)
+    return tuple(found)
