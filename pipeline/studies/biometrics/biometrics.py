@@ -32,7 +32,8 @@ from recorders.parameters import Parameters
 from replay.engine.replaying.estimator import configure
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import MemorySource
-from replay.estimators.biometrics.biometrics import LearnerParameters, subsets_of
+from replay.estimators.biometrics.biometrics import LearnerParameters
+from replay.estimators.biometrics.pairs import subsets_of
 from replay.judging.consistency.verification import (
     FALSE_ACCEPT_RATES,
     Fused,

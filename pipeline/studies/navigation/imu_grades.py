@@ -20,7 +20,7 @@ from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from recorders.simulators.navigation import NavigationParameters
+from recorders.simulators.navigation_parameters import NavigationParameters
 from replay.engine.streams.sources import MemorySource
 from replay.judging.errors.evaluation import Errors
 
