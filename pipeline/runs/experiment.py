@@ -15,6 +15,7 @@ from pipeline.output.results import Outcome, Result, plain, result_folder, write
 from pipeline.runs.checkpoints import Kept, kept_cells
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import Crew
+from pipeline.runs.inputs import Import, Logs, Record
 from pipeline.runs.settings import parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
@@ -26,41 +27,6 @@ from replay.engine.replaying.late import parse_late
 from replay.judging.metrics.measuring import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
-
-
-class Record(Parameters):
-    """What to simulate.
-
-    Attributes:
-        scenario: a scenario by name or TOML file.
-        parameters: what differs from its defaults, by name.
-    """
-
-    scenario: str
-    parameters: dict[str, Any] = {}
-
-
-class Import(Parameters):
-    """What to import; the data's place comes from --data.
-
-    Attributes:
-        source: name of the importer.
-        parameters: what differs from its defaults, by name.
-    """
-
-    source: str
-    parameters: dict[str, Any] = {}
-
-
-class Logs(Parameters):
-    """Logs to replay, one run each.
-
-    Attributes:
-        files: files or patterns such as `drive-*.mcap`, from the folder of the experiment's file on;
-            estimates that lie beside the logs are left out.
-    """
-
-    files: list[str] = []
 
 
 class Experiment(Parameters):
