@@ -20,7 +20,7 @@ from pipeline.api.catalog import Entry
 from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
 from pipeline.output.summary import summary_table
-from pipeline.runs.executors import crew_of, of_executor
+from pipeline.runs.executors import pool_for, pool_of
 from pipeline.runs.experiment import (
     load_experiment,
     load_scenario,
@@ -167,9 +167,10 @@ def run(
     place = None if data is None else Path(data)
     files = [Path(experiment)] if str(experiment).endswith(".toml") else []
     check_folder(folder, {"input": files if place is None else [*files, place]})
-    crew = crew_of(workers, scheduler, found.runs) if executor is None else of_executor(executor)
+    open_pool = pool_for(workers, scheduler, found.runs) if executor is None else pool_of(executor)
     return ResultFolder(
-        folder, run_experiment(name, found, folder, data=place, logs=logs, errors=errors, crew=crew)
+        folder,
+        run_experiment(name, found, folder, data=place, logs=logs, errors=errors, open_pool=open_pool),
     )
 
 
@@ -209,8 +210,10 @@ def sweep(
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": [Path(experiment)] if str(experiment).endswith(".toml") else []})
     runs_in_all = sum(each.runs for each in found)
-    crew = crew_of(workers, scheduler, runs_in_all) if executor is None else of_executor(executor)
-    return ResultFolder(folder, run_sweep(stated.name, overs, points, found, folder, crew=crew))
+    open_pool = pool_for(workers, scheduler, runs_in_all) if executor is None else pool_of(executor)
+    return ResultFolder(
+        folder, run_sweep(stated.name, overs, points, found, folder, open_pool=open_pool)
+    )
 
 
 class Catalog(Mapping[str, Entry]):
