@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 from pipeline.runs.checkpoints import Kept
 from pipeline.runs.ensemble import Pass, parts_of
 from pipeline.runs.executors import Crew, Team, here, states_of, version_of_code
-from pipeline.runs.experiment import Experiment, Logs, Record, Setting, load_scenario
+from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.inputs import Logs, Record
 from pipeline.runs.recorded import KEPT_BYTES, require_memory
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput

@@ -106,7 +106,11 @@ class RegressionParameters(MethodParameters):
 
 
 class SquareRootParameters(UnscentedParameters):
-    """`filter` is the one whose covariances are carried as factors, ekf or ukf."""
+    """Chooses the filter that carries factors of its covariances.
+
+    Attributes:
+        filter: the filter whose covariances are carried as factors.
+    """
 
     filter: Literal["ekf", "ukf"] = "ekf"
 
