@@ -21,8 +21,6 @@ OF_LEAVES = {"recorders/models", "recorders/simulators", "replay/timeline/famili
 # Files of more lines; the schemas are data.
 LARGER = {
     "pipeline/diagnosing/hypotheses.py",
-    "pipeline/studies/biometrics/sequential.py",
-    "pipeline/studies/navigation/quad_inertial.py",
     "recorders/log/schemas.py",
 }
 
