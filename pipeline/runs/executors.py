@@ -53,11 +53,15 @@ class Team(NamedTuple):
 Crew = Callable[[], AbstractContextManager[Team]]
 
 
-def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
+def crew_of(
+    workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
+) -> Crew:
     """Who works on so many runs: whom the options ask for, else processes on all cores if that pays.
 
-    Raises BadInput where both options are given.
+    An executor that is there does all of it. Raises BadInput where both options are given.
     """
+    if executor is not None:
+        return _of_executor(executor)
     if scheduler is not None and workers is not None:
         raise BadInput(
             f"--workers {workers} --scheduler {scheduler}: a scheduler has its own workers; give one "
@@ -70,7 +74,7 @@ def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
     return here if workers == 1 else processes(workers)
 
 
-def of_executor(executor: Executor) -> Crew:
+def _of_executor(executor: Executor) -> Crew:
     """An executor that is there; it is given as much work at a time as there are cores."""
 
     @contextmanager
