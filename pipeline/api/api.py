@@ -20,7 +20,7 @@ from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
 from pipeline.output.summary import summary_table
 from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import Crew, crew_of
+from pipeline.runs.executors import PoolFactory, pool_for
 from pipeline.runs.experiment import (
     Experiment,
     Stated,
@@ -143,12 +143,12 @@ def run(
     """
     stated = _stated(experiment)
     found = stated.with_settings(set or {}, _given(runs=runs, seed=seed))
-    if (workers or 1) > 1 or scheduler is not None or executor is not None:
+    if workers not in (None, 1) or scheduler is not None or executor is not None:
         require_campaign(found, "leave out workers, scheduler and executor")
     folder = Path("out", stated.name) if out is None else Path(out)
     place = None if data is None else Path(data)
     check_folder(folder, {"input": [*_inputs(stated, found), *filter(None, [place])]})
-    crew = _crew(workers, scheduler, executor, [found])
+    open_pool = _pool(workers, scheduler, executor, [found])
     result = run_experiment(
         stated.name,
         found,
@@ -156,7 +156,7 @@ def run(
         data=place,
         logs=logs,
         errors=errors,
-        crew=crew,
+        open_pool=open_pool,
         progress=progress,
     )
     return ResultFolder(folder, result)
@@ -204,8 +204,8 @@ def sweep(
     found = [stated.with_settings(merge(set or {}, nested(point)), given) for point in points]
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": _inputs(stated, found[0])})
-    crew = _crew(workers, scheduler, executor, found)
-    result = run_sweep(stated.name, over, points, found, folder, crew=crew, progress=progress)
+    open_pool = _pool(workers, scheduler, executor, found)
+    result = run_sweep(stated.name, over, points, found, folder, open_pool=open_pool, progress=progress)
     return ResultFolder(folder, result)
 
 
@@ -224,17 +224,17 @@ def _inputs(stated: Stated, experiment: Experiment) -> list[Path]:
     return [*experiment.files, *stated.files, *tables]
 
 
-def _crew(
+def _pool(
     workers: int | None,
     scheduler: str | None,
     executor: Executor | None,
     experiments: Sequence[Experiment],
-) -> Crew:
+) -> PoolFactory:
     """Who works on experiments; a scheduler has its own workers, so that one beside it is none."""
     if scheduler is not None and workers == 1:
         workers = None
     runs = sum(len(each.files) or each.runs for each in experiments)
-    return crew_of(workers, scheduler, runs, executor)
+    return pool_for(workers, scheduler, runs, executor)
 
 
 class Catalog(Mapping[str, Entry]):

@@ -133,7 +133,7 @@ class Replay:
 
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.unjudged]
+        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.components_without_truth]
         return "\n".join(
             [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
         )
@@ -194,7 +194,7 @@ class Replay:
     @property
     def losses(self) -> list[str]:
         """A sentence for what was not estimated throughout, and for measurements that were not used."""
-        return [*self.judge.losses, *sentences(self.done.coverage)]
+        return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
 
     @property
     def coverage(self) -> pd.DataFrame:

@@ -208,7 +208,7 @@ def evaluate_logs(
                 gap_limit_s=gap_limit_s,
                 on_errors=kept.add if kept else None,
             )
-        if not judge.tells:
+        if not judge.has_numbers:
             raise BadInput(
                 f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
                 "give its log with --log"
@@ -302,7 +302,7 @@ def _print_outcome(
 ) -> None:
     values = in_order(plain({**judge.metrics, **(more or {})}), estimators)
     failures = judge.failures
-    for sentence in [*judge.unjudged, *failures[:5]]:
+    for sentence in [*judge.components_without_truth, *failures[:5]]:
         warn(sentence)
     if len(failures) > 5:
         warn(f"{len(failures)} failures in all")
@@ -311,7 +311,7 @@ def _print_outcome(
             "metrics": values,
             "bounds": judge.bounds,
             "failures": failures,
-            "losses": [*judge.losses, *unused],
+            "losses": [*judge.notes_of_coverage, *unused],
             "written": [str(path) for path in written],
         }
         print_json(outcome | dict(told or {}))
@@ -324,7 +324,7 @@ def _print_outcome(
             "show that a filter is consistent, only that it is not far from it; nis_per_component says "
             "more"
         )
-    for sentence in [*judge.losses, *unused]:
+    for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
     if told and "seconds" in told:
         print_table(("estimator", "time (s)"), list(told["seconds"].items()))
@@ -393,6 +393,6 @@ def _draw_log(
         judge = judge_logs(
             judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
         )
-    for sentence in judge.unjudged:
+    for sentence in judge.components_without_truth:
         warn(sentence)
     _state_losses([log, source.log])
