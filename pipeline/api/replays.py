@@ -115,7 +115,7 @@ def replay(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Replay:
-    """What estimators made of logs.
+    """Holds what estimators made of logs.
 
     Attributes:
         logs: the runs.
@@ -136,7 +136,7 @@ class Replay:
 
     @property
     def judge(self) -> Judge:
-        """What the estimators are worth."""
+        """Judge what the estimators are worth."""
         return self.done.judge
 
     def __repr__(self) -> str:
@@ -206,7 +206,7 @@ class Replay:
 
     @property
     def coverage(self) -> pd.DataFrame:
-        """What became of the logs' topics: messages, used, gated, skipped and why, by estimator."""
+        """Return what became of the logs' topics by estimator: messages, used, gated, skipped, why."""
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
@@ -294,7 +294,7 @@ class Replay:
 
 
 def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
-    """One log or several as sources; raises BadInput where there is none, or one is no log."""
+    """Open one log or several as sources; raises BadInput where there is none, or one is no log."""
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
         raise BadInput("there are no logs to replay; give at least one")

@@ -50,7 +50,7 @@ class Rows:
 
     @property
     def is_done(self) -> bool:
-        """Whether all rows were given."""
+        """Tell whether all rows were given."""
         return self._next is None
 
     # What is read.
@@ -306,7 +306,7 @@ class Rows:
             self._told[subject, fact] += count
 
     def notes(self) -> dict[str, str]:
-        """What was read of the file."""
+        """Describe what was read of the file."""
         name = self.path.name
         topics = ", ".join(self._filled(stream.topic) for stream in self.mapping.streams)
         notes = {name: f"{self.count} rows as {topics}"}

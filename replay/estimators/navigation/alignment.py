@@ -1,4 +1,4 @@
-"""Where inertial navigation starts from: levelled at rest, its heading from the course.
+"""Finds where inertial navigation starts from: levelled at rest, its heading from the course.
 
 Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013,
 section 5.6: roll and pitch from the specific force, of which gravity is all while nothing accelerates;
@@ -119,7 +119,7 @@ def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Where to start from: the first fix within the unit's samples, and the velocity nearest to it.
+    """Find where to start: at the first fix within the unit's samples, with the velocity nearest to it.
 
     Args:
         streams: `inertial` samples, `fix`, positions in the plane (east, north, up), and perhaps
@@ -162,7 +162,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
-    """What looks wrong in the first samples of a body whose start is known.
+    """Find what looks wrong in the first samples of a body whose start is known.
 
     It is what `align` refuses, and only said here: the body may begin in motion.
 

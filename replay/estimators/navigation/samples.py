@@ -42,7 +42,7 @@ class ReceiverVelocities(NamedTuple):
 
 
 def mounted(sample: Any, parameters: Any) -> Any:
-    """What the unit measures, in the body's axes; three components, or columns of them."""
+    """Turn what the unit measures into the body's axes; three components, or columns of them."""
     roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
