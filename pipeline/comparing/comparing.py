@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from pipeline.api.api import ResultFolder
-from pipeline.api.replays import Kind
+from pipeline.api.planning import Kind
 from pipeline.comparing.candidates import Candidate
 from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, unlike_runs
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level

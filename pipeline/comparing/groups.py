@@ -3,7 +3,8 @@
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from pipeline.api.replays import Kind, replay
+from pipeline.api.planning import Kind
+from pipeline.api.replays import replay
 from pipeline.comparing.candidates import (
     Candidate,
     Given,

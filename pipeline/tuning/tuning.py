@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.api.replays import Kind, Log, settings_of, sources_of
+from pipeline.api.planning import Kind, Log, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for, pool_of
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (

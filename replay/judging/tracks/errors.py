@@ -185,7 +185,7 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
 
 
 def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:
-    """The tracks at k instants as (tracks, k, 2), NaN where one is absent; see `track_distances`."""
+    """The tracks at k instants as (tracks, k, 2), NaN where one is absent; see `tracks.distances`."""
     numbers = np.unique(np.concatenate([at.number for at in tracks] or [np.empty(0, np.int64)]))
     found = np.full((len(numbers), len(tracks), 2), np.nan)
     for instant, at in enumerate(tracks):
