@@ -13,7 +13,7 @@ from recorders.log import Log, Stream, schemas
 from replay.engine.streams.sources import LogSource
 
 
-def said_once(log: Log, topics: Sequence[str]) -> list[str]:
+def static_topics(log: Log, topics: Sequence[str]) -> list[str]:
     """Maps, priors, and topics all of whose messages have the first stamp of the log."""
     first_ns, _ = LogSource(log).extent("publish_time")
     early: Counter[str] = Counter()

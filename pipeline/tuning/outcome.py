@@ -35,7 +35,7 @@ SETTINGS = "settings.toml"
 IMPROBABLE = 1e-3  # of white innovations: they are none
 
 
-class Found(NamedTuple):
+class SearchOutcome(NamedTuple):
     """States where a search ended.
 
     Attributes:
@@ -80,7 +80,7 @@ class Tuning:
     held_out_logs: Sequence[Source]
     settings: Mapping[str, Mapping[str, Any]]
     objective: Objective
-    found: Found
+    found: SearchOutcome
     costs: Floats
     held_out_costs: Floats | None
     folds: pd.DataFrame

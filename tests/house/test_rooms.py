@@ -37,7 +37,7 @@ WIDER = {
         "view_path",
     },
     "pipeline/command_line/experiment_commands.py": {"run_named", "sweep_named"},
-    "pipeline/comparing/command.py": {"compare_sides"},
+    "pipeline/comparing/command.py": {"compare_candidates"},
     "pipeline/diagnosing/command.py": {"diagnose_log"},
     "pipeline/runs/ensemble.py": {"replay_parts"},
     "pipeline/tuning/command.py": {"tune_logs"},
