@@ -27,6 +27,7 @@ LARGER = {
 # Functions of more parameters: what the door offers by keyword, commands and what they call, and others.
 WIDER = {
     "pipeline/api/api.py": {"run", "sweep"},
+    "pipeline/api/planning.py": {"plan_replay"},
     "pipeline/api/replays.py": {"replay"},
     "pipeline/api/trajectories.py": {"evaluate"},
     "pipeline/checking/command.py": {"check_path"},

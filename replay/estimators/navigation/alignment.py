@@ -29,6 +29,7 @@ from replay.estimators.navigation.samples import (
     read_motion,
     read_samples,
     stated_or,
+    unsteadiness,
 )
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.start import Started
@@ -39,7 +40,6 @@ SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
 USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
 SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
-PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
 
 
 class AlignmentParameters(ModelParameters):
@@ -154,7 +154,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
     up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
     covariance[9:12, 9:12] = stated_or(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
-    unsteadiness_mps2 = _unsteadiness(samples, motion, parameters)
+    unsteadiness_mps2 = unsteadiness(samples, motion, parameters)
     tilts = np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])
     covariance[tilts] = _tilt_covariance(up, unsteadiness_mps2, parameters)
     covariance[6:9, 6:9] += heading_sigma**2 * np.outer(up, up)
@@ -255,23 +255,6 @@ def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, floa
             f"(z = {z:.3g} m/s2): is the unit mounted upside down? mounting_roll_rad=3.14159 turns it"
         )
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
-
-
-def _unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
-    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
-
-    It is as much as they differ among themselves, and as the velocity changes meanwhile.
-    """
-    begin_ns = samples.time_ns[0]
-    until_ns = begin_ns + round(parameters.level_s / NS)
-    spread = samples.force[samples.time_ns < until_ns].std(axis=0)
-    changed = np.zeros(3)
-    if motion is not None:
-        ends = np.interp([begin_ns, until_ns], motion.time_ns, np.arange(len(motion.time_ns)))
-        first, last = np.rint(ends).astype(int)
-        changed = (motion.mps[last] - motion.mps[first]) / parameters.level_s
-    plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
-    return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))
 
 
 def _bias(

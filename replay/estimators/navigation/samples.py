@@ -79,3 +79,23 @@ def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | 
         return None
     time_ns = stream.publish_time_ns - round(parameters.velocity_delay_s / NS)
     return GnssMotion(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
+
+
+PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
+
+
+def unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
+    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
+
+    It is as much as they differ among themselves, and as the velocity changes meanwhile.
+    """
+    begin_ns = samples.time_ns[0]
+    until_ns = begin_ns + round(parameters.level_s / NS)
+    spread = samples.force[samples.time_ns < until_ns].std(axis=0)
+    changed = np.zeros(3)
+    if motion is not None:
+        ends = np.interp([begin_ns, until_ns], motion.time_ns, np.arange(len(motion.time_ns)))
+        first, last = np.rint(ends).astype(int)
+        changed = (motion.mps[last] - motion.mps[first]) / parameters.level_s
+    plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
+    return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))
