@@ -1,4 +1,4 @@
-"""What `import fuselog` offers in place of the commands: logs, recordings, experiments, lists.
+"""Offers in Python what the commands do: logs, recordings, experiments, lists.
 
 Everything raises BadInput as the commands do, with the same sentences. docs/python.md shows how to use
 it; `pipeline.api.replays` has the replay.
@@ -238,7 +238,7 @@ def _pool(
 
 
 class Catalog(Mapping[str, Entry]):
-    """What there is of a kind, by name; raises `UnknownName` for another, with the one that is near."""
+    """Holds what there is of a kind, by name; for another name raises `UnknownName` with a near one."""
 
     def __init__(self, kind: str, list_entries: Callable[[], list[Entry]]) -> None:
         self._kind, self._list = kind, list_entries

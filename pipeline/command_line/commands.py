@@ -1,4 +1,4 @@
-"""What the commands do: the work between the command line and the library.
+"""Does the commands' work, between the command line and the library.
 
 Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
 """
@@ -103,7 +103,7 @@ def replay_logs(
 
 
 def companions_if(foxglove: bool) -> Companions | None:
-    """What makes the messages for Foxglove, where they are asked for; it takes long to import."""
+    """Make the messages for Foxglove, where they are asked for; it takes long to import."""
     if not foxglove:
         return None
     from pipeline.logs.foxglove import companions

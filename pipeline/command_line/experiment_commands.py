@@ -1,4 +1,4 @@
-"""What `fuselog run` and `fuselog sweep` do: experiments, or logs as one, at one point or many."""
+"""Runs experiments, or logs as one, at one point or many: `fuselog run` and `fuselog sweep`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -122,7 +122,7 @@ def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) ->
 
 @dataclass(frozen=True)
 class Setting:
-    """Where and how an experiment runs.
+    """States where and how an experiment runs.
 
     Attributes:
         folder: what is written goes there.
@@ -171,7 +171,7 @@ def shipped(kind: str) -> dict[str, Path]:
 
 
 class Stated(NamedTuple):
-    """What an experiment is before settings go over it.
+    """Holds what an experiment is before settings go over it.
 
     Attributes:
         name: what it is called.
@@ -321,7 +321,7 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
 
 
 def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
-    """What claims may name: the number of the runs, and what a study's options have of numbers."""
+    """Return what claims may name: the number of the runs, and the numbers of a study's options."""
     stated = {name: value for name, value in options if isinstance(value, int | float)}
     return {"runs": experiment.runs, **stated}
 
