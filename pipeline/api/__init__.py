@@ -1,1 +1,1 @@
-"""What `import fuselog` offers, on which the commands rest; begin with `api`."""
+"""What `import fuselog` offers, on which the commands rest; begin with `replays` and `api`."""

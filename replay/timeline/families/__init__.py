@@ -1,1 +1,4 @@
-"""One timeline per scenario family: which scenes it has and how they are laid out."""
+"""One timeline per scenario family: which scenes it has and how they are laid out.
+
+Begin with `landmarks`.
+"""
