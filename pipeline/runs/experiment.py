@@ -12,9 +12,9 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, mode
 
 from pipeline.output.claims import StatedClaim, decide, require_names
 from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
-from pipeline.runs.checkpoints import Kept, kept_cells
+from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import Crew
+from pipeline.runs.executors import PoolFactory
 from pipeline.runs.inputs import Import, Logs, Record
 from pipeline.runs.settings import parameters_by_label
 from recorders.errors import BadInput, choices
@@ -133,8 +133,8 @@ class Setting:
         errors: whether every single error is kept too.
         options: of the study's own type.
         progress: is told how it goes.
-        crew: who works off the cells of a campaign; by default this process.
-        kept: where finished cells are kept until all are.
+        open_pool: who works off the cells of a campaign; by default this process.
+        checkpoints: where finished cells are kept until all are.
     """
 
     folder: Path
@@ -145,8 +145,8 @@ class Setting:
     errors: bool = False
     options: Any = None
     progress: Progress = no_progress
-    crew: Crew | None = None
-    kept: Kept | None = None
+    open_pool: PoolFactory | None = None
+    checkpoints: Checkpoints | None = None
 
 
 @dataclass(frozen=True)
@@ -342,7 +342,7 @@ def run_experiment(
     data: Path | None = None,
     logs: int = 20,
     errors: bool = False,
-    crew: Crew | None = None,
+    open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
@@ -365,7 +365,7 @@ def run_experiment(
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
     with (
-        kept_cells(folder) as kept,
+        checkpoints_of(folder) as checkpoints,
         result_folder(folder) as part,
         foreign_code(f"study {experiment.study}"),
         warnings.catch_warnings(),
@@ -380,8 +380,8 @@ def run_experiment(
             errors=errors,
             options=options,
             progress=progress,
-            crew=crew,
-            kept=kept,
+            open_pool=open_pool,
+            checkpoints=checkpoints,
         )
         outcome = study.run(experiment, setting)
         metrics = plain(outcome.metrics)
