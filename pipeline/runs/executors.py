@@ -53,11 +53,15 @@ class WorkerPool(NamedTuple):
 PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 
 
-def pool_for(workers: int | None, scheduler: str | None, runs: int) -> PoolFactory:
+def pool_for(
+    workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
+) -> PoolFactory:
     """Who works on so many runs: whom the options ask for, else processes on all cores if that pays.
 
-    Raises BadInput where both options are given.
+    An executor that is there does all of it. Raises BadInput where both options are given.
     """
+    if executor is not None:
+        return pool_of(executor)
     if scheduler is not None and workers is not None:
         raise BadInput(
             f"--workers {workers} --scheduler {scheduler}: a scheduler has its own workers; give one "

@@ -177,13 +177,15 @@ class Stated(NamedTuple):
         name: what it is called.
         source: what it was read from, as messages name it.
         values: its entries.
-        folder: what its files count from.
+        folder: what its logs count from.
+        files: what else it was read from.
     """
 
     name: str
     source: str
     values: Mapping[str, Any]
     folder: Path
+    files: Sequence[Path] = ()
 
     @property
     def labels(self) -> Collection[str]:
@@ -223,7 +225,7 @@ def read_experiment(name: str) -> Stated:
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
     path = known.get(name, Path(name))
-    return Stated(path.stem, name, read_toml(path), path.parent)
+    return Stated(path.stem, name, read_toml(path), path.parent, () if name in known else (path,))
 
 
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:

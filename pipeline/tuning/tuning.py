@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.api.planning import Kind, Log, settings_of, sources_of
-from pipeline.runs.executors import WorkerPool, pool_for, pool_of
+from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
     CRITERIA,
@@ -151,11 +151,9 @@ def _pool(
     workers: int | None, scheduler: str | None, executor: Executor | None
 ) -> AbstractContextManager[WorkerPool | None]:
     """Who evaluates; None stands for threads of this process."""
-    if executor is not None:
-        return pool_of(executor)()
-    if workers is None and scheduler is None:
+    if workers is None and scheduler is None and executor is None:
         return nullcontext()
-    return pool_for(workers, scheduler, 1)()
+    return pool_for(workers, scheduler, 1, executor)()
 
 
 def _gate(bound: Sequence[Bound]) -> float:
