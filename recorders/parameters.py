@@ -298,7 +298,8 @@ def nested(name: str, value: Any) -> dict[str, Any]:
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     """Turn `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
 
-    A right side that is no TOML value is taken as text. Raises BadInput where there is no `=`.
+    A right side that is no TOML value is taken as text; a key that begins with a slash (of a
+    topic) stays whole. Raises BadInput where there is no `=`.
 
     >>> parse_settings(["duration_s=30", "range.rate_hz=5.0", "name=walk"])
     {'duration_s': 30, 'range': {'rate_hz': 5.0}, 'name': 'walk'}
@@ -306,7 +307,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
-        parts = key.strip().split(".")
+        parts = [key.strip()] if key.strip().startswith("/") else key.strip().split(".")
         if not equals or not all(parts):
             raise BadInput(f"--set {setting}: expected key=value, such as duration_s=30")
         if len(parts) > DEEPEST:

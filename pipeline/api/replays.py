@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from pipeline.altering.sources import alter, setting_of, split_settings
 from pipeline.api import api
 from pipeline.api.api import ResultFolder
 from pipeline.output.charts import draw
@@ -27,6 +28,7 @@ from pipeline.output.summary import error_charts, summarise, summary_table
 from pipeline.runs.ensemble import Pass, Settings, cut_in_parts, judge_logs, replay_parts
 from pipeline.runs.estimates import add_to_hash
 from pipeline.runs.initial_states import order_of, origins_of, span_of
+from pipeline.runs.settings import with_settings
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, open_log, schemas
@@ -58,6 +60,7 @@ def replay(
     gap_limit_s: float = 0.2,
     arrival_order: bool = False,
     late: str | None = None,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
     metrics: str | Sequence[str] = (),
 ) -> "Replay":
     """Replay estimators over logs, and judge them where there is truth.
@@ -76,6 +79,8 @@ def replay(
         arrival_order: go by log time, as the messages arrived.
         late: what is done about messages that then come late, by their stamps: "drop", "wait:0.5" (in
             seconds), "rewind:0.5"; by default they count as measured when they arrived.
+        set: parameters of all estimators that have them, and how topics are altered before they are
+            replayed: `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
         metrics: which ones; none stands for all.
 
     Raises BadInput where no run can be replayed by one of the estimators.
@@ -90,10 +95,13 @@ def replay(
             raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
     from_ = [start_from] if isinstance(start_from, str | Path) else start_from
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
+    alterations, given = split_settings(set or {})
     settings = settings_of(estimators)
+    if given:
+        settings = with_settings(settings, given)
     wanted = [metrics] if isinstance(metrics, str) else list(metrics)
     find_metrics(wanted)
-    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
+    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs, alterations)]
     origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
     with ExitStack() as stack:
         folder = stack.enter_context(scratch_folder("fuselog-replay"))
@@ -265,6 +273,7 @@ class Replay:
             "title": f"replay of {self.logs[0].name}",
             "logs": [log.name for log in self.logs],
             "estimators": json.loads(json.dumps(self.settings, default=str)),
+            **setting_of(self.logs[0]),
             "parameters": self.done.parameters,
             "gap_limit_s": self.gap_limit_s,
         }
@@ -293,12 +302,17 @@ class Replay:
         return digest.hexdigest()
 
 
-def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
-    """One log or several as sources; raises BadInput where there is none, or one is no log."""
+def sources_of(
+    logs: Log | Iterable[Log], alterations: Mapping[str, Any] | None = None
+) -> list[LogSource | MemorySource]:
+    """One log or several as sources, with topics altered where that is asked for.
+
+    Raises BadInput where there is none, or one is no log, or cannot be altered so.
+    """
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
         raise BadInput("there are no logs to replay; give at least one")
-    return [_source(log) for log in found]
+    return [alter(_source(log), alterations or {}) for log in found]
 
 
 def _source(log: Log) -> LogSource | MemorySource:

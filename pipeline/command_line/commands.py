@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.sources import alter, setting_of
 from pipeline.output.coverage import recounted, sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.output.results import (
@@ -30,9 +31,9 @@ from pipeline.output.terminal import (
     warn,
 )
 from pipeline.runs.ensemble import cut_in_parts, judge_logs, replay_parts
-from pipeline.runs.estimates import hash_files, log_of_estimates, stated_estimators
+from pipeline.runs.estimates import hash_files, log_of_estimates, source_of_estimates, stated_estimators
 from pipeline.runs.initial_states import check_same_run, order_of, origins_of, span_of
-from pipeline.runs.settings import settings_of_estimators, sigmas_of
+from pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
 from recorders.log import Companions, Log, NotMcap, open_log
@@ -74,9 +75,10 @@ def replay_logs(
         "settings": [settings_file] if settings_file else [],
     }
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
-    estimators = settings_of_estimators(names, settings, settings_file, model=model, every_s=every_s)
+    alterations, own = split_texts(settings)
+    estimators = settings_of_estimators(names, own, settings_file, model=model, every_s=every_s)
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
-    opened = [LogSource(open_log(path, recover=recover)) for path in logs]
+    opened = [alter(LogSource(open_log(path, recover=recover)), alterations) for path in logs]
     sources = [span_of(source, start_s, end_s, order) for source in opened]
     starts = origins_of(sources, origins, sigmas_of(sigmas, "--start-sigma"), order, gap_limit_s)
     estimates = list(zip(paths, logs, strict=True))
@@ -177,7 +179,8 @@ def evaluate_logs(
     places = logs or [log_of_estimates(each) for each in opened]
     if out is not None:
         check_folder(out, {"input": [*estimates, *places]})
-    sources = [LogSource(open_log(path, recover=recover)) for path in places]
+    pairs = zip(opened, places, strict=True)
+    sources = [source_of_estimates(each, path, recover=recover) for each, path in pairs]
     for each, source in zip(opened, sources, strict=True):
         check_same_run(LogSource(each), source)
     wanted = find_metrics(metrics)
@@ -217,6 +220,7 @@ def evaluate_logs(
                 "estimates": [str(path) for path in estimates],
                 "logs": [source.name for source in sources],
                 "estimators": estimators,
+                **setting_of(sources[0]),
                 "gap_limit_s": gap_limit_s,
                 "metrics": list(metrics),
                 **comparison,
@@ -382,7 +386,7 @@ def _draw_log(
     estimates = source = LogSource(log)
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
-        source = LogSource(open_log(log_of_estimates(log), recover=recover))
+        source = source_of_estimates(log, recover=recover)
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:

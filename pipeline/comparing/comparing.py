@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -234,6 +234,7 @@ def compare(
     case: str | None = None,
     margin: float = MARGIN,
     gap_limit_s: float = 0.2,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
     recover: bool = False,
     progress: Progress = no_progress,
 ) -> Differences:
@@ -247,6 +248,8 @@ def compare(
         case: what trajectory files are of, such as `robot2`, where a log has several truths.
         margin: which share of a metric is no matter.
         gap_limit_s: the truth is not interpolated over longer gaps.
+        set: how topics are altered, and parameters of estimators, of logs that are replayed; as for
+            `replay`.
         recover: read what is whole of logs that were cut off or damaged.
         progress: is told how a replay of results goes.
 
@@ -263,7 +266,16 @@ def compare(
     paths = [Path(side) for side in sides]
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
-    givens = sides_of(paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover)
+    givens = sides_of(
+        paths,
+        estimators,
+        truth,
+        case,
+        progress,
+        gap_limit_s=gap_limit_s,
+        set_=set or {},
+        recover=recover,
+    )
     groups = list(comparable_groups(givens, [label for each in estimators for label in _labels(each)]))
     notes = [note for group in groups for side in group for note in side.notes]
     paired: list[Paired] = []

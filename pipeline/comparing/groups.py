@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipeline.api.replays import Kind, replay
 from pipeline.comparing.sides import (
@@ -38,6 +39,7 @@ def sides_of(
     progress: Progress,
     *,
     gap_limit_s: float,
+    set_: Mapping[str, Any],
     recover: bool,
 ) -> list[Given]:
     """What every path stands for; logs without estimates are replayed together."""
@@ -52,8 +54,13 @@ def sides_of(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             estimators,
             gap_limit_s=gap_limit_s,
+            set=set_,
         )
         return [of_replay(name_of(logs[0]), done, gap_limit_s)]
+    if set_:
+        raise BadInput(
+            f"--set {next(iter(set_))}: is for logs that are replayed; {paths[0]} has estimates already"
+        )
     found: dict[int, Given] = {}
     for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
         if kind == "result":

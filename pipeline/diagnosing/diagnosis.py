@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.altering.sources import setting_of, split_settings
 from pipeline.api.api import ResultFolder
 from pipeline.api.replays import Kind as EstimatorKind
 from pipeline.api.replays import Log, Replay, replay, settings_of, sources_of
@@ -33,7 +34,7 @@ from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.runs.estimates import source_of_estimates, stated_estimators
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.log.streams import concatenate
@@ -199,6 +200,7 @@ class Diagnosis:
             "title": f"{self.label} diagnosed over {self.replay.logs[0].name}",
             "logs": [log.name for log in self.replay.logs],
             "estimators": json.loads(json.dumps(self.replay.settings, default=str)),
+            **setting_of(self.replay.logs[0]),
             "notes": [*self.told, *self.notes],
             "gap_limit_s": self.replay.gap_limit_s,
         }
@@ -230,7 +232,7 @@ def diagnose(
             is of.
         estimator: a registered name, or a label of your own with what it stands for, see `replay`; of
             an estimates log one of its labels, by default its only one.
-        set: parameters of the estimator.
+        set: parameters of the estimator, and how topics are altered; see `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
     Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
@@ -241,7 +243,8 @@ def diagnose(
     >>> found.sentences[0].kind, found.sentences[0].topic
     ('measurement noise', 'sigma_range_m')
     """
-    sources = sources_of(log)
+    alterations, given = split_settings(set or {})
+    sources = sources_of(log, alterations)
     if len(sources) > 1:
         raise BadInput(
             f"{len(sources)} logs: one log is diagnosed at a time; give one, such as {sources[0].name}. "
@@ -249,7 +252,7 @@ def diagnose(
         )
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
-    settings = merge(own, set or {})
+    settings = merge(own, given)
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
@@ -312,7 +315,7 @@ def _asked(
         if len(labels) != 1:
             raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
-        return sources_of(log_of_estimates(source.log))[0], {labels[0]: own}
+        return source_of_estimates(source.log), {labels[0]: own}
     if estimator is None:
         raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.diagnosing import alterations as alter
+from pipeline.altering import alterations as alter
 from pipeline.diagnosing.likelihood import Trial
 from pipeline.tuning.objective import with_values
 from recorders.log import Stream, Topic

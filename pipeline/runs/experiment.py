@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 
+from pipeline.altering.changes import is_of_topic
 from pipeline.output.results import Outcome, Result, result_folder, write_outcome
 from pipeline.runs.checkpoints import Kept, kept_cells
 from pipeline.runs.ensemble import Progress, no_progress
@@ -77,6 +78,7 @@ class Experiment(Parameters):
         logs: logs to replay.
         estimators: parameters by label; one that is `kind` names the estimator where the label is not
             its name.
+        alterations: how topics are altered before they are replayed, as `--set /TOPIC.WHAT` has it.
         metrics: names of the metrics; without any, all that are registered.
         gap_limit_s: longest gap over which truth is interpolated.
         arrival_order: whether messages are processed in the order in which they arrived.
@@ -92,6 +94,7 @@ class Experiment(Parameters):
     import_: Import | None = Field(None, alias="import")
     logs: Logs | None = None
     estimators: dict[str, dict[str, Any]] = {}
+    alterations: dict[str, Any] | None = None
     metrics: list[str] = []
     gap_limit_s: NonNegativeFloat = 0.2
     arrival_order: bool | None = None
@@ -118,6 +121,12 @@ class Experiment(Parameters):
                 f"study {self.study} replays in the order of the stamps; leave out arrival_order and "
                 "late"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _alters_what_it_replays(self) -> Self:
+        if self.alterations and self.study != "localization":
+            raise ValueError(f"study {self.study} alters no topics; leave out {min(self.alterations)}")
         return self
 
     @property
@@ -214,7 +223,7 @@ def load_experiment(
 
     A setting goes to the entry of the experiment or to the estimator that its first word names, else to
     the scenario's or importer's parameters, else to all estimators that have such a parameter:
-    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`.
+    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`, `/fix.delay_s=0.3`.
     """
     stated = read_experiment(name)
     return stated.name, stated.with_settings(settings, over)
@@ -270,6 +279,8 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
     for key, value in settings.items():
         if key in entries:
             place: dict[str, Any] = {key: value}
+        elif is_of_topic(key):
+            place = {"alterations": {key: value}}
         elif key in experiment.estimators:
             place = {"estimators": {key: value}}
         elif key in names:

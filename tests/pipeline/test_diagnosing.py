@@ -13,7 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
-from pipeline.diagnosing import alterations as alter
+from pipeline.altering import alterations as alter
 from pipeline.diagnosing import study
 from pipeline.diagnosing.causes import find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
