@@ -8,10 +8,11 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
-from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
 from pipeline.altering.changes import is_of_topic
-from pipeline.output.results import Outcome, Result, result_folder, write_outcome
+from pipeline.output.claims import StatedClaim, decide, require_names
+from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
 from pipeline.runs.checkpoints import Kept, kept_cells
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import Crew
@@ -76,14 +77,16 @@ class Experiment(Parameters):
         record: what to simulate.
         import_: what to import.
         logs: logs to replay.
-        estimators: parameters by label; one that is `kind` names the estimator where the label is not
-            its name.
+        estimators: parameters by label; `kind` names the estimator where the label is not its name,
+            `like` another label whose kind and parameters it has but for what it says itself.
         alterations: how topics are altered before they are replayed, as `--set /TOPIC.WHAT` has it.
         metrics: names of the metrics; without any, all that are registered.
         gap_limit_s: longest gap over which truth is interpolated.
         arrival_order: whether messages are processed in the order in which they arrived.
         late: what becomes of late measurements, as `--late` of `fuselog replay` has it.
         options: the study's own.
+        claims: what is claimed of the metrics that it yields.
+        claims_of: name of another experiment whose claims are tried first.
     """
 
     title: str
@@ -100,6 +103,18 @@ class Experiment(Parameters):
     arrival_order: bool | None = None
     late: str | None = None
     options: dict[str, Any] = {}
+    # what is claimed changes nothing in what is run, and a result has it with its verdict
+    claims: Annotated[list[StatedClaim], Field(exclude=True)] = []
+    claims_of: Annotated[str, Field(exclude=True)] = ""
+
+    @field_validator("estimators")
+    @classmethod
+    def _are_spelt_out(cls, stated: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        spelt = {label: _spelt_out(label, stated) for label in stated}
+        for label, values in stated.items():
+            if "like" in values and spelt[label]["kind"] == label:
+                del spelt[label]["kind"]  # as a label that is a name needs none
+        return spelt
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:
@@ -133,6 +148,19 @@ class Experiment(Parameters):
     def files(self) -> list[Path]:
         """The logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []
+
+
+def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) -> dict[str, Any]:
+    """An estimator's parameters with those of the one that it is like."""
+    values = stated[label]
+    if "like" not in values:
+        return values
+    other, own = values["like"], {name: of for name, of in values.items() if name != "like"}
+    if other not in stated or other in (label, *above):
+        raise ValueError(
+            f"estimator {label} is like '{other}'; name another estimator of the experiment"
+        )
+    return merge({"kind": other, **_spelt_out(other, stated, label, *above)}, own)
 
 
 @dataclass(frozen=True)
@@ -210,6 +238,9 @@ class Stated(NamedTuple):
         where = f"experiment {self.source}"
         own = _settings_of_experiment(build(Experiment, self.values, where), settings)
         experiment = build(Experiment, {**merge(self.values, own), **over}, where)
+        if experiment.claims_of:
+            shared = read_experiment(experiment.claims_of).with_settings({}, {}).claims
+            experiment = experiment.model_copy(update={"claims": [*shared, *experiment.claims]})
         if experiment.logs is None:
             return experiment
         files = _found(experiment.logs.files, self.folder, where)
@@ -332,6 +363,12 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
     return recorder, parameters, path.stem
 
 
+def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
+    """What claims may name: the number of the runs, and what a study's options have of numbers."""
+    stated = {name: value for name, value in options if isinstance(value, int | float)}
+    return {"runs": experiment.runs, **stated}
+
+
 def require_campaign(experiment: Experiment, mend: str) -> None:
     """Raise BadInput where an experiment's study replays all runs together, in one process."""
     study: Study = load("studies", experiment.study, Study)
@@ -368,6 +405,8 @@ def run_experiment(
         experiment = experiment.model_copy(update={"runs": len(experiment.files)})
     study: Study = load("studies", experiment.study, Study)
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
+    numbers = numbers_of(experiment, options)
+    require_names(experiment.claims, numbers, f"experiment {name}")
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
     with (
@@ -390,6 +429,8 @@ def run_experiment(
             kept=kept,
         )
         outcome = study.run(experiment, setting)
+        metrics = plain(outcome.metrics)
+        outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)

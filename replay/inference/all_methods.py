@@ -1,11 +1,16 @@
-"""Lists all methods by name, and makes the estimator of one model by one of them."""
+"""Lists all methods by name, and makes estimators of them: of one model, or of any.
+
+A method is registered by its entry in METHODS, and by an entry point that names this module and the
+method, as `replay.inference.all_methods:ekf`.
+"""
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 from recorders.errors import BadInput, choices
 from replay.engine.replaying.estimator import Estimator, set_by_variant
-from replay.inference.estimators import modelled_by
+from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import FILTERS, Method
 from replay.inference.model.model import Model
 from replay.inference.modes.gaussian_sum import GAUSSIAN_SUM
@@ -38,3 +43,11 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
         raise BadInput(f"no method '{kind}'; {choices(kind, METHODS)}")
     chosen = METHODS[kind]
     return modelled_by(model, chosen, method, set_by_variant("method", kind, variant, chosen.variant))
+
+
+@cache
+def __getattr__(method: str) -> Estimator[Any]:
+    """Make the estimator of any model by a method: what an entry point and `-e ekf` mean."""
+    if method not in METHODS:
+        raise AttributeError(method)
+    return of_any_model(METHODS[method])

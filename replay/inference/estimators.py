@@ -26,7 +26,7 @@ from replay.inference.model.augmentation import (
     with_gauss_markov,
 )
 from replay.inference.model.binding import Found, roles_of, topics_of
-from replay.inference.model.model import Model, Motion
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
     assumed_of,
@@ -55,7 +55,7 @@ def combined(model: Model, method: Method) -> type[ModelParameters]:
 def _created(
     name: str, bases: tuple[type[Parameters], ...], fields: Mapping[str, Any] | None = None
 ) -> type[Any]:
-    """Make a type of parameters with further fields."""
+    """Make a type of parameters that has the meanings of its bases."""
     return create_model(name, __base__=bases, **(fields or {}))
 
 
@@ -128,11 +128,11 @@ class _OfAnyModel(Estimator[Any]):
         return _any_parameters(vars(self)["_method"])
 
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:
-        """Those of all models, and of the method that the variant of a name chooses."""
+        """Return those of all models, and of the method that the variant of a name chooses."""
         return _any_parameters(self._made(name, variant))
 
     def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:
-        """Those of each model that the method can estimate, and of the method."""
+        """Return those of each model that the method can estimate, and of the method."""
         method = self._made(name, variant)
         models = registered_models().items()
         return {each: combined(model, method) for each, model in models if not method.lacks(model)}
@@ -251,14 +251,17 @@ def bind_model(
         )
     renamed = parameters.topics or {}
     _check_topics(label, model, topics, renamed)
+    stages: dict[tuple[Sensor, ...], Stage] = {}  # one for all that have the same sensors
     for found in topics_of(model, topics, renamed):
         found = found._replace(origin=_origin_of(label, model, found, topics))
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
-        try:
-            stage = stage_of(*augmented_stage(own, added))
-        except BadInput as error:
-            raise BadInput(f"estimator {label}: {error}") from error
+        if own.sensors not in stages:
+            try:
+                stages[own.sensors] = stage_of(*augmented_stage(own, added))
+            except BadInput as error:
+                raise BadInput(f"estimator {label}: {error}") from error
+        stage = stages[own.sensors]
         name = label + found.prefix
         samplers = samplers_of(stage, method, parameters)
         settings = with_gauss_markov(numbers, added)

@@ -191,6 +191,11 @@ def _complaint(
     places = [
         Path(os.path.normpath(command[index + 1])) for index, word in enumerate(command) if word in FLAGS
     ]
+    if "estimates" in kinds:  # a link to a folder names that folder, and a new file of it may be written
+        linked = {place.resolve() for place in places if place.is_symlink() and place.is_dir()}
+        changed = [
+            name for name in changed if name in before or Path(name).resolve().parent not in linked
+        ]
     for name in changed:
         if not any(Path(name) == place or place in Path(name).parents for place in places):
             if name in before or after[name]:  # a folder that was made on the way is none of these

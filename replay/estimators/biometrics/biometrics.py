@@ -31,6 +31,7 @@ from replay.estimators.biometrics.pairs import (
     all_pairs,
     cross_validate,
     normalise,
+    subsets_of,
     trimmed_pairs,
     user_folds,
 )
@@ -102,8 +103,7 @@ class MixtureParameters(LearnerParameters):
     """HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
 
     Attributes:
-        topology: how states follow one another; joint takes all scores as one vector of one state: a
-            Gaussian mixture.
+        topology: how states follow one another; joint is one state, with all scores as its vector.
         genuine_components: Gaussians per state of genuine pairs.
         impostor_components: Gaussians per state of impostor pairs.
         components_of: Gaussians per state of both, by the name of a subset.
@@ -119,25 +119,6 @@ class MixtureParameters(LearnerParameters):
     covariance_floor: NonNegativeFloat = 0.01
     iterations: PositiveInt = 20
     tolerance: NonNegativeFloat = 0.0
-
-
-def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
-    """The three factors' subsets: each modality, the k-th matcher of every modality, all, singles.
-
-    A subset of one matcher goes by that matcher's name; those of the paper (M1, M2, R1, R2, all) are
-    the larger ones.
-    """
-    by_modality: dict[str, list[int]] = {}
-    for index, matcher in enumerate(matchers):
-        by_modality.setdefault(matcher.modality, []).append(index)
-    subsets = {name: indices for name, indices in by_modality.items() if len(indices) > 1}
-    if len(by_modality) > 1:
-        ranks = min(map(len, by_modality.values()))
-        if ranks > 1:
-            for rank in range(ranks):
-                subsets[f"matcher-{rank + 1}"] = [of[rank] for of in by_modality.values()]
-        subsets["all"] = list(range(len(matchers)))
-    return subsets | {matcher.name: [index] for index, matcher in enumerate(matchers)}
 
 
 def learn_classifier(

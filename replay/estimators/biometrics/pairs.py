@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.models.scores import TOPIC
+from recorders.models.scores import TOPIC, Matcher
 from replay.engine.arrays import Booleans, Floats, Integers
 
 Scorer = Callable[[Floats], Floats]
@@ -116,3 +116,22 @@ def cross_validate(
         rows = np.concatenate([np.flatnonzero(learnt & genuine), np.sort(impostors)])
         fused[judged] = learner(vectors[rows], genuine[rows], rng)(vectors[judged])
     return fused
+
+
+def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
+    """The three factors' subsets: each modality, the k-th matcher of every modality, all, singles.
+
+    A subset of one matcher goes by that matcher's name; those of the paper (M1, M2, R1, R2, all) are
+    the larger ones.
+    """
+    by_modality: dict[str, list[int]] = {}
+    for index, matcher in enumerate(matchers):
+        by_modality.setdefault(matcher.modality, []).append(index)
+    subsets = {name: indices for name, indices in by_modality.items() if len(indices) > 1}
+    if len(by_modality) > 1:
+        ranks = min(map(len, by_modality.values()))
+        if ranks > 1:
+            for rank in range(ranks):
+                subsets[f"matcher-{rank + 1}"] = [of[rank] for of in by_modality.values()]
+        subsets["all"] = list(range(len(matchers)))
+    return subsets | {matcher.name: [index] for index, matcher in enumerate(matchers)}

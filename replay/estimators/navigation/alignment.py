@@ -48,20 +48,17 @@ class AlignmentParameters(ModelParameters):
     Tilt comes from the first samples. The body is assumed to rest until a margin before it first moves.
     The heading is the course at the first speed that is high enough, less the turn of the gyro until
     then; without such a speed it is unknown. Standard deviations of the start that are not given come
-    from the data: position and velocity start so uncertain that their first messages, used like any
-    other, decide; the tilt is as uncertain as the accelerometer's bias and the motion make it; the
-    gyro's bias as its mean over the rest; the heading as much as the course differs from the turn of
-    the gyro.
+    from the data: position and velocity start so uncertain that their first messages decide; the tilt
+    is as uncertain as the accelerometer's bias and the motion make it; the gyro's bias as its mean over
+    the rest; the heading as much as the course differs from the turn of the gyro.
 
     The mounting turns the unit's axes into forward, left, up: by yaw about up, then pitch about left,
     then roll about forward. An axis measures (1 + scale) times the true value, plus the bias.
 
     Attributes:
         mounting_roll_rad, mounting_pitch_rad, mounting_yaw_rad: this angle of the mounting.
-        force_scale_x, force_scale_y, force_scale_z: share by which this axis measures too much of the
-            specific force.
-        gyro_scale_x, gyro_scale_y, gyro_scale_z: share by which this axis measures too much of the turn
-            rate.
+        force_scale_x, force_scale_y, force_scale_z: share of the force that is measured too much.
+        gyro_scale_x, gyro_scale_y, gyro_scale_z: share of the turn rate that is measured too much.
         fix_delay_s: a position was measured so long before its stamp.
         velocity_delay_s: a velocity was measured so long before its stamp.
         inertial_delay_s: an inertial sample was measured so long before its stamp.

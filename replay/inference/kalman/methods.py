@@ -66,15 +66,12 @@ class MethodParameters(Parameters):
     Attributes:
         every_s: estimates are given at this interval too, besides those at the sensors' stamps.
         mode: the motion to use of a model that has several.
-        estimate: names of parameters that become part of the state; each starts from its value, and is
-            constant unless `estimate_drift` or `estimate_time_s` has it.
+        estimate: names of parameters that become part of the state; each starts from its value.
         estimate_sigma: standard deviation of such a parameter at the start, in its unit, by name.
-        estimate_drift: random walk of such a parameter, in its unit per square root of a second, by
-            name.
-        estimate_time_s: time within about which such a parameter returns to its value, as a first-order
-            Gauss-Markov process, in s, by name.
-        topics: which topic of the log stands for one that the model asks for, such as {pose =
-            "/amcl_pose/pose"}; an empty name leaves a sensor out.
+        estimate_drift: random walk of such a parameter, in its unit/sqrt(s), by name.
+        estimate_time_s: time within about which it returns to its value (Gauss-Markov), in s, by name.
+        topics: which topic stands for one that the model asks for, such as {pose = "/amcl_pose/pose"};
+            an empty name leaves a sensor out.
     """
 
     every_s: PositiveFloat | None = None

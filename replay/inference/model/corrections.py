@@ -34,6 +34,7 @@ def sloping(kinds: Kinds, correct: Correction | None, form: Form = COVARIANCES) 
     Args:
         kinds: of the state's components.
         correct: the model's own correction, if it has one.
+        form: of what the filter carries for a covariance.
     """
     if correct is None:
 

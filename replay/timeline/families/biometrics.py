@@ -8,7 +8,7 @@ import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
 from recorders.models.scores import TOPIC, matchers_of
-from replay.estimators.biometrics.biometrics import subsets_of
+from replay.estimators.biometrics.pairs import subsets_of
 from replay.judging.consistency.verification import Floats, Fused, fused_of
 from replay.timeline.drawing.canvas import (
     PALETTE,

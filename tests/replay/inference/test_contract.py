@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.parameters import build
-from recorders.recording import Recording
+from recorders.recording import Recording, record_run
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource, memory_source
@@ -19,6 +19,7 @@ from replay.inference import estimators
 from replay.inference.all_methods import METHODS
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.stage import Stage, stage_of
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
 from tests.replay.inference.vehicle_a import RANGE_BEARING, SPEED, VEHICLE_A
@@ -267,3 +268,16 @@ def test_a_run_without_a_usable_prior_fails_alone(uncompiled: None) -> None:
     alone = collect(replay([SOURCE], filters))["/estimates/test/state"]
     for run in (0, 2):
         assert_array_equal(found["/estimates/test/state"].of_run(run)["mean"], alone["mean"])
+
+
+def test_models_are_traced_once_for_all_that_have_the_same_sensors(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Logs may have a thousand robots."""
+    traced: list[Stage] = []
+    monkeypatch.setattr(
+        estimators, "stage_of", lambda *parts: traced.append(stage_of(*parts)) or traced[-1]
+    )
+    recording, run = record_run("landmarks", {"duration_s": 0.1, "robots": 3}, 0)
+    filters = bind("ekf", [memory_source(recording, run)], {"kind": "ekf"})
+    assert (len(filters), len(traced)) == (3, 1)

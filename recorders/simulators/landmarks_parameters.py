@@ -1,0 +1,121 @@
+"""Parameters of the scenario of robots among landmarks: their drive, sensors and fixes."""
+
+from typing import Annotated
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+
+from recorders.parameters import Parameters
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+
+
+FieldOfView = Annotated[float, Field(gt=0, le=360)]
+
+
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+
+
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+
+
+class Sensor(Parameters):
+    """What the sensors of a robot have in common.
+
+    Attributes:
+        rate_hz: measurements per second; 0 switches the sensor off.
+        maximum_range_m: it sees targets up to this range.
+        field_of_view_deg: it sees targets within this angle about straight ahead.
+        outlier_probability: probability that a value is any that the sensor can have.
+        dropout_probability: probability that a measurement is lost.
+        outages_per_minute: mean number of outages per minute.
+        outage_s: length of an outage.
+        latency_s: least time from measurement to arrival at the recorder.
+        latency_jitter_s: mean of the random time beyond this (exponential).
+        clock_offset_s: the sensor's clock is ahead by so much.
+        stamp_offset_s: the stamps of its messages are ahead by so much.
+        sigma_range_m: standard deviation of a range.
+        sigma_bearing_rad: standard deviation of a bearing.
+        bias_range_m: ranges are too long by so much.
+        bias_bearing_rad: bearings are too large by so much.
+    """
+
+    rate_hz: NonNegativeFloat = 0.0
+    maximum_range_m: PositiveFloat = 8.0
+    field_of_view_deg: FieldOfView = 360.0
+    outlier_probability: Probability = 0.0
+    dropout_probability: Probability = 0.0
+    outages_per_minute: NonNegativeFloat = 0.0
+    outage_s: PositiveFloat = 3.0
+    latency_s: NonNegativeFloat = 0.0
+    latency_jitter_s: NonNegativeFloat = 0.0
+    clock_offset_s: float = 0.0
+    stamp_offset_s: float = 0.0
+    sigma_range_m: NonNegativeFloat = 0.1
+    sigma_bearing_rad: NonNegativeFloat = 0.02
+    bias_range_m: float = 0.0
+    bias_bearing_rad: float = 0.0
+
+
+class Fixes(Parameters):
+    """A receiver of positions.
+
+    Attributes:
+        rate_hz: fixes per second; 0 switches it off.
+        sigma_m: standard deviation of a fix, per axis.
+        outages_per_minute: mean number of outages per minute.
+        outage_s: length of an outage.
+        origin_deg: latitude and longitude of the plane's origin, with which fixes are latitudes and
+            longitudes; without it they are positions in the plane.
+    """
+
+    rate_hz: NonNegativeFloat = 0.0
+    sigma_m: PositiveFloat = 1.0
+    outages_per_minute: NonNegativeFloat = 0.0
+    outage_s: PositiveFloat = 10.0
+    origin_deg: tuple[Latitude, Longitude] | None = None
+
+
+class LandmarksParameters(Parameters):
+    """Robots in a square arena with landmarks, their odometry and their sensors.
+
+    Attributes:
+        duration_s: length of the run.
+        robots: number of robots.
+        landmarks: number of landmarks, placed at random.
+        arena_m: side of the arena.
+        speed_mps: speed of every robot.
+        odometry_rate_hz: odometry readings per second.
+        odometry_latency_s: time from a reading of the odometry to its arrival at the recorder.
+        forward_noise_density: noise of the odometry's forward speed, in m/s/sqrt(Hz).
+        turn_noise_density: noise of the odometry's turn rate, in rad/s/sqrt(Hz).
+        forward_scale_error: the odometry reports this share too much of the forward speed.
+        turn_bias_radps: the odometry's turn rate is too large by so much.
+        prior_sigma_m: standard deviation of the position in the prior, per axis.
+        prior_sigma_rad: standard deviation of the heading in the prior.
+        robots_see_each_other: whether robots are targets of the sensors too, beside landmarks.
+        range_bearing: the sensor of ranges and bearings.
+        range: the sensor of ranges.
+        bearing: the sensor of bearings.
+        relative_bearing: the sensor of angles between pairs of targets.
+        fix: the receiver of positions.
+    """
+
+    duration_s: PositiveFloat = 60.0
+    robots: PositiveInt = 1
+    landmarks: Annotated[int, Field(ge=0)] = 12
+    arena_m: PositiveFloat = 12.0
+    speed_mps: PositiveFloat = 0.6
+    odometry_rate_hz: PositiveFloat = 20.0
+    odometry_latency_s: NonNegativeFloat = 0.0
+    forward_noise_density: NonNegativeFloat = 0.02
+    turn_noise_density: NonNegativeFloat = 0.01
+    forward_scale_error: Annotated[float, Field(gt=-1)] = 0.0
+    turn_bias_radps: float = 0.0
+    prior_sigma_m: PositiveFloat = 0.1
+    prior_sigma_rad: PositiveFloat = 0.05
+    robots_see_each_other: bool = False
+    range_bearing: Sensor = Sensor(rate_hz=5.0)
+    range: Sensor = Sensor()
+    bearing: Sensor = Sensor()
+    relative_bearing: Sensor = Sensor()
+    fix: Fixes = Fixes()

@@ -1,0 +1,160 @@
+"""Parameters of the scenario of a body that carries an inertial unit and a GNSS receiver."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, NonNegativeFloat, PositiveFloat
+
+from recorders.parameters import Parameters
+
+WayPoint = tuple[float, float, float]
+
+
+Span = tuple[float, float]
+
+
+class Unit(Parameters):
+    """The errors of an inertial unit; without settings those of a telephone's.
+
+    Attributes:
+        rate_hz: samples per second.
+        force_noise_density: white noise of the specific force, in m/s^2/sqrt(Hz).
+        gyro_noise_density: white noise of the turn rate, in rad/s/sqrt(Hz).
+        force_bias_density: random walk of the accelerometer's bias, in m/s^2/sqrt(s).
+        gyro_bias_density: random walk of the gyro's bias, in rad/s/sqrt(s).
+        force_bias_sigma_mps2: standard deviation of the accelerometer's bias at the start, per axis.
+        gyro_bias_sigma_radps: standard deviation of the gyro's bias at the start, per axis.
+        scale_sigma: standard deviation of the errors of scale, as a share.
+        misalignment_sigma_rad: standard deviation of the misalignments of the axes.
+        force_quantum_mps2: specific forces are rounded to multiples of this; 0 does not round.
+        gyro_quantum_radps: turn rates are rounded to multiples of this; 0 does not round.
+        delay_s: samples are stamped so late.
+    """
+
+    rate_hz: PositiveFloat = 100.0
+    force_noise_density: NonNegativeFloat = 0.002
+    gyro_noise_density: NonNegativeFloat = 2e-4
+    force_bias_density: NonNegativeFloat = 2e-4
+    gyro_bias_density: NonNegativeFloat = 5e-6
+    force_bias_sigma_mps2: PositiveFloat = 0.1
+    gyro_bias_sigma_radps: PositiveFloat = 0.003
+    scale_sigma: NonNegativeFloat = 0.0
+    misalignment_sigma_rad: NonNegativeFloat = 0.0
+    force_quantum_mps2: NonNegativeFloat = 0.0
+    gyro_quantum_radps: NonNegativeFloat = 0.0
+    delay_s: float = 0.0
+
+
+class Receiver(Parameters):
+    """A GNSS receiver and its weak times; spans are [begin, end] in s since the run's epoch.
+
+    Attributes:
+        rate_hz: positions per second.
+        velocity_rate_hz: velocities per second; 0 leaves them out.
+        sigma_m: standard deviation of a position, per horizontal axis.
+        sigma_up_m: standard deviation of a height.
+        sigma_mps: standard deviation of a velocity, per horizontal axis.
+        sigma_up_mps: standard deviation of a vertical velocity.
+        lever_m: position of the antenna in the body (forward, left, up).
+        delay_s: positions are stamped so late.
+        velocity_delay_s: velocities are stamped so late.
+        outages_s: spans in which it is silent.
+        floats_s: spans in which it has float solutions.
+        float_factor: errors of float solutions are so many times larger, as their covariance states.
+        multipath_s: spans in which positions are off by `multipath_m`, which their covariance does not
+            state.
+        multipath_m: by how much positions are off then (east, north, up).
+    """
+
+    rate_hz: PositiveFloat = 5.0
+    velocity_rate_hz: NonNegativeFloat = 5.0
+    sigma_m: PositiveFloat = 0.5
+    sigma_up_m: PositiveFloat = 1.0
+    sigma_mps: PositiveFloat = 0.05
+    sigma_up_mps: PositiveFloat = 0.1
+    lever_m: WayPoint = (0.0, 0.0, 0.0)
+    delay_s: float = 0.0
+    velocity_delay_s: float = 0.0
+    outages_s: list[Span] = []
+    floats_s: list[Span] = []
+    float_factor: PositiveFloat = 10.0
+    multipath_s: list[Span] = []
+    multipath_m: WayPoint = (3.0, -2.0, 5.0)
+
+
+class Carried(Parameters):
+    """Further sensors on board.
+
+    Attributes:
+        wheel_rate_hz: forward speeds of the wheels per second; 0 leaves them out.
+        wheel_sigma_mps: standard deviation of a forward speed.
+        wheel_scale_sigma: standard deviation of the wheels' error of scale, as a share.
+        axle_m: where wheels measure the speed, in the body (forward, left, up).
+        compass_rate_hz: orientations of the compass per second; 0 leaves it out.
+        compass_sigma_rad: standard deviation of the compass's heading.
+        barometer_rate_hz: heights of the barometer per second; 0 leaves it out.
+        barometer_sigma_m: standard deviation of a height.
+    """
+
+    wheel_rate_hz: NonNegativeFloat = 0.0
+    wheel_sigma_mps: PositiveFloat = 0.05
+    wheel_scale_sigma: NonNegativeFloat = 0.0
+    axle_m: WayPoint = (0.0, 0.0, 0.0)
+    compass_rate_hz: NonNegativeFloat = 0.0
+    compass_sigma_rad: PositiveFloat = 0.05
+    barometer_rate_hz: NonNegativeFloat = 0.0
+    barometer_sigma_m: PositiveFloat = 0.5
+
+
+class Prior(Parameters):
+    """The prior of the log; the standard deviations of the biases are the unit's.
+
+    Attributes:
+        is_told: whether the log has a prior.
+        sigma_m: standard deviation of the position at the start, per axis.
+        sigma_mps: standard deviation of the velocity at the start, per axis.
+        tilt_sigma_rad: standard deviation of roll and pitch at the start.
+        heading_sigma_rad: standard deviation of the heading at the start.
+    """
+
+    is_told: bool = True
+    sigma_m: PositiveFloat = 0.5
+    sigma_mps: PositiveFloat = 0.2
+    tilt_sigma_rad: PositiveFloat = 0.02
+    heading_sigma_rad: PositiveFloat = 0.05
+
+
+class NavigationParameters(Parameters):
+    """What moves, where, and its sensors.
+
+    A person sways, bobs with each step and turns to both sides of the path; a quadrotor leans into its
+    acceleration and may look in any direction.
+
+    Attributes:
+        carrier: what moves.
+        duration_s: length of the run.
+        rest_s: the body rests for so long first.
+        leg_s: time between way points that are drawn at random.
+        speed_mps: speed along the path.
+        way_points_m: the path (east, north, up); without any it is drawn at random.
+        origin_latitude_deg: latitude of the local plane's origin.
+        origin_longitude_deg: longitude of the local plane's origin.
+        origin_altitude_m: height of the plane's origin above the WGS 84 ellipsoid.
+        unit: errors of the inertial unit.
+        gnss: the GNSS receiver.
+        carried: further sensors on board.
+        prior: what the log states of the start.
+    """
+
+    carrier: Literal["vehicle", "pedestrian", "quadrotor"] = "vehicle"
+    duration_s: Annotated[float, Field(gt=10.0)] = 120.0
+    rest_s: PositiveFloat = 5.0
+    leg_s: PositiveFloat = 6.0
+    speed_mps: PositiveFloat = 10.0
+    way_points_m: list[WayPoint] = []
+    origin_latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 48.0
+    origin_longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 11.0
+    origin_altitude_m: float = 500.0
+    unit: Unit = Unit()
+    gnss: Receiver = Receiver()
+    carried: Carried = Carried()
+    prior: Prior = Prior()
