@@ -125,6 +125,17 @@ def is_of_topic(key: str) -> bool:
     return key.startswith("/")
 
 
+def bare(name: str) -> str:
+    """The name of a field or component without its unit: `x` of `x_m`."""
+    return name.rpartition("_")[0] if unit_of(name) else name
+
+
+def entry_of(field_: str, place: int) -> str:
+    """What an entry of a vector is called: `position_x_m` of `position_m`."""
+    stem, _, unit = field_.rpartition("_")
+    return f"{stem}_{AXES[place]}_{unit}"
+
+
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
     """What settings of topics do to a run, by topic; several of one topic in their order.
 
@@ -227,12 +238,10 @@ def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
             continue
         fields[each.name] = each.name, None
         if each.kind == "vector" and not each.name.startswith("covariance"):
-            stem, _, unit = each.name.rpartition("_")
-            fields |= {f"{stem}_{axis}_{unit}": (each.name, place) for place, axis in enumerate(AXES)}
-    bare = {each: each.rpartition("_")[0] if unit_of(each) else each for each in fields}
+            fields |= {entry_of(each.name, place): (each.name, place) for place in range(len(AXES))}
     for fits in (
         [each for each in fields if each == name],
-        [each for each in fields if bare[each] == name],
+        [each for each in fields if bare(each) == name],
         [each for each in fields if each.startswith(f"{name}_") and fields[each][1] is None],
         [each for each in fields if each.startswith(f"{name}_")],
     ):

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.altering.sources import setting_of, split_settings
+from pipeline.altering.sources import alterations_of, setting_of, split_settings
 from pipeline.api.api import ResultFolder
 from pipeline.api.replays import Kind as EstimatorKind
 from pipeline.api.replays import Log, Replay, replay, settings_of, sources_of
+from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
 from pipeline.diagnosing.findings import (
     Finding,
@@ -39,7 +40,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.log.streams import concatenate
 from recorders.parameters import merge
-from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.evaluation import split_topic
@@ -56,7 +57,8 @@ PROFILE_BINS = 60
 class Sentence(NamedTuple):
     """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
 
-    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so.
+    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
+    and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.
     """
 
     kind: Kind
@@ -64,6 +66,7 @@ class Sentence(NamedTuple):
     words: str
     time_ns: int | None = None
     cause: Cause | None = None
+    setting: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,7 +103,7 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """A row per sentence: its kind, topic and component, number with its 95 % interval, and gain."""
+        """A row per sentence: its kind, topic and component, number with its interval, gain, setting."""
         rows = []
         for each in self.sentences:
             cause = each.cause
@@ -113,6 +116,7 @@ class Diagnosis:
                     "low": cause.ends[0] if cause else np.nan,
                     "high": cause.ends[1] if cause else np.nan,
                     "gain": cause.gain if cause else np.nan,
+                    "setting": each.setting,
                     "sentence": each.words,
                 }
             )
@@ -274,7 +278,7 @@ def diagnose(
         part, note = _first_part(source, bound, streamed)
         notes += note
         base = Trial(part, opened)
-        alternatives = hypotheses(label, bound, base, likelihood.begin(base))
+        alternatives = hypotheses(bound, base, likelihood.begin(base))
         causes = find_causes(likelihood, base, alternatives, MOST_SENTENCES)
         tried, least = len(alternatives), least_gain(len(alternatives))
     else:
@@ -282,7 +286,8 @@ def diagnose(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
         )
-    sentences = [_sentence(each) for each in causes]
+    trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
+    sentences = [_sentence(each, trying) for each in causes]
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
@@ -355,9 +360,11 @@ def _first_part(
     return MemorySource(streams, run, source.name), notes
 
 
-def _sentence(cause: Cause) -> Sentence:
+def _sentence(cause: Cause, trying: Trying) -> Sentence:
     of = cause.hypothesis
-    return Sentence(of.kind, of.topic, f"{cause.words}; try {of.mend(cause.value)}", None, cause)
+    advice = trying.over(of.mend(cause.value))
+    words = f"{cause.words}; try {trying.words(advice)}"
+    return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
 
 
 def _of_errors(done: Replay, label: str) -> list[Finding]:
