@@ -17,16 +17,18 @@ from replay.engine.streams.geodetic import ORIGIN
 from replay.engine.streams.sources import LogSource, MemorySource
 
 AXES = "xyz"
-WHATS = (
-    "delay_s",
-    "clock_gain",
-    "FIELD_scale",
-    "FIELD_bias",
-    "FIELD_turn",
-    "heading_bias",
-    "origin",
-    "exchanged",
-)
+# Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
+WHATS = {
+    "delay_s": "The stamps are so late, and are taken back by it.",
+    "clock_gain": "The clock of the stamps gains so many s a second from the run's begin on.",
+    "FIELD_scale": "The field is multiplied by it; covariance_scale is a factor of variances.",
+    "FIELD_bias": "The field is too large by it, and is reduced by it.",
+    "FIELD_turn": "The vector is turned about the vertical by this angle (rad), and is turned back.",
+    "heading_bias": "The heading of a Gaussian estimate, such as a prior, is too large by it (rad).",
+    "origin": "Of geodetic fixes the origin of the plane: latitude and longitude in deg, altitude in m. "
+    "Of positions where their zero lies in the plane, in m: it is added.",
+    "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",
+}
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
 
 
@@ -139,21 +141,9 @@ def entry_of(field_: str, place: int) -> str:
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
     """What settings of topics do to a run, by topic; several of one topic in their order.
 
-    Each undoes a fault, and takes its number as a diagnosis names it:
-
-    - `delay_s`: the stamps are so late, and are taken back by it.
-    - `clock_gain`: the clock of the stamps gains so many s a second from the run's begin on.
-    - `FIELD_scale`: the field is multiplied by it; `covariance_scale` is a factor of variances.
-    - `FIELD_bias`: the field is too large by it, and is reduced by it.
-    - `FIELD_turn`: the vector is turned about the vertical by this angle, and is turned back.
-    - `heading_bias`: the same of the orientation of a Gaussian estimate, such as a prior.
-    - `origin`: of geodetic fixes the origin of the plane (latitude and longitude in deg, altitude in m);
-      of positions where their zero lies in the plane (m): it is added.
-    - `exchanged`: two numbers that stand for each other, or the topic that this one stands for.
-
-    A field is named in full, or without its unit, or by its beginning where that is clear; an entry of a
-    vector with its axis, as `position_x_bias`; one of a state by the name of its component. A number may
-    have a unit, as `300 ms` or `4.5 deg`.
+    What can be set is in `WHATS`. A field is named in full, or without its unit, or by its beginning
+    where that is clear; an entry of a vector with its axis, as `position_x_bias`; one of a state by its
+    component. A number may have a unit, as `300 ms` or `4.5 deg`.
 
     Raises BadInput where there is no such topic or field, or a value makes no sense.
     """
@@ -204,9 +194,8 @@ def _of_column(given: _Setting) -> Callable[[Stream], Stream]:
         angle = given.number("heading_rad", "an angle in rad, such as 0.1 or 5 deg")
         return partial(alter.heading_turned, angle=-angle)
     if not name or what not in ("scale", "bias", "turn"):
-        raise BadInput(
-            f"--set {given.key}: of a topic can be set {', '.join(WHATS)}; {choices(given.what, WHATS)}"
-        )
+        known = f"of a topic can be set {', '.join(WHATS)}"
+        raise BadInput(f"--set {given.key}: {known}; {choices(given.what, list(WHATS))}")
     full, (field_, entry) = _field(given, name)
     if what == "scale":
         factor = given.number("scale", "a factor, such as -1 or 3.6")
