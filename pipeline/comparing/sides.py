@@ -342,6 +342,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Side) -> S
             gap_limit_s=experiment.gap_limit_s,
             arrival_order=bool(experiment.arrival_order),
             late=experiment.late,
+            set=experiment.alterations,
         )
         runs = [_run_of_result(result, number) for number in range(now.start, now.stop)]
         pairs = dict(zip(runs, zip(done.logs, done.estimates, strict=True), strict=True))

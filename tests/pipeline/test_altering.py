@@ -137,8 +137,8 @@ def test_every_command_alters_alike_and_says_so(
     key = f"{SEEN}.range_bias"
     mend = ["-e", "ekf", "--set", f"{key}=.2"]
     told = fuselog("replay", log, *mend, "-o", estimates, "--json").json["metrics"]
-    notes = fl.open(estimates).run.notes  # type: ignore[union-attr]
-    assert json.loads(notes["alterations"]) == {key: ".2"}
+    stated = fl.open(estimates).run.notes["alterations"]  # type: ignore[union-attr]
+    assert json.loads(stated) == {key: 0.2}
     in_python = fl.replay(log, "ekf", set={key: 0.2})
     clean = fl.replay(run, "ekf").metrics.query("quantity == 'nis_per_component'")["value"].tolist()
     assert clean == pytest.approx([told["ekf.nis_per_component.robot1"]], rel=1e-9)
@@ -157,10 +157,17 @@ def test_every_command_alters_alike_and_says_so(
         assert fuselog(*command).code == 0
     for folder in ("ran", "tuned", "diagnosed", "judged"):
         stated = json.loads((tmp_path / folder / "result.json").read_text(encoding="utf-8"))
-        assert stated["settings"]["alterations"] == {key: ".2"}
+        assert stated["settings"]["alterations"] == {key: 0.2}
     ran = json.loads((tmp_path / "ran" / "result.json").read_text(encoding="utf-8"))["metrics"]
     assert ran["ekf.nis_per_component.robot1"] == told["ekf.nis_per_component.robot1"]
     assert "nothing found" in fuselog("diagnose", estimates).out
+    golden = tmp_path / "ran.golden.xz"
+    assert fuselog("check", tmp_path / "ran", "--against", golden, "--update").code == 0
+    notes = fuselog("compare", tmp_path / "ran", tmp_path / "ran", "--json").json["notes"]
+    assert not any("without other metrics" in note for note in notes)  # it was replayed as it ran
+    swept = ["--over", f"{key}=0,.2", "--out", tmp_path / "swept"]
+    at = fuselog("sweep", log, "-e", "ekf", *swept, "--json").json["metrics"]
+    assert at["ekf.nis_per_component.robot1"][1] == told["ekf.nis_per_component.robot1"]
 
 
 def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySource) -> None:
