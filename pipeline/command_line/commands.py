@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import alter, setting_of
+from pipeline.altering.sources import setting_of
+from pipeline.api.planning import plan_replay
 from pipeline.output.coverage import recounted, sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.output.results import (
@@ -30,9 +31,9 @@ from pipeline.output.terminal import (
     say,
     warn,
 )
-from pipeline.runs.ensemble import cut_in_parts, judge_logs, replay_parts
+from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import hash_files, log_of_estimates, source_of_estimates, stated_estimators
-from pipeline.runs.initial_states import check_same_run, order_of, origins_of, span_of
+from pipeline.runs.initial_states import check_same_run, span_of
 from pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
@@ -69,31 +70,31 @@ def replay_logs(
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
-    inputs = {
-        "log": logs,
-        "start": [Path(origin) for origin in origins],
-        "settings": [settings_file] if settings_file else [],
-    }
+    given = [settings_file] if settings_file else []
+    inputs = {"log": logs, "start": [Path(origin) for origin in origins], "settings": given}
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
     alterations, own = split_texts(settings)
     estimators = settings_of_estimators(names, own, settings_file, model=model, every_s=every_s)
-    order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
-    opened = [alter(LogSource(open_log(path, recover=recover)), alterations) for path in logs]
-    sources = [span_of(source, start_s, end_s, order) for source in opened]
-    starts = origins_of(sources, origins, sigmas_of(sigmas, "--start-sigma"), order, gap_limit_s)
-    estimates = list(zip(paths, logs, strict=True))
-    done = replay_parts(
-        cut_in_parts(sources, estimates, starts),
+    plan = plan_replay(
+        (LogSource(open_log(path, recover=recover)) for path in logs),
         estimators,
+        start_s=start_s,
+        end_s=end_s,
+        start_from=origins,
+        start_sigma=sigmas_of(sigmas, "--start-sigma"),
         gap_limit_s=gap_limit_s,
-        order=order,
-        late=policy,
+        arrival_order=arrival_order,
+        late=late,
+        set=alterations,
+    )
+    done = plan.replay(
+        list(zip(paths, logs, strict=True)),
         save=save,
         connect=connect,
         companions=companions_if(foxglove),
         progress=progress,
-    ).check()
-    _state_losses(source.log for source in sources)
+    )
+    _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)
     told = {
@@ -179,8 +180,7 @@ def evaluate_logs(
     places = logs or [log_of_estimates(each) for each in opened]
     if out is not None:
         check_folder(out, {"input": [*estimates, *places]})
-    pairs = zip(opened, places, strict=True)
-    sources = [source_of_estimates(each, path, recover=recover) for each, path in pairs]
+    sources = [source_of_estimates(*each, recover=recover) for each in zip(opened, places, strict=True)]
     for each, source in zip(opened, sources, strict=True):
         check_same_run(LogSource(each), source)
     wanted = find_metrics(metrics)
@@ -208,7 +208,7 @@ def evaluate_logs(
                 gap_limit_s=gap_limit_s,
                 on_errors=kept.add if kept else None,
             )
-        if not judge.tells:
+        if not judge.has_numbers:
             raise BadInput(
                 f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
                 "give its log with --log"
@@ -303,7 +303,7 @@ def _print_outcome(
 ) -> None:
     values = in_order(plain({**judge.metrics, **(more or {})}), estimators)
     failures = judge.failures
-    for sentence in [*judge.unjudged, *failures[:5]]:
+    for sentence in [*judge.components_without_truth, *failures[:5]]:
         warn(sentence)
     if len(failures) > 5:
         warn(f"{len(failures)} failures in all")
@@ -312,7 +312,7 @@ def _print_outcome(
             "metrics": values,
             "bounds": judge.bounds,
             "failures": failures,
-            "losses": [*judge.losses, *unused],
+            "losses": [*judge.notes_of_coverage, *unused],
             "written": [str(path) for path in written],
         }
         print_json(outcome | dict(told or {}))
@@ -325,7 +325,7 @@ def _print_outcome(
             "show that a filter is consistent, only that it is not far from it; nis_per_component says "
             "more"
         )
-    for sentence in [*judge.losses, *unused]:
+    for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
     if told and "seconds" in told:
         print_table(("estimator", "time (s)"), list(told["seconds"].items()))
@@ -394,6 +394,6 @@ def _draw_log(
         judge = judge_logs(
             judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
         )
-    for sentence in judge.unjudged:
+    for sentence in judge.components_without_truth:
         warn(sentence)
     _state_losses([log, source.log])

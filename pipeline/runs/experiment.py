@@ -13,9 +13,10 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, mode
 from pipeline.altering.changes import is_of_topic
 from pipeline.output.claims import StatedClaim, decide, require_names
 from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
-from pipeline.runs.checkpoints import Kept, kept_cells
+from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import Crew
+from pipeline.runs.executors import PoolFactory
+from pipeline.runs.inputs import Import, Logs, Record
 from pipeline.runs.settings import parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
@@ -27,41 +28,6 @@ from replay.engine.replaying.late import parse_late
 from replay.judging.metrics.measuring import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
-
-
-class Record(Parameters):
-    """What to simulate.
-
-    Attributes:
-        scenario: a scenario by name or TOML file.
-        parameters: what differs from its defaults, by name.
-    """
-
-    scenario: str
-    parameters: dict[str, Any] = {}
-
-
-class Import(Parameters):
-    """What to import; the data's place comes from --data.
-
-    Attributes:
-        source: name of the importer.
-        parameters: what differs from its defaults, by name.
-    """
-
-    source: str
-    parameters: dict[str, Any] = {}
-
-
-class Logs(Parameters):
-    """Logs to replay, one run each.
-
-    Attributes:
-        files: files or patterns such as `drive-*.mcap`, from the folder of the experiment's file on;
-            estimates that lie beside the logs are left out.
-    """
-
-    files: list[str] = []
 
 
 class Experiment(Parameters):
@@ -131,17 +97,10 @@ class Experiment(Parameters):
     def _has_an_order(self) -> Self:
         if self.late is not None:
             parse_late(self.late, arrival_order=bool(self.arrival_order))
-        if self.arrival_order and self.study != "localization":
+        if (self.arrival_order or self.alterations) and self.study != "localization":
             raise ValueError(
-                f"study {self.study} replays in the order of the stamps; leave out arrival_order and "
-                "late"
+                f"study {self.study} replays by the stamps; leave out arrival_order, late and alterations"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _alters_what_it_replays(self) -> Self:
-        if self.alterations and self.study != "localization":
-            raise ValueError(f"study {self.study} alters no topics; leave out {min(self.alterations)}")
         return self
 
     @property
@@ -176,8 +135,8 @@ class Setting:
         errors: whether every single error is kept too.
         options: of the study's own type.
         progress: is told how it goes.
-        crew: who works off the cells of a campaign; by default this process.
-        kept: where finished cells are kept until all are.
+        open_pool: who works off the cells of a campaign; by default this process.
+        checkpoints: where finished cells are kept until all are.
     """
 
     folder: Path
@@ -188,8 +147,8 @@ class Setting:
     errors: bool = False
     options: Any = None
     progress: Progress = no_progress
-    crew: Crew | None = None
-    kept: Kept | None = None
+    open_pool: PoolFactory | None = None
+    checkpoints: Checkpoints | None = None
 
 
 @dataclass(frozen=True)
@@ -387,7 +346,7 @@ def run_experiment(
     data: Path | None = None,
     logs: int = 20,
     errors: bool = False,
-    crew: Crew | None = None,
+    open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
@@ -410,7 +369,7 @@ def run_experiment(
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
     with (
-        kept_cells(folder) as kept,
+        checkpoints_of(folder) as checkpoints,
         result_folder(folder) as part,
         foreign_code(f"study {experiment.study}"),
         warnings.catch_warnings(),
@@ -425,8 +384,8 @@ def run_experiment(
             errors=errors,
             options=options,
             progress=progress,
-            crew=crew,
-            kept=kept,
+            open_pool=open_pool,
+            checkpoints=checkpoints,
         )
         outcome = study.run(experiment, setting)
         metrics = plain(outcome.metrics)

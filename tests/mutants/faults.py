@@ -86,7 +86,7 @@ FAULTS = [
     ),
     Fault(
         "recorders/simulators/landmarks.py",
-        "prior = truth[0] + rngs[1].normal(size=3) * sigma",
+        'prior = truth[0] + rng_of("prior").normal(size=3) * sigma',
         "prior = truth[0] + np.random.default_rng(0).normal(size=3) * sigma",
         LANDMARKS,
     ),

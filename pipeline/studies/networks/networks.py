@@ -52,7 +52,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     runner = Runner(experiment, setting)
     replayed = runner.run()
     settled = replace(replayed, errors=[_after(each, options.settle_s) for each in replayed.errors])
-    judge = Judge(replayed.sources, gap_limit_s=experiment.gap_limit_s, settle_s=options.settle_s)
+    judge = Judge(replayed.sources, gap_limit_s=experiment.gap_limit_s, burn_in_s=options.settle_s)
     judge.add(replayed.outputs)
     outcome = summarise(judge)
     outcome.metrics |= _loads(experiment, replayed.sources)

@@ -18,7 +18,8 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.inputs import Record
 from pipeline.runs.recorded import judge, replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import mean_interval, rmse_of_runs

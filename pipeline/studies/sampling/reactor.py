@@ -11,7 +11,8 @@ import pandas as pd
 from pipeline.output.charts import Chart
 from pipeline.output.results import MetricValue, Outcome
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.inputs import Record
 from pipeline.studies.sampling.linearization import (
     REFERENCE,
     Ensemble,

@@ -13,7 +13,8 @@ import pandas as pd
 from pipeline.output.charts import Axis, Chart, Panel, curve, path
 from pipeline.output.results import MetricValue, Outcome
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.inputs import Record
 from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from replay.judging.errors.evaluation import split_topic
