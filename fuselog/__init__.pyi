@@ -6,13 +6,13 @@ from pipeline.api.api import experiments as experiments
 from pipeline.api.api import import_ as import_
 from pipeline.api.api import metrics as metrics
 from pipeline.api.api import models as models
-from pipeline.api.api import open as open  # noqa: A004
 from pipeline.api.api import record as record
 from pipeline.api.api import run as run
 from pipeline.api.api import scenarios as scenarios
 from pipeline.api.api import sweep as sweep
 from pipeline.api.api import write as write
 from pipeline.api.observability import observability as observability
+from pipeline.api.planning import open as open  # noqa: A004
 from pipeline.api.precompiling import Precompiled as Precompiled
 from pipeline.api.precompiling import precompile as precompile
 from pipeline.api.replays import Replay as Replay

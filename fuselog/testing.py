@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.api.replays import Kind, settings_of
+from pipeline.api.planning import Kind, settings_of
 from pipeline.checking.checking import Checked, check, compared, runs_of
 from pipeline.checking.golden import Replayed, make
 from pipeline.checking.stored import Golden, read, write

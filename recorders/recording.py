@@ -35,6 +35,25 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
     return SIMULATION_EPOCH_NS + elapsed_ns.astype(np.int64)
 
 
+def named_generator(
+    rng: np.random.Generator, name: str, numbers: Mapping[str, int] | None = None
+) -> np.random.Generator:
+    """A generator of its own for what has this name: one more name changes no other's numbers.
+
+    Args:
+        rng: of the run, or of a part of it; it is not drawn from.
+        name: such as a sensor's, of two letters at least; the same name gives the same numbers again.
+        numbers: of names that drew from `rng.spawn(...)` before they had a generator by name.
+    """
+    seed = rng.bit_generator.seed_seq
+    assert isinstance(seed, np.random.SeedSequence)
+    key = [numbers[name]] if numbers and name in numbers else name.encode()
+    child = np.random.SeedSequence(
+        seed.entropy, spawn_key=(*seed.spawn_key, *key), pool_size=seed.pool_size
+    )
+    return np.random.Generator(type(rng.bit_generator)(child))
+
+
 @dataclass(frozen=True)
 class Recording:
     """Streams in memory, before they are a log: one for every topic.

@@ -4,7 +4,6 @@ Everything raises BadInput as the commands do, with the same sentences. docs/pyt
 it; `pipeline.api.replays` has the replay.
 """
 
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from pipeline.api.catalog import Entry
 from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
 from pipeline.output.summary import summary_table
-from pipeline.runs.executors import crew_of, of_executor
+from pipeline.runs.executors import pool_for, pool_of
 from pipeline.runs.experiment import (
     load_experiment,
     load_scenario,
@@ -30,32 +29,10 @@ from pipeline.runs.experiment import (
 )
 from pipeline.runs.sweeps import nested, over_of, points_of, run_sweep
 from recorders.errors import BadInput, UnknownName, choices
-from recorders.log import Stream, open_log, write_log
+from recorders.log import Stream, write_log
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run
-from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-
-
-def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
-    """Open a log: a mapping of its topics to their streams, each read when it is asked for.
-
-    Args:
-        path: an MCAP file.
-        recover: read what is whole of a log that was cut off or damaged; a warning says what is missing.
-
-    Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
-
-    >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
-    >>> log = open("run.mcap")
-    >>> log.run.scenario, len(log)
-    ('landmarks', 5)
-    >>> log["/robot1/odometry"]["forward_mps"].shape
-    (40,)
-    """
-    log = open_log(path, recover=recover)
-    if log.loss_statement:
-        warnings.warn(log.loss_statement, stacklevel=2)
-    return LogSource(log)
+from replay.engine.streams.sources import MemorySource, memory_source
 
 
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
@@ -167,9 +144,10 @@ def run(
     place = None if data is None else Path(data)
     files = [Path(experiment)] if str(experiment).endswith(".toml") else []
     check_folder(folder, {"input": files if place is None else [*files, place]})
-    crew = crew_of(workers, scheduler, found.runs) if executor is None else of_executor(executor)
+    open_pool = pool_for(workers, scheduler, found.runs) if executor is None else pool_of(executor)
     return ResultFolder(
-        folder, run_experiment(name, found, folder, data=place, logs=logs, errors=errors, crew=crew)
+        folder,
+        run_experiment(name, found, folder, data=place, logs=logs, errors=errors, open_pool=open_pool),
     )
 
 
@@ -209,8 +187,10 @@ def sweep(
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": [Path(experiment)] if str(experiment).endswith(".toml") else []})
     runs_in_all = sum(each.runs for each in found)
-    crew = crew_of(workers, scheduler, runs_in_all) if executor is None else of_executor(executor)
-    return ResultFolder(folder, run_sweep(stated.name, overs, points, found, folder, crew=crew))
+    open_pool = pool_for(workers, scheduler, runs_in_all) if executor is None else pool_of(executor)
+    return ResultFolder(
+        folder, run_sweep(stated.name, overs, points, found, folder, open_pool=open_pool)
+    )
 
 
 class Catalog(Mapping[str, Entry]):

@@ -6,7 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.api.replays import Log, sources_of
+from pipeline.api.planning import Log, sources_of
 from pipeline.output.terminal import print_json, print_table
 from pipeline.runs.initial_states import span_of
 from pipeline.runs.settings import sigmas_of

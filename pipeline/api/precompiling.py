@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from pipeline.api.replays import replay
 from pipeline.output.terminal import print_json, print_table, say
-from pipeline.runs.executors import here, processes
+from pipeline.runs.executors import inline_pool, processes
 from pipeline.runs.experiment import load_scenario, shipped
 from recorders.errors import BadInput, choices
 from recorders.recording import Importer, Recorder, record_run
@@ -77,10 +77,10 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
     for model, method in pairs:
         modelled(load("models", model, Model), method)
     _check_cache()
-    crew = here if (workers or core_count()) == 1 else processes(workers or core_count())
-    with crew() as team:
+    open_pool = inline_pool if (workers or core_count()) == 1 else processes(workers or core_count())
+    with open_pool() as pool:
         names = sorted({model for model, _ in pairs})
-        fitting = _all(team.executor, _fits, [(name, names) for name in _scenarios()])
+        fitting = _all(pool.executor, _fits, [(name, names) for name in _scenarios()])
         scenarios: dict[tuple[str, Any], str] = {}
         for scenario, fits in fitting:
             for model, sensors in fits.items():
@@ -91,7 +91,7 @@ def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> li
             for (own, _), scenario in scenarios.items()
             if own == model
         ]
-        made = _all(team.executor, _replayed, asked)
+        made = _all(pool.executor, _replayed, asked)
     served = {model for model, _ in scenarios}
     why = "no scenario has a log for it: its first replay compiles"
     return [*made, *(Precompiled(*pair, "", 0.0, why) for pair in pairs if pair[0] not in served)]

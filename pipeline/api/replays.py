@@ -12,39 +12,35 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from pipeline.api import api
 from pipeline.api.api import ResultFolder
+from pipeline.api.planning import Kind as Kind
+from pipeline.api.planning import Log as Log
+from pipeline.api.planning import plan_replay
+from pipeline.api.planning import settings_of as settings_of
+from pipeline.api.planning import sources_of as sources_of
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import in_order, result_folder, write_outcome
 from pipeline.output.summary import error_charts, summarise, summary_table
-from pipeline.runs.ensemble import Pass, Settings, cut_in_parts, judge_logs, replay_parts
+from pipeline.runs.ensemble import Pass, Settings, judge_logs
 from pipeline.runs.estimates import add_to_hash
-from pipeline.runs.initial_states import order_of, origins_of, span_of
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.log import RunMetadata, open_log, schemas
-from recorders.recording import Recording
-from replay.engine.replaying.estimator import Estimator
+from recorders.log import open_log, schemas
 from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import LogSource, MemorySource, memory_source
-from replay.inference.model.model import Model
+from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.evaluation import Errors, innovations_of
 from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import find_metrics
 from replay.judging.tables import error_table, joined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-Log = str | Path | LogSource | MemorySource | Recording
-Kind = str | Estimator[Any] | Mapping[str, Any]
 
 
 def replay(
@@ -85,30 +81,26 @@ def replay(
     >>> sorted(done.metrics["estimator"].unique())
     ['ekf', 'sure']
     """
-    for name, value in (("start_s", start_s), ("end_s", end_s), ("gap_limit_s", gap_limit_s)):
-        if value is not None and not (abs(value) <= 1e9 and (value >= 0 or name != "gap_limit_s")):
-            raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
-    from_ = [start_from] if isinstance(start_from, str | Path) else start_from
-    order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
-    settings = settings_of(estimators)
-    wanted = [metrics] if isinstance(metrics, str) else list(metrics)
-    find_metrics(wanted)
-    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
-    origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
+    plan = plan_replay(
+        logs,
+        estimators,
+        start_s=start_s,
+        end_s=end_s,
+        start_from=start_from,
+        start_sigma=start_sigma,
+        gap_limit_s=gap_limit_s,
+        arrival_order=arrival_order,
+        late=late,
+        metrics=metrics,
+    )
+    sources = plan.sources
     with ExitStack() as stack:
         folder = stack.enter_context(scratch_folder("fuselog-replay"))
         names = [f"run-{number:04d}.mcap" for number in range(len(sources))]
         places = [(folder / name, folder / "logs" / name) for name in names]
-        done = replay_parts(
-            cut_in_parts(sources, places, origins),
-            settings,
-            gap_limit_s=gap_limit_s,
-            metrics=wanted,
-            order=order,
-            late=policy,
-        ).check()
+        done = plan.replay(places)
         estimates = [LogSource(open_log(path)) for path, _ in places]
-        made = Replay(sources, estimates, settings, done, gap_limit_s, arrival_order, late)
+        made = Replay(sources, estimates, plan.estimators, done, gap_limit_s, arrival_order, late)
         weakref.finalize(made, stack.pop_all().close)
     return made
 
@@ -141,7 +133,7 @@ class Replay:
 
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.unjudged]
+        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.components_without_truth]
         return "\n".join(
             [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
         )
@@ -202,7 +194,7 @@ class Replay:
     @property
     def losses(self) -> list[str]:
         """A sentence for what was not estimated throughout, and for measurements that were not used."""
-        return [*self.judge.losses, *sentences(self.done.coverage)]
+        return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
 
     @property
     def coverage(self) -> pd.DataFrame:
@@ -291,56 +283,3 @@ class Replay:
                 with log.log.path.open("rb") as file:
                     digest.update(hashlib.file_digest(file, "sha256").digest())
         return digest.hexdigest()
-
-
-def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
-    """One log or several as sources; raises BadInput where there is none, or one is no log."""
-    found = [logs] if isinstance(logs, Log) else list(logs)
-    if not found:
-        raise BadInput("there are no logs to replay; give at least one")
-    return [_source(log) for log in found]
-
-
-def _source(log: Log) -> LogSource | MemorySource:
-    if isinstance(log, LogSource | MemorySource):
-        return log
-    if isinstance(log, Recording):
-        return memory_source(log, RunMetadata("recording", epoch_ns=log.epoch_ns, notes=dict(log.notes)))
-    if isinstance(log, str | Path):
-        return api.open(log)
-    raise BadInput(f"a log to replay is {type(log).__name__}; give a path, a log or a recording")
-
-
-def settings_of(
-    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
-) -> dict[str, dict[str, Any]]:
-    """The settings of each estimator by its label; raises BadInput where they are none."""
-    listed = [estimators] if isinstance(estimators, str | Mapping) else list(estimators)
-    chosen: dict[str, dict[str, Any]] = {}
-    for each in listed:
-        if not isinstance(each, str | Mapping):
-            raise BadInput(
-                f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
-            )
-        if isinstance(each, Mapping) and "kind" in each:
-            raise BadInput(
-                f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
-                '{"mine": {...}}'
-            )
-        for label, what in ({each: {}} if isinstance(each, str) else each).items():
-            if label in chosen:
-                raise BadInput(f"estimator {label} is given twice; give the second another label")
-            chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}
-            kind = chosen[label].get("kind", "")
-            if isinstance(kind, Model):
-                raise BadInput(
-                    f'estimator {label} is a model without a method; give modelled(model, "ekf")'
-                )
-            if not isinstance(kind, str | Estimator):
-                raise BadInput(
-                    f"estimator {label} is {type(kind).__name__}; make an estimator of it with "
-                    "recursive, batch or modelled"
-                )
-    if not chosen:
-        raise BadInput("there are no estimators to replay; give at least one")
-    return chosen

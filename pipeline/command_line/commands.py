@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.api.planning import plan_replay
 from pipeline.output.coverage import recounted, sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
 from pipeline.output.results import (
@@ -29,9 +30,9 @@ from pipeline.output.terminal import (
     say,
     warn,
 )
-from pipeline.runs.ensemble import cut_in_parts, judge_logs, replay_parts
+from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import hash_files, log_of_estimates, stated_estimators
-from pipeline.runs.initial_states import check_same_run, order_of, origins_of, span_of
+from pipeline.runs.initial_states import check_same_run, span_of
 from pipeline.runs.settings import settings_of_estimators, sigmas_of
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
@@ -75,23 +76,25 @@ def replay_logs(
     }
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
     estimators = settings_of_estimators(names, settings, settings_file, model=model, every_s=every_s)
-    order, policy = order_of(arrival_order=arrival_order, late=late, origins=origins)
-    opened = [LogSource(open_log(path, recover=recover)) for path in logs]
-    sources = [span_of(source, start_s, end_s, order) for source in opened]
-    starts = origins_of(sources, origins, sigmas_of(sigmas, "--start-sigma"), order, gap_limit_s)
-    estimates = list(zip(paths, logs, strict=True))
-    done = replay_parts(
-        cut_in_parts(sources, estimates, starts),
+    plan = plan_replay(
+        (LogSource(open_log(path, recover=recover)) for path in logs),
         estimators,
+        start_s=start_s,
+        end_s=end_s,
+        start_from=origins,
+        start_sigma=sigmas_of(sigmas, "--start-sigma"),
         gap_limit_s=gap_limit_s,
-        order=order,
-        late=policy,
+        arrival_order=arrival_order,
+        late=late,
+    )
+    done = plan.replay(
+        list(zip(paths, logs, strict=True)),
         save=save,
         connect=connect,
         companions=companions_if(foxglove),
         progress=progress,
-    ).check()
-    _state_losses(source.log for source in sources)
+    )
+    _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)
     told = {
@@ -205,7 +208,7 @@ def evaluate_logs(
                 gap_limit_s=gap_limit_s,
                 on_errors=kept.add if kept else None,
             )
-        if not judge.tells:
+        if not judge.has_numbers:
             raise BadInput(
                 f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
                 "give its log with --log"
@@ -299,7 +302,7 @@ def _print_outcome(
 ) -> None:
     values = in_order(plain({**judge.metrics, **(more or {})}), estimators)
     failures = judge.failures
-    for sentence in [*judge.unjudged, *failures[:5]]:
+    for sentence in [*judge.components_without_truth, *failures[:5]]:
         warn(sentence)
     if len(failures) > 5:
         warn(f"{len(failures)} failures in all")
@@ -308,7 +311,7 @@ def _print_outcome(
             "metrics": values,
             "bounds": judge.bounds,
             "failures": failures,
-            "losses": [*judge.losses, *unused],
+            "losses": [*judge.notes_of_coverage, *unused],
             "written": [str(path) for path in written],
         }
         print_json(outcome | dict(told or {}))
@@ -321,7 +324,7 @@ def _print_outcome(
             "show that a filter is consistent, only that it is not far from it; nis_per_component says "
             "more"
         )
-    for sentence in [*judge.losses, *unused]:
+    for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
     if told and "seconds" in told:
         print_table(("estimator", "time (s)"), list(told["seconds"].items()))
@@ -390,6 +393,6 @@ def _draw_log(
         judge = judge_logs(
             judged if is_estimates else [], [source], {}, gap_limit_s=gap_limit_s, drawing=drawing
         )
-    for sentence in judge.unjudged:
+    for sentence in judge.components_without_truth:
         warn(sentence)
     _state_losses([log, source.log])

@@ -15,7 +15,7 @@ from pipeline.output.terminal import (
     progress,
     say,
 )
-from pipeline.runs.executors import crew_of
+from pipeline.runs.executors import pool_for
 from pipeline.runs.experiment import (
     Experiment,
     Stated,
@@ -56,9 +56,16 @@ def run_named(
     folder = out or Path("out") / label
     inputs = _files_of(named, experiment, settings_file)
     check_folder(folder, {"input": inputs if data is None else [*inputs, data]})
-    crew = crew_of(workers, scheduler, len(experiment.files) or experiment.runs)
+    open_pool = pool_for(workers, scheduler, len(experiment.files) or experiment.runs)
     result = run_experiment(
-        label, experiment, folder, data=data, logs=logs, errors=errors, crew=crew, progress=progress
+        label,
+        experiment,
+        folder,
+        data=data,
+        logs=logs,
+        errors=errors,
+        open_pool=open_pool,
+        progress=progress,
     )
     if as_json:
         print_json(result.model_dump(mode="json"))
@@ -119,8 +126,8 @@ def sweep_named(
     at = [stated.with_settings(merge(values, nested(point)), over) for point in points]
     folder = out or Path("out") / f"{stated.name}-sweep"
     check_folder(folder, {"input": _files_of(named, experiment, settings_file)})
-    crew = crew_of(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
-    result = run_sweep(stated.name, overs, points, at, folder, crew=crew, progress=progress)
+    open_pool = pool_for(workers, scheduler, len(points) * (len(experiment.files) or experiment.runs))
+    result = run_sweep(stated.name, overs, points, at, folder, open_pool=open_pool, progress=progress)
     if as_json:
         print_json(result.model_dump(mode="json"))
         return

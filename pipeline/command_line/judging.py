@@ -154,9 +154,9 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
     first, metric by metric over the runs that both have, with intervals of 95 % by the bootstrap over
     runs.
     """
-    from pipeline.comparing.command import compare_sides
+    from pipeline.comparing.command import compare_candidates
 
-    compare_sides(list(sides), list(labels), **options)
+    compare_candidates(list(sides), list(labels), **options)
 
 
 @command(

@@ -24,8 +24,8 @@ COLUMNS = {
 }
 
 
-def compare_sides(
-    sides: Sequence[Path],
+def compare_candidates(
+    candidates: Sequence[Path],
     labels: Sequence[str],
     *,
     truth: Path | None,
@@ -40,10 +40,10 @@ def compare_sides(
     settings: Sequence[str],
 ) -> None:
     """Compare, print a table for each pair and case and the verdicts, write folder and timeline."""
-    check_outputs(out, save, {"input": [*sides, *filter(None, [truth, settings_file])]})
+    check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
     chosen = settings_of_estimators(labels, settings, settings_file)
     found = compare(
-        *sides,
+        *candidates,
         estimators=[{label: values} for label, values in chosen.items()],
         truth=truth,
         case=case,

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from pipeline.api.api import ResultFolder
-from pipeline.api.replays import Kind
-from pipeline.comparing.groups import comparable_groups, runs_of, sides_of, unlike_runs
-from pipeline.comparing.sides import Side
+from pipeline.api.planning import Kind
+from pipeline.comparing.candidates import Candidate
+from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, unlike_runs
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -27,10 +27,10 @@ from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.differences import (
     FEWEST_RUNS,
     NATS,
-    Aim,
     Difference,
-    aim_of,
+    Target,
     paired_difference,
+    target_of,
 )
 
 MARGIN = 0.02
@@ -40,13 +40,13 @@ ALL = "all"
 
 
 class Paired(NamedTuple):
-    """A metric of two sides.
+    """A metric of two candidates.
 
     Attributes:
-        first, second: the sides' names.
+        first, second: the candidates' names.
         quantity: the metric.
         case: of what; `all` is the mean over the cases of each run.
-        aim: what it should be.
+        target: what it should be.
         found: the difference over the runs.
         where: when it is, from and to, in seconds since the epoch; None where it is no more at one time.
     """
@@ -55,7 +55,7 @@ class Paired(NamedTuple):
     second: str
     quantity: str
     case: str
-    aim: Aim
+    target: Target
     found: Difference
     where: tuple[float, float] | None = None
 
@@ -65,8 +65,8 @@ class Paired(NamedTuple):
         found = self.found
         of = f" of {self.case}" if self.case else ""
         values = f"{found.second:.4g} against {found.first:.4g}"
-        if isinstance(self.aim, float):
-            values += f", where {self.aim:g} is right"
+        if isinstance(self.target, float):
+            values += f", where {self.target:g} is right"
         if found.runs < FEWEST_RUNS and np.isnan(found.low):
             return (
                 f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
@@ -88,7 +88,7 @@ class Differences:
     """Estimators compared: the first of each group with every other one.
 
     Attributes:
-        groups: the sides.
+        groups: the candidates.
         margin: which share of a metric is no matter.
         gap_limit_s: the truth is not interpolated over longer gaps.
         notes: sentences on what is not alike, and what was left out.
@@ -96,7 +96,7 @@ class Differences:
         times: a row per pair, case, quantity and span of time: the difference and its interval.
     """
 
-    groups: Sequence[Sequence[Side]]
+    groups: Sequence[Sequence[Candidate]]
     margin: float
     gap_limit_s: float
     notes: Sequence[str]
@@ -111,7 +111,7 @@ class Differences:
             found = each.found._asdict()
             begin_s, end_s = each.where or (np.nan, np.nan)
             first, second = each.first, each.second
-            about = {"quantity": each.quantity, "case": each.case, "aim": _told(each.aim)}
+            about = {"quantity": each.quantity, "case": each.case, "aim": _target_text(each.target)}
             values = {"first_mean": found.pop("first"), "second_mean": found.pop("second")}
             when = {"most_from_s": begin_s, "most_to_s": end_s}
             rows.append({"first": first, "second": second, **about, **values, **found, **when})
@@ -139,25 +139,25 @@ class Differences:
         }
 
     def draw(self, save: Path) -> None:
-        """Write a timeline of the first run that both sides of the first group have: side by side.
+        """Write a timeline of the first run that both candidates of the first group have: side by side.
 
         Raises BadInput where no such run can be drawn.
         """
         from replay.timeline.show import Drawing  # which takes long to import
 
-        sides = self.groups[0]
+        candidates = self.groups[0]
         check_files([(save, TIMELINE)], {"input": self.inputs})
         if not self.drawable:
             raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
-        source = sides[0].pairs[first][0]
-        of_sides = (side.estimates(first) for side in sides)
+        source = candidates[0].pairs[first][0]
+        of_candidates = (candidate.estimates(first) for candidate in candidates)
         streams = {
-            topic: stream for own in of_sides for topic, stream in own.read([*own.topics]).items()
+            topic: stream for own in of_candidates for topic, stream in own.read([*own.topics]).items()
         }
         run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
         estimates = MemorySource(streams, run, source.name)
-        names = [side.name for side in sides]
+        names = [candidate.name for candidate in candidates]
         identity = json.dumps([source.name, names])
         with Drawing(source.whole(), identity=identity, save=save, sides=names) as drawing:
             judge_logs([estimates], [source], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
@@ -170,7 +170,7 @@ class Differences:
         place = Path(folder)
         inputs = self.inputs
         check_folder(place, {"input": inputs})
-        names = [[side.name for side in sides] for sides in self.groups]
+        names = [[candidate.name for candidate in candidates] for candidates in self.groups]
         outcome = Outcome(tables={"differences": self.table}, figures=dict(self.charts()))
         if self.coverage:
             outcome.tables["coverage"] = coverage_table(self.coverage)
@@ -193,24 +193,28 @@ class Differences:
 
     @cached_property
     def coverage(self) -> list[Row]:
-        """What became of every topic, by side."""
-        return [row for sides in self.groups for side in sides for row in side.coverage]
+        """What became of every topic, by candidate."""
+        return [
+            row for candidates in self.groups for candidate in candidates for row in candidate.coverage
+        ]
 
     @property
     def drawable(self) -> list[str]:
-        """The runs of which all sides of the first group have estimates."""
+        """The runs of which all candidates of the first group have estimates."""
         first, *others = self.groups[0]
         return [run for run in first.pairs if all(run in each.pairs for each in others)]
 
     @property
     def inputs(self) -> list[Path]:
         """The files that went in."""
-        sources = [each for side in self.groups[0] for pair in side.pairs.values() for each in pair]
+        sources = [
+            each for candidate in self.groups[0] for pair in candidate.pairs.values() for each in pair
+        ]
         return [each.log.path for each in sources if isinstance(each, LogSource)]
 
 
-def _told(aim: Aim) -> str:
-    return "" if aim is None else f"{aim:g}" if isinstance(aim, float) else aim
+def _target_text(target: Target) -> str:
+    return "" if target is None else f"{target:g}" if isinstance(target, float) else target
 
 
 def _chart(rows: pd.DataFrame) -> Chart:
@@ -228,7 +232,7 @@ def _chart(rows: pd.DataFrame) -> Chart:
 
 
 def compare(
-    *sides: str | Path,
+    *candidates: str | Path,
     estimators: Sequence[str | Mapping[str, Kind]] = (),
     truth: str | Path | None = None,
     case: str | None = None,
@@ -240,17 +244,18 @@ def compare(
     """Compare estimators over the same runs, each other one with the first.
 
     Args:
-        sides: result folders, estimates logs or folders of them, and trajectory files; or with
+        candidates: result folders, estimates logs or folders of them, and trajectory files; or with
             `estimators` logs to replay.
-        estimators: which ones, as for `replay`; by default those that all sides have, or the only ones.
-        truth: the true trajectory, as a file, where all sides are files.
+        estimators: which ones, as for `replay`; by default those that all candidates have,
+            or the only ones.
+        truth: the true trajectory, as a file, where all candidates are files.
         case: what trajectory files are of, such as `robot2`, where a log has several truths.
         margin: which share of a metric is no matter.
         gap_limit_s: the truth is not interpolated over longer gaps.
         recover: read what is whole of logs that were cut off or damaged.
         progress: is told how a replay of results goes.
 
-    Raises BadInput where there are not two sides, or they have nothing in common.
+    Raises BadInput where there are not two candidates, or they have nothing in common.
 
     >>> from pipeline.api.api import record, write
     >>> write("run.mcap", record("landmarks", duration_s=5.0))
@@ -260,12 +265,14 @@ def compare(
     """
     if not 0 <= margin < np.inf:
         raise BadInput(f"margin is {margin:g}; give a share such as 0.02, which means 2 %")
-    paths = [Path(side) for side in sides]
+    paths = [Path(candidate) for candidate in candidates]
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
-    givens = sides_of(paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover)
+    givens = inputs_of(
+        paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
+    )
     groups = list(comparable_groups(givens, [label for each in estimators for label in _labels(each)]))
-    notes = [note for group in groups for side in group for note in side.notes]
+    notes = [note for group in groups for candidate in group for note in candidate.notes]
     paired: list[Paired] = []
     times: list[pd.DataFrame] = []
     for group in groups:
@@ -276,7 +283,7 @@ def compare(
             times.append(over_time)
     filled = [each for each in times if len(each)]
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
-    notes += sentences([row for group in groups for side in group for row in side.coverage])
+    notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
     return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table)
 
 
@@ -285,15 +292,15 @@ def _labels(each: str | Mapping[str, Kind]) -> list[str]:
 
 
 def _compared(
-    first: Side, second: Side, margin: float, notes: list[str]
+    first: Candidate, second: Candidate, margin: float, notes: list[str]
 ) -> tuple[list[Paired], pd.DataFrame]:
     """Every metric that both have, over the runs that both have; and some over time."""
     keys = ["quantity", "case", "run"]
     both = first.rows.merge(second.rows, on=keys, suffixes=("_first", "_second"))
-    of_first, of_second = (set(side.rows["quantity"]) for side in (first, second))
-    for side, alone in ((first, of_first - of_second), (second, of_second - of_first)):
+    of_first, of_second = (set(candidate.rows["quantity"]) for candidate in (first, second))
+    for candidate, alone in ((first, of_first - of_second), (second, of_second - of_first)):
         if alone:
-            notes.append(f"only {side.name} has {', '.join(sorted(alone))}")
+            notes.append(f"only {candidate.name} has {', '.join(sorted(alone))}")
     known = both.dropna(subset=["value_first", "value_second"])
     if known.empty:
         raise BadInput(
@@ -309,30 +316,32 @@ def _compared(
             notes.append(f"{quantity}: {runs_of(missing)} without it are left out")
         scale = NATS if quantity == "log_likelihood" else None
         cases = list(dict.fromkeys(rows["case"]))
-        sizes = {first.sizes.get((quantity, case), aim_of(quantity)) for case in cases}
+        sizes = {first.sizes.get((quantity, case), target_of(quantity)) for case in cases}
         groups = {ALL: rows} if len(cases) > 1 and len(sizes) == 1 else {}
         groups |= {case: rows[rows["case"] == case] for case in cases}
         for case, own in groups.items():
-            aim = first.sizes.get((quantity, case if case in cases else cases[0]), aim_of(quantity))
+            target = first.sizes.get(
+                (quantity, case if case in cases else cases[0]), target_of(quantity)
+            )
             means = own.groupby("run", sort=False)[["value_first", "value_second"]].mean().to_numpy()
-            found = paired_difference(means[:, 0], means[:, 1], aim, margin, scale)
+            found = paired_difference(means[:, 0], means[:, 1], target, margin, scale)
             where = _where(over_time, quantity, case, found)
-            paired.append(Paired(first.name, second.name, quantity, case, aim, found, where))
+            paired.append(Paired(first.name, second.name, quantity, case, target, found, where))
     return paired, over_time
 
 
-def _over_time(first: Side, second: Side, margin: float) -> pd.DataFrame:
+def _over_time(first: Candidate, second: Candidate, margin: float) -> pd.DataFrame:
     """The differences of the main RMSE and of NEES by spans of time."""
     if first.times.empty or second.times.empty:
         return pd.DataFrame()
     width_s = _span_s([first.times, second.times])
-    spans = [_in_spans(side.times, width_s) for side in (first, second)]
+    spans = [_in_spans(candidate.times, width_s) for candidate in (first, second)]
     both = spans[0].merge(spans[1], on=["case", "quantity", "span", "run"], suffixes=("_1", "_2"))
     rows = []
     for _, own in both.groupby(["case", "quantity", "span"], sort=False):
         case, quantity, span = (own[name].iloc[0] for name in ("case", "quantity", "span"))
-        aim = first.sizes.get((quantity, case), aim_of(quantity))
-        found = paired_difference(own["value_1"].to_numpy(), own["value_2"].to_numpy(), aim, margin)
+        target = first.sizes.get((quantity, case), target_of(quantity))
+        found = paired_difference(own["value_1"].to_numpy(), own["value_2"].to_numpy(), target, margin)
         about = {"first": first.name, "second": second.name, "case": case, "quantity": quantity}
         time = {
             "elapsed_s": (span - 0.5) * width_s,

@@ -1,12 +1,13 @@
-"""Groups the estimators of several sides that can be compared, run by run."""
+"""Groups the estimators of several candidates that can be compared, run by run."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from pipeline.api.replays import Kind, replay
-from pipeline.comparing.sides import (
+from pipeline.api.planning import Kind
+from pipeline.api.replays import replay
+from pipeline.comparing.candidates import (
+    Candidate,
     Given,
-    Side,
     name_of,
     of_estimates,
     of_replay,
@@ -30,7 +31,7 @@ def runs_of(count: int) -> str:
     return "1 run" if count == 1 else f"{count} runs"
 
 
-def sides_of(
+def inputs_of(
     paths: Sequence[Path],
     estimators: Sequence[str | Mapping[str, Kind]],
     truth: str | Path | None,
@@ -80,7 +81,7 @@ def _kind_of(path: Path, *, recover: bool) -> str:
 
 
 def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
-    """The run that trajectories are of: that of the other sides, or the true trajectory alone."""
+    """The run that trajectories are of: that of the other candidates, or the true trajectory alone."""
     if truth is not None:
         trajectory = read_trajectory(truth)
         stream = truth_of(trajectory, "/truth")
@@ -111,8 +112,8 @@ def _truth_topic(source: Source, case: str | None) -> str:
     return truths[case]
 
 
-def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Side]]:
-    """The sides to compare: the estimators of one thing, or each estimator of several things."""
+def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterator[list[Candidate]]:
+    """The candidates to compare: the estimators of one thing, or each estimator of several things."""
     for each in givens:
         for label in labels:
             if label not in each.labels and (len(each.labels) > 1 or len(givens) == 1):
@@ -121,20 +122,22 @@ def comparable_groups(givens: Sequence[Given], labels: Sequence[str]) -> Iterato
         chosen = list(labels) or list(givens[0].labels)
         if len(chosen) < 2:
             raise BadInput(f"{givens[0].name}: has only {chosen[0]}; give another side to compare with")
-        yield [givens[0].side(label, label) for label in chosen]
+        yield [givens[0].candidate(label, label) for label in chosen]
         return
     names = _distinct([each.name for each in givens])
     common = list(labels) or [x for x in givens[0].labels if all(x in each.labels for each in givens)]
     if not common and all(len(each.labels) == 1 for each in givens):
-        yield [each.side(each.labels[0], name) for each, name in zip(givens, names, strict=True)]
+        yield [each.candidate(each.labels[0], name) for each, name in zip(givens, names, strict=True)]
         return
     if not common:
-        told = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
-        raise BadInput(f"the sides have no estimator in common: {told}; name those to compare with -e")
+        problem = "; ".join(f"{each.name} has {', '.join(each.labels)}" for each in givens)
+        raise BadInput(
+            f"the sides have no estimator in common: {problem}; name those to compare with -e"
+        )
     for label in common:
         suffix = f":{label}" if len(common) > 1 else ""
         yield [
-            each.side(label if label in each.labels else each.labels[0], name + suffix)
+            each.candidate(label if label in each.labels else each.labels[0], name + suffix)
             for each, name in zip(givens, names, strict=True)
         ]
 
@@ -146,21 +149,22 @@ def _distinct(names: Sequence[str]) -> list[str]:
     ]
 
 
-def unlike_runs(first: Side, second: Side) -> Iterator[str]:
-    """A sentence for what two sides do not share; raises BadInput where that is everything."""
-    runs = [list(dict.fromkeys(side.rows["run"])) for side in (first, second)]
+def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
+    """A sentence for what two candidates do not share; raises BadInput where that is everything."""
+    runs = [list(dict.fromkeys(candidate.rows["run"])) for candidate in (first, second)]
     common = [run for run in runs[0] if run in set(runs[1])]
     if not common:
-        told = " and ".join(f"{each[0]}" if each else "nothing" for each in runs)
+        problem = " and ".join(f"{each[0]}" if each else "nothing" for each in runs)
         raise BadInput(
-            f"{first.name} and {second.name} have no run in common: they begin with {told}; compare "
+            f"{first.name} and {second.name} have no run in common: they begin with {problem}; compare "
             "estimates of the same runs"
         )
-    for side, own in zip((first, second), runs, strict=True):
+    for candidate, own in zip((first, second), runs, strict=True):
         alone = [run for run in own if run not in set(common)]
         if alone:
-            yield f"only {side.name} has {runs_of(len(alone))}, left out: {', '.join(alone[:3])}" + (
-                ", ..." if len(alone) > 3 else ""
+            yield (
+                f"only {candidate.name} has {runs_of(len(alone))}, left out: {', '.join(alone[:3])}"
+                + (", ..." if len(alone) > 3 else "")
             )
     judged = [run for run in common if run in first.truths and run in second.truths]
     apart = [run for run in judged if first.truths[run] != second.truths[run]]
@@ -169,7 +173,9 @@ def unlike_runs(first: Side, second: Side) -> Iterator[str]:
         yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
     missing = "not stated"
     names = dict.fromkeys([*first.settings, *second.settings])
-    values = {name: [side.settings.get(name, missing) for side in (first, second)] for name in names}
+    values = {
+        name: [candidate.settings.get(name, missing) for candidate in (first, second)] for name in names
+    }
     differing = [f"{name} {a} and {b}" for name, (a, b) in values.items() if a != b]
     if differing:
         more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""

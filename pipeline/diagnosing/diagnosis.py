@@ -378,7 +378,7 @@ def _of_errors(done: Replay, label: str) -> list[Finding]:
 
 
 def _notes(done: Replay, sentences: Sequence[Sentence]) -> list[str]:
-    notes = list(done.judge.unjudged)
+    notes = list(done.judge.components_without_truth)
     if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
         notes.append(
             "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"

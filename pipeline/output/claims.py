@@ -1,14 +1,34 @@
-"""Claims: statements of papers with our verdicts, and how numbers stand in their sentences."""
+"""Claims: statements of papers with our verdicts.
+
+A claim is stated as data, beside an experiment's settings: a sentence, what the paper says, and a
+comparison of metrics that decides it; see `pipeline.output.expressions`.
+"""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from itertools import product
+from string import Template
+from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from pydantic import model_validator
 
-Verdict = Literal["confirmed", "refuted", "not reproducible"]
+from pipeline.output.expressions import (
+    NoMetric,
+    Values,
+    evaluate,
+    expressions_in,
+    formatted,
+    keys_of,
+    names_in,
+    truth,
+)
+from pipeline.output.numbers import Value, exactly
+from recorders.errors import BadInput, choices
+from recorders.parameters import Parameters
+
+Verdict = Literal["confirmed", "refuted", "not shown", "not reproducible"]
 
 
 @dataclass(frozen=True)
@@ -31,19 +51,183 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
     return Claim(claim, paper, ours, "confirmed" if holds else "refuted", why)
 
 
-def decided(claim: Claim) -> Claim:
+def known(claim: Claim) -> Claim:
     """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
-    if not re.search(r"\bnan\b", claim.ours):
+    if claim.verdict == "not reproducible" or not re.search(r"\bnan\b", claim.ours):
         return claim
     why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
     return replace(claim, verdict="not reproducible", why=why)
 
 
-def listed(values: ArrayLike, digits: int = 2, between: str = " ") -> str:
-    """Numbers for a sentence."""
-    return between.join(f"{value:.{digits}f}" for value in np.ravel(values))
+class StatedClaim(Parameters):
+    """A claim as an experiment's file says it.
+
+    In texts, `{EXPRESSION:FORMAT}` is a number; everywhere `$NAME` is what `each` says.
+
+    Attributes:
+        sentence: what is claimed.
+        paper: what the paper says, or where the limit comes from.
+        holds: comparison that decides: confirmed, refuted, or not shown where an interval holds both;
+            without one the claim is not reproducible.
+        value: expression that the texts and the comparison name `value`.
+        ours: what we found.
+        why: reason of the verdict, or what has to be known beside it.
+        unless: what is said beside every verdict but `confirmed`.
+        reproducible: comparison without which the claim is not reproducible, whatever `holds` says.
+        each: names and what they stand for; the claim is made of each, or of each combination. An entry
+            that is a table gives several names; `nees[ekf, *]` gives all that its `*` stands for.
+        given: numbers or expressions by the names that the texts and the comparison have for them.
+        optional: whether it is left out where the result lacks one of its metrics, in place of not
+            reproducible.
+    """
+
+    sentence: str
+    paper: str
+    holds: str = ""
+    value: str = ""
+    ours: str = "{value}"
+    why: str = ""
+    unless: str = ""
+    reproducible: str = ""
+    each: dict[str, str | list[Any]] = {}
+    given: dict[str, float | str] = {}
+    optional: bool = False
+
+    @model_validator(mode="after")
+    def _can_be_read(self) -> Self:
+        try:
+            _ = self.names
+        except BadInput as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    @property
+    def names(self) -> set[str]:
+        """What its expressions name that the claim does not say; raises BadInput where one is none."""
+        found: set[str] = set()
+        for meant in _combinations(self.each):
+            claim = _named(self, meant)
+            texts = (claim.sentence, claim.paper, claim.ours, claim.why, claim.unless)
+            expressions = [claim.holds, claim.value, claim.reproducible]
+            expressions += [of for of in claim.given.values() if isinstance(of, str)]
+            for text in texts:
+                expressions += _reading(self.sentence, expressions_in, text)
+            for expression in filter(None, expressions):
+                found |= _reading(self.sentence, names_in, expression)
+        return found - {*self.given, *(["value"] if self.value else [])}
 
 
-def named(values: Mapping[str, float], *names: str) -> str:
-    """Some names with their numbers, for a sentence."""
-    return ", ".join(f"{name} {values[name]:.3g}" for name in names)
+def _reading(sentence: str, read: Any, *arguments: Any) -> Any:
+    """What reading an expression gives; BadInput that names the claim where it cannot be read."""
+    try:
+        return read(*arguments)
+    except BadInput as error:
+        raise BadInput(f"claim '{sentence}': {error}") from None
+
+
+def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: str) -> None:
+    """Raise BadInput that names `where` and the claim, where one names a number that is not there."""
+    for claim in stated:
+        for name in sorted(claim.names.difference(names)):
+            raise BadInput(
+                f"{where}: claim '{claim.sentence}': no number '{name}'; {choices(name, names)}"
+            )
+
+
+def decide(
+    stated: Sequence[StatedClaim],
+    metrics: Mapping[str, Any],
+    intervals: Mapping[str, Sequence[float | None]],
+    names: Mapping[str, float],
+) -> list[Claim]:
+    """The claims with their verdicts by a result's metrics, their 95 % intervals, and numbers by name.
+
+    Raises BadInput where an expression of a claim cannot be evaluated.
+    """
+    values = Values(metrics, intervals, {name: exactly(value) for name, value in names.items()})
+    return [
+        found
+        for claim in stated
+        for meant in _combinations(claim.each, metrics)
+        if (found := _decided(_named(claim, meant), values)) is not None
+    ]
+
+
+def _combinations(
+    each: Mapping[str, str | list[Any]], metrics: Mapping[str, Any] | None = None
+) -> Iterator[dict[str, Any]]:
+    """What the names of `each` stand for, one combination after another.
+
+    Without metrics, which are not known before a run, their `*` stands for itself.
+    """
+    entries = {
+        name: of if isinstance(of, list) else ["*"] if metrics is None else _found(of, metrics)
+        for name, of in each.items()
+    }
+    for chosen in product(*entries.values()):
+        names: dict[str, Any] = {}
+        for name, entry in zip(entries, chosen, strict=True):
+            names |= entry if isinstance(entry, dict) else {name: entry}
+        yield names
+
+
+def _found(pattern: str, metrics: Mapping[str, Any]) -> list[str]:
+    """What the `*` of a metric such as `nees[ekf, *]` stands for, each once."""
+    quantity, _, of = pattern.removesuffix("]").partition("[")
+    return list(dict.fromkeys(keys_of(quantity, of, metrics).values()))
+
+
+def _named(claim: StatedClaim, names: Mapping[str, Any]) -> StatedClaim:
+    """The claim with what names stand for in their places."""
+
+    def put(text: str) -> str:
+        return Template(text).safe_substitute(names)
+
+    given = {name: put(of) if isinstance(of, str) else of for name, of in claim.given.items()}
+    texts = {
+        name: put(text)
+        for name in ("sentence", "paper", "holds", "value", "ours", "why", "unless", "reproducible")
+        for text in [getattr(claim, name)]
+    }
+    return claim.model_copy(update={**texts, "given": given})
+
+
+def _decided(claim: StatedClaim, values: Values) -> Claim | None:
+    """The claim with its verdict; None where it is left out."""
+    try:
+        return _reading(claim.sentence, _verdict, claim, values)
+    except NoMetric as error:
+        if claim.optional:
+            return None
+        limits = {name: exactly(of) for name, of in claim.given.items() if not isinstance(of, str)}
+        values = values._replace(names={**values.names, **limits})
+        sentence, paper = (_as_far_as_known(text, values) for text in (claim.sentence, claim.paper))
+        return Claim(sentence, paper, "-", "not reproducible", f"the result has no {error}")
+
+
+def _as_far_as_known(text: str, values: Values) -> str:
+    """The text with its numbers, or as it stands where one of them is missing."""
+    try:
+        return formatted(text, values)
+    except (BadInput, NoMetric):
+        return text
+
+
+def _verdict(claim: StatedClaim, values: Values) -> Claim:
+    names: dict[str, Value] = dict(values.names)
+    values = values._replace(names=names)
+    for name, of in {**claim.given, **({"value": claim.value} if claim.value else {})}.items():
+        names[name] = evaluate(of, values) if isinstance(of, str) else exactly(of)
+    sentence, paper, ours, why, unless = (
+        formatted(text, values)
+        for text in (claim.sentence, claim.paper, claim.ours, claim.why, claim.unless)
+    )
+    verdict: Verdict = "not reproducible"
+    holds = truth(claim.holds, values) if claim.holds else False
+    if holds == "missing":
+        unless = "; ".join(filter(None, [unless, "estimates are missing"]))
+    elif claim.holds and (not claim.reproducible or truth(claim.reproducible, values) is True):
+        verdict = "not shown" if holds is None else "confirmed" if holds else "refuted"
+    if verdict != "confirmed":
+        why = "; ".join(filter(None, [why, unless]))
+    return Claim(sentence, paper, ours, verdict, why)

@@ -218,8 +218,8 @@ def stored_rows(folder: Path) -> list[Row]:
     return [Row(*row) for row in table.where(table.notna(), None)[[*Row._fields]].to_numpy().tolist()]
 
 
-def rows_of_side(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
-    """The lines of one estimator, under a side's name."""
+def rows_of_candidate(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
+    """The lines of one estimator, under a candidate's name."""
     return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
 from pipeline.output.charts import Chart, draw
-from pipeline.output.claims import Claim, decided
+from pipeline.output.claims import Claim, known
 from recorders.atomic import whole_folder
 from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
@@ -45,9 +45,9 @@ MetricValue = float | list[float] | list[float | None] | None
 class Outcome:
     """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
 
-    `bounds` are where a metric lies with 95 % if all is well. A figure is a chart, or a picture of
-    another kind. `input_sha256` is a hash of the data that went in, `parameters` are those of all
-    estimators, defaults included.
+    `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one lies with
+    95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
+    a hash of the data that went in, `parameters` are those of all estimators, defaults included.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -57,6 +57,11 @@ class Outcome:
     input_sha256: str = ""
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     bounds: dict[str, Bounds] = field(default_factory=dict)
+    intervals: dict[str, Bounds] = field(default_factory=dict)
+
+    def measure(self, key: str, value: float, low: float, high: float) -> None:
+        """Keep a metric with its 95 % interval."""
+        self.metrics[key], self.intervals[key] = float(value), (float(low), float(high))
 
 
 class Result(Parameters):
@@ -64,7 +69,7 @@ class Result(Parameters):
 
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
     without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
-    lies with 95 % if all is well.
+    lies with 95 % if all is well, `intervals` where the true one lies with 95 %.
     """
 
     format: int = FORMAT
@@ -76,6 +81,7 @@ class Result(Parameters):
     claims: list[Claim]
     files: dict[str, str | None] = {}
     bounds: dict[str, Bounds] = {}
+    intervals: dict[str, tuple[float | None, float | None]] = {}
 
     @property
     def contents(self) -> list[str]:
@@ -322,7 +328,10 @@ def write_outcome(
             input_sha256=outcome.input_sha256,
             metrics=in_order(plain(outcome.metrics), settings.get("estimators", ())),
             bounds={key: bounds for key, bounds in outcome.bounds.items() if key in outcome.metrics},
-            claims=[decided(claim) for claim in outcome.claims],
+            intervals={
+                key: (_number(low), _number(high)) for key, (low, high) in outcome.intervals.items()
+            },
+            claims=[known(claim) for claim in outcome.claims],
             files={
                 path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else hash_of(path)
                 for path in written

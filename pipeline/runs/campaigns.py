@@ -21,10 +21,11 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any, NamedTuple
 
-from pipeline.runs.checkpoints import Kept
+from pipeline.runs.checkpoints import Checkpoints
 from pipeline.runs.ensemble import Pass, parts_of
-from pipeline.runs.executors import Crew, Team, here, states_of, version_of_code
-from pipeline.runs.experiment import Experiment, Logs, Record, Setting, load_scenario
+from pipeline.runs.executors import PoolFactory, WorkerPool, inline_pool, states_of, version_of_code
+from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.inputs import Logs, Record
 from pipeline.runs.recorded import KEPT_BYTES, require_memory
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
@@ -164,10 +165,10 @@ def judge(experiment: Experiment, setting: Setting) -> Pass:
     Raises BadInput where there is an estimator that can follow no run, or workers die again and again.
     """
     cells = cells_of(experiment, setting)
-    if len(cells) == 1 or setting.kept is None:  # nothing to share, and nothing to go on with
+    if len(cells) == 1 or setting.checkpoints is None:  # nothing to share, and nothing to go on with
         return cells[0].work_off(setting.folder, setting).check()
     (done,) = _merged([cells], setting)
-    setting.kept.hand_over([cell.key for cell in cells], setting.folder)
+    setting.checkpoints.hand_over([cell.key for cell in cells], setting.folder)
     return done
 
 
@@ -181,10 +182,10 @@ def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[P
 
 def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]:
     """What each part of the cells leaves, merged in their order."""
-    assert setting.kept is not None
+    assert setting.checkpoints is not None
     cells = list(chain.from_iterable(parts))
     pace = Pace(sum(cell.runs for cell in cells))
-    results = work_off(cells, setting.crew or here, setting.kept, pace)
+    results = work_off(cells, setting.open_pool or inline_pool, setting.checkpoints, pace)
     told = iter(setting.progress(results, pace, len(cells)))
     for part in parts:
         whole = next(told)
@@ -195,7 +196,7 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
         if len(part) > 1:
             whole.input_sha256 = hashes.hexdigest()
         yield whole.check()
-    for _ in told:  # there are no more: progress and team come to their ends
+    for _ in told:  # there are no more: progress and pool come to their ends
         pass
 
 
@@ -215,33 +216,35 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
     return cells
 
 
-def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Iterator[Pass]:
+def work_off(
+    cells: Sequence[Cell], open_pool: PoolFactory, checkpoints: Checkpoints, pace: Pace
+) -> Iterator[Pass]:
     """What cells leave, in their order; those that are kept are not worked off again.
 
     Memory holds what is handed out and what comes in. Raises BadInput where the workers of a cell died
     again and again.
     """
-    kept.begin()
+    checkpoints.begin()
     keys = [cell.key for cell in cells]
-    waiting = deque(number for number, key in enumerate(keys) if not kept.has(key))
+    waiting = deque(number for number, key in enumerate(keys) if not checkpoints.has(key))
     if len(waiting) < len(cells):
         done = len(cells) - len(waiting)
         _LOG.warning(
-            "%s: has %d of %d cells already; computing the others", kept.folder, done, len(cells)
+            "%s: has %d of %d cells already; computing the others", checkpoints.folder, done, len(cells)
         )
     died: Counter[int] = Counter()
     following = 0
     while following < len(cells):
-        with crew() as team:
-            pace.workers = team.workers
-            begin = _beginner(team, [cells[number] for number in waiting], kept)
+        with open_pool() as pool:
+            pace.workers = pool.workers
+            begin = _beginner(pool, [cells[number] for number in waiting], checkpoints)
             pending: dict[Future[Any], int] = {}
             lost: BaseException | None = None
             while following < len(cells) and lost is None:
-                while waiting and len(pending) < team.workers:
+                while waiting and len(pending) < pool.workers:
                     number = waiting.popleft()
                     pending[begin(cells[number])] = number
-                left = kept.read(keys[following])
+                left = checkpoints.read(keys[following])
                 if left is not None:
                     pace.done += cells[following].runs
                     yield left
@@ -251,8 +254,8 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
                     died[following] += 1
                     if died[following] >= ATTEMPTS:
                         raise BadInput(
-                            f"{kept.folder}: what is kept there is changed by others, or by the disk; "
-                            "give another --out"
+                            f"{checkpoints.folder}: what is kept there is changed by others, or by the "
+                            "disk; give another --out"
                         )
                     waiting.appendleft(following)
                     continue
@@ -261,15 +264,15 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
                         error = future.exception()
                     except CancelledError:  # by a scheduler that is not there any more
                         error = BrokenExecutor("the scheduler has ended")
-                    if isinstance(error, (*team.lost, BrokenExecutor)):
+                    if isinstance(error, (*pool.lost, BrokenExecutor)):
                         lost = error
                         continue
                     number = pending.pop(future)
                     pace.worked_off += cells[number].runs
-                    if team.sees is None:
-                        kept.write(keys[number], future.result())
+                    if pool.sees is None:
+                        checkpoints.write(keys[number], future.result())
                     else:
-                        kept.write(keys[number], *future.result())
+                        checkpoints.write(keys[number], *future.result())
             if lost is not None:  # and with it all others of some executors
                 died.update(pending.values())
                 waiting.extendleft(sorted(pending.values(), reverse=True))
@@ -282,11 +285,13 @@ def work_off(cells: Sequence[Cell], crew: Crew, kept: Kept, pace: Pace) -> Itera
                     )
 
 
-def _beginner(team: Team, cells: Sequence[Cell], kept: Kept) -> Callable[[Cell], Future[Any]]:
-    """What hands a cell to the team; logs that its workers do not see go with it."""
-    sees, submit = team.sees, team.executor.submit
+def _beginner(
+    pool: WorkerPool, cells: Sequence[Cell], checkpoints: Checkpoints
+) -> Callable[[Cell], Future[Any]]:
+    """What hands a cell to the pool; logs that its workers do not see go with it."""
+    sees, submit = pool.sees, pool.executor.submit
     if sees is None:
-        return lambda cell: submit(cell.packed, kept.place_of(cell.key))
+        return lambda cell: submit(cell.packed, checkpoints.place_of(cell.key))
     carries = not sees([file for cell in cells for file in cell.files])
 
     def send(cell: Cell) -> Future[Any]:

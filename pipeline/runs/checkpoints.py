@@ -35,7 +35,7 @@ _LEFTOVER = re.compile(r"\.[0-9a-f]{64}\.bin\.[^.]+\.part")  # where a cell was 
 _LOG = logging.getLogger("fuselog")
 
 
-class Kept:
+class Checkpoints:
     """The folder, whose lock is held."""
 
     def __init__(self, folder: Path, lock: FileLock) -> None:
@@ -172,18 +172,18 @@ class _Left(NamedTuple):
 
 
 @contextmanager
-def kept_cells(place: Path) -> Iterator[Kept]:
+def checkpoints_of(place: Path) -> Iterator[Checkpoints]:
     """The kept cells of the campaign whose result goes to a place; they go when all went well."""
     place = settled(place)
     folder = place.with_name(f"{place.name}.unfinished")
-    kept = Kept(folder, FileLock(folder / _LOCK, timeout=0))
+    checkpoints = Checkpoints(folder, FileLock(folder / _LOCK, timeout=0))
     with parents_of(place):
         try:
-            yield kept
+            yield checkpoints
         except BaseException:
-            kept.end(is_done=False)
+            checkpoints.end(is_done=False)
             raise
-        kept.end(is_done=True)
+        checkpoints.end(is_done=True)
 
 
 def _is_ours(path: Path) -> bool:

@@ -210,7 +210,7 @@ def replay_parts(
                 if drawing is not None:
                     drawing.add(*of_run(block, judged.errors, 0))
 
-            hand_over = stack.enter_context(behind(judge_and_draw))
+            hand_over = stack.enter_context(in_background(judge_and_draw))
             for block in blocks:
                 hand_over(block)
                 for run, writer in enumerate(writers):
@@ -232,7 +232,7 @@ def replay_parts(
 
 
 @contextmanager
-def behind(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
+def in_background(work: Callable[[Item], None]) -> Iterator[Callable[[Item], None]]:
     """Items handed over are worked on in order, one at a time, while the caller goes on.
 
     What the work raises is raised when the next item is handed over, or at the end.

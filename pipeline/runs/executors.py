@@ -32,7 +32,7 @@ PAYING_RUNS = 1000
 PACKAGES = ("recorders", "replay", "pipeline")
 
 
-class Team(NamedTuple):
+class WorkerPool(NamedTuple):
     """Workers that are there.
 
     Attributes:
@@ -49,11 +49,11 @@ class Team(NamedTuple):
     lost: tuple[type[BaseException], ...] = (BrokenExecutor,)
 
 
-# Begins a team, and ends it.
-Crew = Callable[[], AbstractContextManager[Team]]
+# Opens a pool of workers, and closes it.
+PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 
 
-def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
+def pool_for(workers: int | None, scheduler: str | None, runs: int) -> PoolFactory:
     """Who works on so many runs: whom the options ask for, else processes on all cores if that pays.
 
     Raises BadInput where both options are given.
@@ -67,20 +67,20 @@ def crew_of(workers: int | None, scheduler: str | None, runs: int) -> Crew:
         return dask(scheduler)
     if workers is None:
         workers = os.cpu_count() or 1 if runs >= PAYING_RUNS else 1
-    return here if workers == 1 else processes(workers)
+    return inline_pool if workers == 1 else processes(workers)
 
 
-def of_executor(executor: Executor) -> Crew:
+def pool_of(executor: Executor) -> PoolFactory:
     """An executor that is there; it is given as much work at a time as there are cores."""
 
     @contextmanager
-    def begin() -> Iterator[Team]:
-        yield Team(executor, os.cpu_count() or 1)
+    def begin() -> Iterator[WorkerPool]:
+        yield WorkerPool(executor, os.cpu_count() or 1)
 
     return begin
 
 
-class Here(Executor):
+class InlineExecutor(Executor):
     """Does the work when it is submitted, in the calling thread."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -94,28 +94,28 @@ class Here(Executor):
 
 
 @contextmanager
-def here() -> Iterator[Team]:
+def inline_pool() -> Iterator[WorkerPool]:
     """Nobody but the calling process, whose replay uses all cores."""
-    yield Team(Here(), 1)
+    yield WorkerPool(InlineExecutor(), 1)
 
 
 @contextmanager
-def threads() -> Iterator[Team]:
+def threads() -> Iterator[WorkerPool]:
     """Threads of the calling process, one for each core: for work whose kernels run side by side."""
     count = os.cpu_count() or 1
     with ThreadPoolExecutor(count) as pool:
-        yield Team(pool, count)
+        yield WorkerPool(pool, count)
 
 
-def processes(count: int) -> Crew:
+def processes(count: int) -> PoolFactory:
     """So many processes on this machine, each on one core; they end with this one, however that ends."""
 
     @contextmanager
-    def begin() -> Iterator[Team]:
+    def begin() -> Iterator[WorkerPool]:
         others = set(active_children())
         pool = ProcessPoolExecutor(count, get_context("spawn"), _begin_worker)
         try:
-            yield Team(pool, count)
+            yield WorkerPool(pool, count)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             for worker in set(active_children()) - others:
@@ -141,7 +141,7 @@ def _begin_worker() -> None:
     Thread(target=follow, daemon=True).start()
 
 
-def dask(scheduler: str) -> Crew:
+def dask(scheduler: str) -> PoolFactory:
     """The workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
 
     `local:N` begins N on this machine, which no other can reach. Raises BadInput when they are to begin
@@ -149,7 +149,7 @@ def dask(scheduler: str) -> Crew:
     """
 
     @contextmanager
-    def begin() -> Iterator[Team]:
+    def begin() -> Iterator[WorkerPool]:
         try:
             from dask import config
             from distributed import Client, KilledWorker
@@ -173,7 +173,7 @@ def dask(scheduler: str) -> Crew:
             workers = sum(client.nthreads().values())
             sees = None if scheduler.startswith("local:") else partial(_all_see, client)
             stack.enter_context(config.set({"distributed.admin.large-graph-warning-threshold": "1GB"}))
-            yield Team(client.get_executor(pure=False), workers, sees, (KilledWorker,))
+            yield WorkerPool(client.get_executor(pure=False), workers, sees, (KilledWorker,))
 
     return begin
 

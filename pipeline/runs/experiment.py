@@ -8,12 +8,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
-from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
-from pipeline.output.results import Outcome, Result, result_folder, write_outcome
-from pipeline.runs.checkpoints import Kept, kept_cells
+from pipeline.output.claims import StatedClaim, decide, require_names
+from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
+from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import Crew
+from pipeline.runs.executors import PoolFactory
+from pipeline.runs.inputs import Import, Logs, Record
 from pipeline.runs.settings import parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
@@ -25,41 +27,6 @@ from replay.engine.replaying.late import parse_late
 from replay.judging.metrics.measuring import find_metrics
 
 SHIPPED = resources.files("fuselog_data")
-
-
-class Record(Parameters):
-    """What to simulate.
-
-    Attributes:
-        scenario: a scenario by name or TOML file.
-        parameters: what differs from its defaults, by name.
-    """
-
-    scenario: str
-    parameters: dict[str, Any] = {}
-
-
-class Import(Parameters):
-    """What to import; the data's place comes from --data.
-
-    Attributes:
-        source: name of the importer.
-        parameters: what differs from its defaults, by name.
-    """
-
-    source: str
-    parameters: dict[str, Any] = {}
-
-
-class Logs(Parameters):
-    """Logs to replay, one run each.
-
-    Attributes:
-        files: files or patterns such as `drive-*.mcap`, from the folder of the experiment's file on;
-            estimates that lie beside the logs are left out.
-    """
-
-    files: list[str] = []
 
 
 class Experiment(Parameters):
@@ -75,13 +42,15 @@ class Experiment(Parameters):
         record: what to simulate.
         import_: what to import.
         logs: logs to replay.
-        estimators: parameters by label; one that is `kind` names the estimator where the label is not
-            its name.
+        estimators: parameters by label; `kind` names the estimator where the label is not its name,
+            `like` another label whose kind and parameters it has but for what it says itself.
         metrics: names of the metrics; without any, all that are registered.
         gap_limit_s: longest gap over which truth is interpolated.
         arrival_order: whether messages are processed in the order in which they arrived.
         late: what becomes of late measurements, as `--late` of `fuselog replay` has it.
         options: the study's own.
+        claims: what is claimed of the metrics that it yields.
+        claims_of: name of another experiment whose claims are tried first.
     """
 
     title: str
@@ -97,6 +66,18 @@ class Experiment(Parameters):
     arrival_order: bool | None = None
     late: str | None = None
     options: dict[str, Any] = {}
+    # what is claimed changes nothing in what is run, and a result has it with its verdict
+    claims: Annotated[list[StatedClaim], Field(exclude=True)] = []
+    claims_of: Annotated[str, Field(exclude=True)] = ""
+
+    @field_validator("estimators")
+    @classmethod
+    def _are_spelt_out(cls, stated: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        spelt = {label: _spelt_out(label, stated) for label in stated}
+        for label, values in stated.items():
+            if "like" in values and spelt[label]["kind"] == label:
+                del spelt[label]["kind"]  # as a label that is a name needs none
+        return spelt
 
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:
@@ -126,6 +107,19 @@ class Experiment(Parameters):
         return [Path(file) for file in self.logs.files] if self.logs else []
 
 
+def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) -> dict[str, Any]:
+    """An estimator's parameters with those of the one that it is like."""
+    values = stated[label]
+    if "like" not in values:
+        return values
+    other, own = values["like"], {name: of for name, of in values.items() if name != "like"}
+    if other not in stated or other in (label, *above):
+        raise ValueError(
+            f"estimator {label} is like '{other}'; name another estimator of the experiment"
+        )
+    return merge({"kind": other, **_spelt_out(other, stated, label, *above)}, own)
+
+
 @dataclass(frozen=True)
 class Setting:
     """Where and how an experiment runs.
@@ -139,8 +133,8 @@ class Setting:
         errors: whether every single error is kept too.
         options: of the study's own type.
         progress: is told how it goes.
-        crew: who works off the cells of a campaign; by default this process.
-        kept: where finished cells are kept until all are.
+        open_pool: who works off the cells of a campaign; by default this process.
+        checkpoints: where finished cells are kept until all are.
     """
 
     folder: Path
@@ -151,8 +145,8 @@ class Setting:
     errors: bool = False
     options: Any = None
     progress: Progress = no_progress
-    crew: Crew | None = None
-    kept: Kept | None = None
+    open_pool: PoolFactory | None = None
+    checkpoints: Checkpoints | None = None
 
 
 @dataclass(frozen=True)
@@ -201,6 +195,9 @@ class Stated(NamedTuple):
         where = f"experiment {self.source}"
         own = _settings_of_experiment(build(Experiment, self.values, where), settings)
         experiment = build(Experiment, {**merge(self.values, own), **over}, where)
+        if experiment.claims_of:
+            shared = read_experiment(experiment.claims_of).with_settings({}, {}).claims
+            experiment = experiment.model_copy(update={"claims": [*shared, *experiment.claims]})
         if experiment.logs is None:
             return experiment
         files = _found(experiment.logs.files, self.folder, where)
@@ -321,6 +318,12 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
     return recorder, parameters, path.stem
 
 
+def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
+    """What claims may name: the number of the runs, and what a study's options have of numbers."""
+    stated = {name: value for name, value in options if isinstance(value, int | float)}
+    return {"runs": experiment.runs, **stated}
+
+
 def require_campaign(experiment: Experiment, mend: str) -> None:
     """Raise BadInput where an experiment's study replays all runs together, in one process."""
     study: Study = load("studies", experiment.study, Study)
@@ -339,7 +342,7 @@ def run_experiment(
     data: Path | None = None,
     logs: int = 20,
     errors: bool = False,
-    crew: Crew | None = None,
+    open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
     """Run an experiment into its folder, which appears whole or not at all; returns result.json."""
@@ -357,10 +360,12 @@ def run_experiment(
         experiment = experiment.model_copy(update={"runs": len(experiment.files)})
     study: Study = load("studies", experiment.study, Study)
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
+    numbers = numbers_of(experiment, options)
+    require_names(experiment.claims, numbers, f"experiment {name}")
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
     with (
-        kept_cells(folder) as kept,
+        checkpoints_of(folder) as checkpoints,
         result_folder(folder) as part,
         foreign_code(f"study {experiment.study}"),
         warnings.catch_warnings(),
@@ -375,10 +380,12 @@ def run_experiment(
             errors=errors,
             options=options,
             progress=progress,
-            crew=crew,
-            kept=kept,
+            open_pool=open_pool,
+            checkpoints=checkpoints,
         )
         outcome = study.run(experiment, setting)
+        metrics = plain(outcome.metrics)
+        outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)

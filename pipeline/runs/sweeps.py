@@ -19,9 +19,9 @@ from pipeline.output.results import (
     write_outcome,
 )
 from pipeline.runs.campaigns import judge_all
-from pipeline.runs.checkpoints import kept_cells
+from pipeline.runs.checkpoints import checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
-from pipeline.runs.executors import Crew
+from pipeline.runs.executors import PoolFactory
 from pipeline.runs.experiment import Experiment, Setting
 from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
@@ -166,7 +166,7 @@ def run_sweep(
     experiments: Sequence[Experiment],
     folder: Path,
     *,
-    crew: Crew | None = None,
+    open_pool: PoolFactory | None = None,
     progress: Progress = no_progress,
 ) -> Result:
     """Replay and judge an experiment at every point into a folder; returns result.json.
@@ -182,8 +182,16 @@ def run_sweep(
             )
         for label, values in experiment.estimators.items():
             configure(label, values)
-    with kept_cells(folder) as kept, result_folder(folder) as part:
-        setting = Setting(part, folder, logs=0, draws=False, progress=progress, crew=crew, kept=kept)
+    with checkpoints_of(folder) as checkpoints, result_folder(folder) as part:
+        setting = Setting(
+            part,
+            folder,
+            logs=0,
+            draws=False,
+            progress=progress,
+            open_pool=open_pool,
+            checkpoints=checkpoints,
+        )
         outcome = Outcome()
         tables = []
         for number, done in enumerate(judge_all(experiments, setting)):

@@ -1,7 +1,7 @@
 """What a tuning minimises: logs replayed with other parameters, and what their replays cost.
 
 Every log is replayed by itself; a point costs what the sums over all logs do, in their order. Logs and
-points are shared among threads, whose kernels run side by side, or among the workers of a team.
+points are shared among threads, whose kernels run side by side, or among the workers of a pool.
 """
 
 import pickle
@@ -24,7 +24,7 @@ from pipeline.runs.broad_starts import (
     part_count,
     with_find,
 )
-from pipeline.runs.executors import Team, threads
+from pipeline.runs.executors import WorkerPool, threads
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
@@ -181,7 +181,7 @@ class Objective:
         by: what it goes by.
         gap_limit_s: the truth is not interpolated over longer gaps.
         on_best: is told of the best point after every batch.
-        team: who replays; without one threads of this process.
+        pool: who replays; without one threads of this process.
         best: of all points until now.
     """
 
@@ -192,7 +192,7 @@ class Objective:
     by: By
     gap_limit_s: float
     on_best: Callable[[Best], None] = silent
-    team: Team | None = None
+    pool: WorkerPool | None = None
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
     _told: list[int] = field(default_factory=list)
 
@@ -215,11 +215,11 @@ class Objective:
 
     def _shared(self, points: Floats) -> list[list[Sums | None]]:
         """Of every run what it tells at each point, by all who work, each for some of the points."""
-        with threads() if self.team is None else nullcontext(self.team) as team:
-            parts = np.array_split(points, min(team.workers, len(points)))
+        with threads() if self.pool is None else nullcontext(self.pool) as pool:
+            parts = np.array_split(points, min(pool.workers, len(points)))
             alone = self._without_runs()
             working = [
-                [team.executor.submit(alone.sums, part, run, told) for part in parts]
+                [pool.executor.submit(alone.sums, part, run, told) for part in parts]
                 for run, told in zip(self.runs, self._told, strict=True)
             ]
             try:
@@ -228,14 +228,14 @@ class Objective:
                 raise BadInput(
                     f"the scheduler ended while it tuned {self.label}; start it again"
                 ) from None
-            except team.lost as error:
+            except pool.lost as error:
                 raise BadInput(
                     f"a process that tunes {self.label} died ({error}); try fewer workers"
                 ) from error
 
     def _without_runs(self) -> "Objective":
         """What workers need besides a run."""
-        return replace(self, runs=(), on_best=silent, team=None)
+        return replace(self, runs=(), on_best=silent, pool=None)
 
     def begin(self, start: Floats) -> None:
         """Note what every log tells at the start (k,), and where filters begin there: so it stays.
@@ -243,7 +243,7 @@ class Objective:
         Raises BadInput where a run fails there, the log lacks what is minimised, or the estimator
         cannot go to other processes that are to work.
         """
-        if self.team is not None:
+        if self.pool is not None:
             try:
                 pickle.dumps(self._without_runs())
             except (pickle.PicklingError, AttributeError, TypeError) as error:

@@ -204,7 +204,7 @@ class Tuning:
         """A sentence for everything that one has to know of the values."""
         return [
             *self.notes_of_search,
-            *(each for each in self.replay.judge.losses if each.startswith(TUNED)),
+            *(each for each in self.replay.judge.notes_of_coverage if each.startswith(TUNED)),
             *self._notes_of_innovations(),
             *self._notes_of_truth(),
             *self._notes_of_others(),

@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pipeline.api.replays import Kind, Log, settings_of, sources_of
-from pipeline.runs.executors import Team, crew_of, of_executor
+from pipeline.api.planning import Kind, Log, settings_of, sources_of
+from pipeline.runs.executors import WorkerPool, pool_for, pool_of
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
     CRITERIA,
@@ -113,10 +113,10 @@ def tune(
     opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and _gate(bound) < 1.0 else settings
     names = [each.name for each in searched]
 
-    with _team(workers, scheduler, executor) as team:
+    with _pool(workers, scheduler, executor) as pool:
 
         def objective(runs: Sequence[Run]) -> Objective:
-            made = Objective(label, opened, names, runs, by, gap_limit_s, on_best, team)
+            made = Objective(label, opened, names, runs, by, gap_limit_s, on_best, pool)
             made.begin(start)
             return made
 
@@ -129,7 +129,7 @@ def tune(
             left_out = runs[fold::folds]
             rest = [run for number, run in enumerate(runs) if number % folds != fold]
             rows.append(_row_of_fold(fold, objective(left_out), objective(rest), searched, grid))
-    whole.team = None
+    whole.pool = None
     return Tuning(
         label,
         sources,
@@ -147,15 +147,15 @@ def tune(
     )
 
 
-def _team(
+def _pool(
     workers: int | None, scheduler: str | None, executor: Executor | None
-) -> AbstractContextManager[Team | None]:
+) -> AbstractContextManager[WorkerPool | None]:
     """Who evaluates; None stands for threads of this process."""
     if executor is not None:
-        return of_executor(executor)()
+        return pool_of(executor)()
     if workers is None and scheduler is None:
         return nullcontext()
-    return crew_of(workers, scheduler, 1)()
+    return pool_for(workers, scheduler, 1)()
 
 
 def _gate(bound: Sequence[Bound]) -> float:

@@ -151,8 +151,8 @@ def read(folder: Path, parameters: AutoferryParameters) -> Recording:
     for sensor, name in SENSORS.items():
         rows = np.flatnonzero(scans.sensor == sensor)
         if len(rows):
-            sheet = {key: repr(value) for key, value in getattr(parameters, name)}
-            streams += _sensor_streams(f"/{name}", rows, scans, sheet)
+            stated = {key: repr(value) for key, value in getattr(parameters, name)}
+            streams += _sensor_streams(f"/{name}", rows, scans, stated)
             _tell(notes, name, rows, scans)
     for target, (time_ns, place) in truths.items():
         truth = make_stream(
@@ -274,7 +274,7 @@ def _numbers(values: Any, where: str, name: str, count: int) -> Floats:
 
 
 def _sensor_streams(
-    prefix: str, rows: Integers, scans: Scans, sheet: dict[str, str]
+    prefix: str, rows: Integers, scans: Scans, stated: dict[str, str]
 ) -> Iterator[Stream]:
     """The scans of one sensor, and what it saw."""
     counts = np.array([len(scans.seen[row]) for row in rows])
@@ -285,7 +285,7 @@ def _sensor_streams(
         schemas.SCAN,
         scans.time_ns[rows],
         log_time_ns=scans.arrival_ns[rows],
-        metadata={**sheet, "origin": "/ownship/fix"},
+        metadata={**stated, "origin": "/ownship/fix"},
         scan_id=np.arange(len(rows)),
         detections=counts,
     )

@@ -124,7 +124,7 @@ def _radar(
         clutter = rng.uniform(-half_m, half_m, (count, 2))
         scans.append(rng.permutation(np.concatenate([(places[:, scan] + error_m)[is_seen], clutter])))
     counts, number = np.array([len(seen) for seen in scans]), np.arange(len(scans))
-    sheet = {
+    stated = {
         "sigma_m": parameters.sigma_m,
         "detection_probability": min(parameters.detection_probability, 0.999),
         "clutter_per_m2": max(parameters.clutter_per_scan, 1e-3) / parameters.side_m**2,
@@ -134,7 +134,7 @@ def _radar(
             "/radar/scan",
             schemas.SCAN,
             stamps_ns,
-            metadata={name: repr(value) for name, value in sheet.items()},
+            metadata={name: repr(value) for name, value in stated.items()},
             scan_id=number,
             detections=counts,
         ),

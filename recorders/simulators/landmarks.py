@@ -4,7 +4,8 @@ Odometry reads the velocity that holds from its stamp to the next; the robot dri
 white noise. Robots are the targets 1, 2, ..., landmarks the numbers after them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,13 @@ from numpy.typing import NDArray
 from recorders.log import Schema, Stream, make_stream, schemas
 from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.planar import drive, range_bearing, wrap_angle
-from recorders.recording import SIMULATION_EPOCH_NS, Recording, Simulator, simulation_stamps_ns
+from recorders.recording import (
+    SIMULATION_EPOCH_NS,
+    Recording,
+    Simulator,
+    named_generator,
+    simulation_stamps_ns,
+)
 from recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
 
 SENSORS = {
@@ -21,6 +28,16 @@ SENSORS = {
     "range": schemas.RANGE,
     "bearing": schemas.BEARING,
     "relative_bearing": schemas.RELATIVE_BEARING,
+}
+# See `named_generator`. The logs of a seed keep their bytes by these; a new sensor needs none.
+NUMBERS = {
+    "drive": 0,
+    "prior": 1,
+    "range_bearing": 2,
+    "range": 3,
+    "bearing": 4,
+    "relative_bearing": 5,
+    "fix": 6,
 }
 POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 
@@ -55,7 +72,7 @@ class Sightings(NamedTuple):
 
 
 def simulate(parameters: LandmarksParameters, rng: np.random.Generator) -> Recording:
-    """Record one run; every robot and sensor draws from a random stream of its own."""
+    """Record one run; every robot and sensor draws from a generator of its own, by its name."""
     map_rng, *robot_rngs = rng.spawn(1 + parameters.robots)
     half = 0.5 * parameters.arena_m
     landmarks = map_rng.uniform(-half, half, (parameters.landmarks, 2))
@@ -69,10 +86,10 @@ def simulate(parameters: LandmarksParameters, rng: np.random.Generator) -> Recor
             position_m=landmarks,
         )
     ]
-    children = [robot_rng.spawn(7) for robot_rng in robot_rngs]
-    drives = [_drive(parameters, number, rngs[0]) for number, rngs in enumerate(children)]
-    for number, rngs in enumerate(children, start=1):
-        streams += _robot_streams(parameters, number, drives, landmarks, rngs)
+    by_name = [partial(named_generator, robot_rng, numbers=NUMBERS) for robot_rng in robot_rngs]
+    drives = [_drive(parameters, number, rng_of("drive")) for number, rng_of in enumerate(by_name)]
+    for number, rng_of in enumerate(by_name, start=1):
+        streams += _robot_streams(parameters, number, drives, landmarks, rng_of)
     return Recording(streams)
 
 
@@ -111,7 +128,7 @@ def _robot_streams(
     number: int,
     drives: list[Drive],
     landmarks: NDArray[np.float64],
-    rngs: list[np.random.Generator],
+    rng_of: Callable[[str], np.random.Generator],
 ) -> list[Stream]:
     robot = drives[number - 1]
     prefix = f"/robot{number}"
@@ -119,7 +136,7 @@ def _robot_streams(
     truth = robot.poses.copy()
     truth[:, 2] = wrap_angle(truth[:, 2])
     sigma = np.array([parameters.prior_sigma_m, parameters.prior_sigma_m, parameters.prior_sigma_rad])
-    prior = truth[0] + rngs[1].normal(size=3) * sigma
+    prior = truth[0] + rng_of("prior").normal(size=3) * sigma
     streams = [
         make_stream(
             f"{prefix}/prior",
@@ -144,10 +161,11 @@ def _robot_streams(
         ),
     ]
     targets = _targets(parameters, number, drives, landmarks)
-    for (name, schema), sensor_rng in zip(SENSORS.items(), rngs[2:-1], strict=True):
+    for name, schema in SENSORS.items():
         sensor: Sensor = getattr(parameters, name)
         if sensor.rate_hz == 0:
             continue
+        sensor_rng = rng_of(name)
         seen = _look(sensor, robot, targets, sensor_rng)
         look, columns = _measure(schema, sensor, seen, sensor_rng)
         stated = {key: repr(getattr(sensor, key)) for key in ("sigma_range_m", "sigma_bearing_rad")}
@@ -162,7 +180,7 @@ def _robot_streams(
         )
         if sensor.outages_per_minute > 0:
             streams.append(_outages(f"{prefix}/{name}/outages", seen.outages_s))
-    return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rngs[-1])
+    return streams + _fix_streams(f"{prefix}/fix", parameters.fix, robot, rng_of("fix"))
 
 
 def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Generator) -> list[Stream]:

@@ -21,11 +21,11 @@ from replay.judging.errors.evaluation import (
     Errors,
     Innovations,
     chi_square_interval,
+    components_without_truth,
     errors_at,
     errors_of,
     innovations_of,
     split_topic,
-    unjudged,
 )
 from replay.judging.errors.truths import Doubt, Truths
 from replay.judging.metrics.means import MeansOfAll
@@ -73,7 +73,7 @@ class Judged(NamedTuple):
 
 
 @dataclass
-class Told:
+class StreamDiagnostics:
     """What a stream says of the replay itself, for sentences."""
 
     failed: dict[int, str] = field(default_factory=dict)
@@ -82,7 +82,7 @@ class Told:
     started: Counter[str] = field(default_factory=Counter)
     covered: Sums = field(default_factory=dict)
 
-    def merge(self, other: "Told") -> None:
+    def merge(self, other: "StreamDiagnostics") -> None:
         """Take in what was said of other runs."""
         self.failed |= other.failed
         self.skipped.update(other.skipped)
@@ -100,7 +100,7 @@ class Judge:
         metrics: what to compute; see `find_metrics`.
         gap_limit_s: the truth is not interpolated over longer gaps.
         first_run: the number of the first run in the whole ensemble.
-        settle_s: errors up to so long after the epoch are left out.
+        burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
     """
 
@@ -111,7 +111,7 @@ class Judge:
         *,
         gap_limit_s: float,
         first_run: int = 0,
-        settle_s: float | None = None,
+        burn_in_s: float | None = None,
         on_errors: Callable[[Errors], None] | None = None,
     ) -> None:
         self.runs = len(sources)
@@ -120,12 +120,12 @@ class Judge:
         self._truths = [Truths(source) for source in sources]
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
-        self._settle_s = settle_s
+        self._burn_in_s = burn_in_s
         self._on_errors = on_errors
         self._measured = Measurement(find_metrics() if metrics is None else metrics)
         self._quantities: dict[str, Quantities] = {}
         self._steps: dict[str, NDArray[np.int64]] = {}
-        self._told: dict[str, Told] = {}
+        self._diagnostics: dict[str, StreamDiagnostics] = {}
         self._unjudged: dict[str, str] = {}
         self._degrees: Counter[str] = Counter()
         self._bounds: dict[tuple[str, str], Bounds] = {}
@@ -167,8 +167,8 @@ class Judge:
         self._steps[topic] = begun + np.diff(rows.offsets)
         if errors is None:
             return
-        if self._settle_s is not None:
-            errors = errors_at(errors, errors.elapsed_s > self._settle_s + 1e-9)
+        if self._burn_in_s is not None:
+            errors = errors_at(errors, errors.elapsed_s > self._burn_in_s + 1e-9)
         judged.errors.append(errors)
         self._measured.add(topic, errors)
         if self._on_errors is not None:
@@ -186,24 +186,26 @@ class Judge:
     def _listen(self, topic: str, rows: Ragged) -> None:
         """Take in what a stream says of the replay itself."""
         schema = rows.stream.schema.full_name
-        told = self._told.setdefault(topic, Told())
+        diagnostics = self._diagnostics.setdefault(topic, StreamDiagnostics())
         speaking = np.flatnonzero(np.diff(rows.offsets)).tolist()
         if schema == GAUSSIAN:
             spoke = {self._first_run + run for run in speaking}
-            told.speaking = spoke | (told.speaking or set())
+            diagnostics.speaking = spoke | (diagnostics.speaking or set())
         elif schema == FAILURE:
             for run in speaking:
                 found = rows.of_run(run)
                 elapsed_s = (int(found.publish_time_ns[0]) - self._sources[run].epoch_ns) * 1e-9
                 reason = sentences_of(found.take(slice(0, 1)))[0]
                 sentence = f"{_what(topic)} failed at {elapsed_s:.3f} s: {reason}"
-                told.failed.setdefault(self._first_run + run, sentence)
+                diagnostics.failed.setdefault(self._first_run + run, sentence)
         elif schema == SKIPPED:
-            told.skipped.update(sentences_of(rows.stream))
+            diagnostics.skipped.update(sentences_of(rows.stream))
         elif schema == STARTED:
-            told.started.update(sentences_of(rows.stream))
+            diagnostics.started.update(sentences_of(rows.stream))
         elif schema == COVERAGE:
-            told.covered = plus(told.covered, covered(Output("", "", "", rows, self._sources)))
+            diagnostics.covered = plus(
+                diagnostics.covered, covered(Output("", "", "", rows, self._sources))
+            )
 
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
@@ -229,8 +231,8 @@ class Judge:
         self._means.merge(other._means)
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
-        for topic, theirs in other._told.items():
-            self._told.setdefault(topic, Told()).merge(theirs)
+        for topic, theirs in other._diagnostics.items():
+            self._diagnostics.setdefault(topic, StreamDiagnostics()).merge(theirs)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -262,7 +264,7 @@ class Judge:
         return {key: found[key] for key in self.metrics if key in found}
 
     @property
-    def tells(self) -> bool:
+    def has_numbers(self) -> bool:
         """Whether there are numbers, but for what a replay says of itself."""
         return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in TOLD))
 
@@ -275,7 +277,7 @@ class Judge:
         return found
 
     @property
-    def unjudged(self) -> list[str]:
+    def components_without_truth(self) -> list[str]:
         """A sentence for every estimate of which the truth lacks components."""
         return [sentence for sentence in self._unjudged.values() if sentence]
 
@@ -283,30 +285,32 @@ class Judge:
     def failures(self) -> list[str]:
         """A sentence for every run that an estimator could not follow to the end, or not at all."""
         said: dict[tuple[str, int], str] = {}
-        for topic, told in self._told.items():
-            silent = self._names.keys() - told.speaking if told.speaking is not None else set()
+        for topic, diagnostics in self._diagnostics.items():
+            silent = (
+                self._names.keys() - diagnostics.speaking if diagnostics.speaking is not None else set()
+            )
             said |= {(_what(topic), run): f"{_what(topic)} gave no estimates" for run in sorted(silent)}
-        for topic, told in self._told.items():
-            said |= {(_what(topic), run): sentence for run, sentence in told.failed.items()}
+        for topic, diagnostics in self._diagnostics.items():
+            said |= {(_what(topic), run): sentence for run, sentence in diagnostics.failed.items()}
         return [f"{self._names[run]}: {sentence}" for (_, run), sentence in said.items()]
 
     @property
-    def losses(self) -> list[str]:
+    def notes_of_coverage(self) -> list[str]:
         """A sentence for every case that was not estimated throughout, and for measurements not used.
 
         Those for what was assumed, as of where to begin, come first.
         """
         said = []
-        for topic, told in self._told.items():
-            for reason, count in told.started.items():
+        for topic, diagnostics in self._diagnostics.items():
+            for reason, count in diagnostics.started.items():
                 runs = f" (in {count} runs)" if count > 1 else ""
                 said.append(f"{_what(topic)}: {reason}{runs}")
-        for topic, told in self._told.items():
-            share = estimated_share(told.covered)
+        for topic, diagnostics in self._diagnostics.items():
+            share = estimated_share(diagnostics.covered)
             if share is not None and share < LEAST_SHARE:
                 percent = f"{100 * share:.1f} % of the span was estimated"
                 said.append(f"{_what(topic)}: {percent}; its figures are of that")
-            for reason, count in told.skipped.items():
+            for reason, count in diagnostics.skipped.items():
                 said.append(f"{_what(topic)}: {count} not used: {reason}")
         for what, bounds in self._bounds.items():
             if bounds.complaint:
@@ -370,7 +374,7 @@ def _what(topic: str) -> str:
 
 
 def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
-    names = unjudged(estimates, sources)
+    names = components_without_truth(estimates, sources)
     if not names:
         return ""
     verb, them = ("is", "it") if len(names) == 1 else ("are", "them")

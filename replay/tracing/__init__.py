@@ -1,5 +1,6 @@
 """Models as expression graphs: each function is called once with traced numbers, and is known then.
 
 From the graph of a function come its exact derivatives (`derivatives`), its machine code (`emission`),
-its Python and its formulas (`text`). Begin reading in `functions`, which is what models are wrapped in.
+the formulas that a person reads (`formulas`). Begin reading in `functions`, which is what models are
+wrapped in.
 """

@@ -12,8 +12,8 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.runs.campaigns import cells_of, judge_all
-from pipeline.runs.checkpoints import kept_cells
-from pipeline.runs.executors import Crew, processes
+from pipeline.runs.checkpoints import checkpoints_of
+from pipeline.runs.executors import PoolFactory, processes
 from pipeline.runs.experiment import Experiment, Setting, load_experiment, run_experiment
 from tests.bench.timing import cpu_seconds, seconds
 
@@ -49,15 +49,15 @@ def main() -> list[Row]:
     ]
 
 
-def _campaign(folder: Path, crew: Crew, runs: int = RUNS) -> Callable[[], object]:
+def _campaign(folder: Path, open_pool: PoolFactory, runs: int = RUNS) -> Callable[[], object]:
     name, experiment = load_experiment("landmarks", {}, {"runs": runs})
-    return partial(run_experiment, name, experiment, folder / "result", logs=0, crew=crew)
+    return partial(run_experiment, name, experiment, folder / "result", logs=0, open_pool=open_pool)
 
 
 def _one_cell(experiment: Experiment, folder: Path) -> None:
     """A campaign of one cell: it is worked off, kept, read again and merged."""
-    with kept_cells(folder / "one") as kept:
-        setting = Setting(folder, folder / "one", logs=0, draws=False, kept=kept)
+    with checkpoints_of(folder / "one") as checkpoints:
+        setting = Setting(folder, folder / "one", logs=0, draws=False, checkpoints=checkpoints)
         list(judge_all([experiment], setting))
 
 

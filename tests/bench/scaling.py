@@ -21,7 +21,7 @@ import matplotlib as mpl
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, draw, level
 from pipeline.runs.campaigns import Cell, cells_of
-from pipeline.runs.checkpoints import kept_cells
+from pipeline.runs.checkpoints import checkpoints_of
 from pipeline.runs.ensemble import RUNS_AT_ONCE
 from pipeline.runs.executors import processes
 from pipeline.runs.experiment import Setting, load_experiment, run_experiment
@@ -77,7 +77,7 @@ def measure() -> Measured:
 
 def _campaign(folder: Path, workers: int) -> None:
     name, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
-    run_experiment(name, experiment, folder / "result", logs=0, crew=processes(workers))
+    run_experiment(name, experiment, folder / "result", logs=0, open_pool=processes(workers))
 
 
 def _measured_cells(folder: Path) -> tuple[float, float, int]:
@@ -85,13 +85,13 @@ def _measured_cells(folder: Path) -> tuple[float, float, int]:
     _, experiment = load_experiment("landmarks", {}, {"runs": RUNS})
     cells = cells_of(experiment, Setting(folder, folder, logs=0, draws=False))[:7]
     cell_s, driver_s, left, whole = [], [], b"", None
-    with processes(1)() as team, kept_cells(folder / "cells") as kept:
-        kept.begin()
+    with processes(1)() as pool, checkpoints_of(folder / "cells") as checkpoints:
+        checkpoints.begin()
         for cell in cells:
-            left, taken_s = team.executor.submit(_timed, cell, kept.place_of(cell.key)).result()
+            left, taken_s = pool.executor.submit(_timed, cell, checkpoints.place_of(cell.key)).result()
             begin_s = process_time()
-            kept.write(cell.key, left)
-            done = kept.read(cell.key)
+            checkpoints.write(cell.key, left)
+            done = checkpoints.read(cell.key)
             if whole is None:
                 whole = done
             else:

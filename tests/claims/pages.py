@@ -43,16 +43,17 @@ class Stored:
     def __init__(self, result: Mapping[str, Any]) -> None:
         self.settings: dict[str, Any] = result["settings"]
         self._name: str = result["experiment"]
-        self._metrics: dict[str, MetricValue] = result["metrics"]
-        self._claims: list[dict[str, str]] = result["claims"]
+        self.metrics: dict[str, MetricValue] = result["metrics"]
+        self.intervals: dict[str, list[float | None]] = result.get("intervals", {})
+        self.stated_claims: list[dict[str, str]] = result["claims"]
 
     def __getitem__(self, key: str) -> MetricValue:
         """A metric."""
-        return self._metrics[key]
+        return self.metrics[key]
 
     @property
     def verdicts(self) -> str:
-        """How many claims are confirmed, refuted and not reproducible."""
+        """How many claims are confirmed, refuted, not shown and not reproducible."""
         return ", ".join(map(str, self._counts().values()))
 
     @property
@@ -71,11 +72,11 @@ class Stored:
         )
 
     def _counts(self) -> dict[str, int]:
-        found = Counter(claim["verdict"] for claim in self._claims)
+        found = Counter(claim["verdict"] for claim in self.stated_claims)
         return {verdict: found[verdict] for verdict in get_args(Verdict)}
 
     def _rows(self) -> Iterator[str]:
-        for claim in self._claims:
+        for claim in self.stated_claims:
             verdict = ": ".join(filter(None, [claim["verdict"], claim["why"]]))
             cells = [claim["claim"], claim["paper"], claim["ours"], verdict]
             yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"

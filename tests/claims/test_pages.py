@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.output.claims import Claim
+from pipeline.output.claims import Claim, decide, known
 from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.runs.experiment import load_experiment, shipped
+from pipeline.runs.experiment import Study, load_experiment, numbers_of, shipped
 from recorders.importers.tables.mapping import shipped as shipped_mappings
+from recorders.parameters import build
+from recorders.registry import load
 from tests.bench import __main__ as bench
 from tests.claims import pages
 from tests.docs.reference import reference
@@ -38,7 +40,17 @@ def test_every_experiment_has_its_result_and_every_claim_its_page() -> None:
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         stated = {key: value for key, value in result.settings.items() if key != "parameters"}
         assert stated == settings, f"make docs-claims NAMES={name}"
-        assert templates.count(f"{{{name}.claims}}") == (result.verdicts != "0, 0, 0"), name
+        assert templates.count(f"{{{name}.claims}}") == (result.verdicts != "0, 0, 0, 0"), name
+
+
+def test_verdicts_follow_from_the_numbers_that_are_kept() -> None:
+    """Claims are made anew from the metrics of each stored result, by what its experiment states."""
+    for name, result in pages.stored().items():
+        _, experiment = load_experiment(name, {}, {})
+        study = load("studies", experiment.study, Study)
+        numbers = numbers_of(experiment, build(study.options, experiment.options, name))
+        found = decide(experiment.claims, result.metrics, result.intervals, numbers)
+        assert [vars(claim) for claim in map(known, found)] == result.stated_claims, name
 
 
 def test_the_systems_are_all_there_and_counted() -> None:
@@ -51,7 +63,7 @@ def test_the_systems_are_all_there_and_counted() -> None:
         names = re.findall(r"`(.*?)`", experiments)
         assert counts.split("; ") == [pages.stored()[name].verdicts for name in names], names
         named += names
-    with_claims = {name for name, each in pages.stored().items() if each.verdicts != "0, 0, 0"}
+    with_claims = {name for name, each in pages.stored().items() if each.verdicts != "0, 0, 0, 0"}
     assert sorted(named) == sorted(with_claims)
     demo = load_experiment("landmarks", {}, {})[1]
     assert f"replays {ONES[len(demo.estimators)]} estimators" in README
@@ -71,7 +83,8 @@ def test_a_changed_result_changes_its_page(tmp_path: Path, monkeypatch: pytest.M
     text = pages.rendered(f"A\n<!-- results\n{template}\n-->\nold\n<!-- end -->\nZ")
     assert text.partition("-->\n")[2] == (
         "0.25 and 1\n\n"
-        "`fuselog run mine` (seed 3, 7 runs): 1 confirmed, 1 refuted, 0 not reproducible.\n\n"
+        "`fuselog run mine` (seed 3, 7 runs): 1 confirmed, 1 refuted, 0 not shown, "
+        "0 not reproducible.\n\n"
         "| claim | paper | ours | verdict |\n|---|---|---|---|\n"
         "| a \\| b | 1 | 2 | refuted: why |\n| c | 1 | 1 | confirmed |\n<!-- end -->\nZ"
     )

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.command_line import main
-from pipeline.runs.checkpoints import Kept
+from pipeline.runs.checkpoints import Checkpoints
 from tests.faults import Tally
 
 COMMANDS = (
@@ -56,22 +56,22 @@ def _prepared(number: int, command: str) -> tuple[Path, Path, dict[str, str]]:
     whole = _state(Path("out"))
     shutil.rmtree("out")
     places = []
-    finish = Kept.end
+    finish = Checkpoints.end
     for seed in "12":
-        Kept.end = partialmethod(_stopped, finish)  # type: ignore[method-assign, assignment]
+        Checkpoints.end = partialmethod(_stopped, finish)  # type: ignore[method-assign, assignment]
         try:
             _main(command.replace("SEED", seed))
         finally:
-            Kept.end = finish  # type: ignore[method-assign]
+            Checkpoints.end = finish  # type: ignore[method-assign]
         shutil.rmtree("out")
         places.append(Path(f"kept-{number}-{seed}"))
         Path("out.unfinished").rename(places[-1])
     return places[0], places[1], whole
 
 
-def _stopped(kept: Kept, finish: Callable[..., None], **_: bool) -> None:
+def _stopped(checkpoints: Checkpoints, finish: Callable[..., None], **_: bool) -> None:
     """The end of a campaign as one that was stopped has it."""
-    finish(kept, is_done=False)
+    finish(checkpoints, is_done=False)
 
 
 def _meddle(folder: Path, others: Path, rng: np.random.Generator) -> str:

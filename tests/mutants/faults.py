@@ -86,7 +86,7 @@ FAULTS = [
     ),
     Fault(
         "recorders/simulators/landmarks.py",
-        "prior = truth[0] + rngs[1].normal(size=3) * sigma",
+        'prior = truth[0] + rng_of("prior").normal(size=3) * sigma',
         "prior = truth[0] + np.random.default_rng(0).normal(size=3) * sigma",
         LANDMARKS,
     ),
@@ -480,9 +480,15 @@ FAULTS = [
     ),
     Fault(
         "pipeline/output/claims.py",
-        'if not re.search(r"\\bnan\\b", claim.ours):',
+        'if claim.verdict == "not reproducible" or not re.search(r"\\bnan\\b", claim.ours):',
         "if True:",
-        "tests/pipeline/test_experiments.py",
+        "tests/pipeline/test_claims.py",
+    ),
+    Fault(
+        "pipeline/output/claims.py",
+        'verdict = "not shown" if holds is None else "confirmed" if holds else "refuted"',
+        'verdict = "confirmed" if holds else "refuted"',
+        "tests/pipeline/test_claims.py",
     ),
     Fault(
         "pipeline/output/results.py",

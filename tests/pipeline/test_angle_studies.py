@@ -31,7 +31,7 @@ def verdicts(result: dict, start: str) -> dict[str, str]:
 
 
 def test_table_iii_is_refuted_as_stated_and_confirmed_as_reproduced(three_sensors: tuple) -> None:
-    found = verdicts(three_sensors[1], "sigma_CRLB of table III")
+    found = verdicts(three_sensors[1], "sigma_CRLB of the table of biases")
     assert found == {"1 deg, 0.34 mrad": "refuted", "3 deg, 0.30 mrad": "confirmed"}
 
 

@@ -17,8 +17,8 @@ import pytest
 
 from pipeline.command_line import main
 from pipeline.runs import campaigns
-from pipeline.runs.checkpoints import kept_cells
-from pipeline.runs.executors import Here, Team, crew_of, version_of_code
+from pipeline.runs.checkpoints import checkpoints_of
+from pipeline.runs.executors import InlineExecutor, WorkerPool, pool_for, version_of_code
 from pipeline.runs.experiment import experiment_of_logs, load_experiment, run_experiment
 from recorders.errors import BadInput
 from recorders.log import write_log
@@ -31,10 +31,10 @@ RUNS = 260
 SETTINGS = {"duration_s": 3}
 
 
-def run(folder: Path, crew=None, runs: int = RUNS, **options) -> dict[str, bytes]:
+def run(folder: Path, open_pool=None, runs: int = RUNS, **options) -> dict[str, bytes]:
     """Run the experiment; returns the bytes of all files of its result but for the timeline."""
     name, experiment = load_experiment("landmarks", SETTINGS, {"runs": runs})
-    run_experiment(name, experiment, folder, logs=2, crew=crew, **options)
+    run_experiment(name, experiment, folder, logs=2, open_pool=open_pool, **options)
     return contents(folder)
 
 
@@ -112,7 +112,7 @@ def test_another_way_of_working_gives_the_same_bytes(whole, tmp_path, worked_off
         @contextmanager
         def backwards():
             """Works on all cells at once, and the last one is done first."""
-            yield Team(Backwards(), 3)
+            yield WorkerPool(Backwards(), 3)
 
         assert run(place, backwards, errors=True) == whole[1]
         assert worked_off == [256, 128, 0]
@@ -121,7 +121,7 @@ def test_another_way_of_working_gives_the_same_bytes(whole, tmp_path, worked_off
         kept.rename(place)
 
 
-class Backwards(Here):
+class Backwards(InlineExecutor):
     """Begins when three are there, with the last."""
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monke
 def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkeypatch):
     place = tmp_path / "result"
     with monkeypatch.context() as patch:
-        patch.setattr(campaigns.Kept, "hand_over", lambda *_: 1 / 0)
+        patch.setattr(campaigns.Checkpoints, "hand_over", lambda *_: 1 / 0)
         with pytest.raises(BadInput, match="division by zero"):
             run(place, runs=130)
     worked_off.clear()
@@ -190,7 +190,7 @@ def test_a_dead_worker_costs_its_cell_which_is_tried_again(tmp_path, worked_off)
     @contextmanager
     def dying():
         teams.append(Dying(deaths=len(teams) < 2))
-        yield Team(teams[-1], 2)
+        yield WorkerPool(teams[-1], 2)
 
     files = run(tmp_path / "result", dying)
     assert len(teams) == 3
@@ -199,13 +199,13 @@ def test_a_dead_worker_costs_its_cell_which_is_tried_again(tmp_path, worked_off)
 
     @contextmanager
     def hopeless():
-        yield Team(Dying(deaths=True), 1)
+        yield WorkerPool(Dying(deaths=True), 1)
 
     with pytest.raises(BadInput, match="runs 0 to 127: the process that computed them died 3 times"):
         run(tmp_path / "other", hopeless)
 
 
-class Dying(Here):
+class Dying(InlineExecutor):
     """The process of the first cell dies, as in a pool, which is then of no use."""
 
     def __init__(self, *, deaths: bool) -> None:
@@ -231,9 +231,9 @@ def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
         recording, run = record_run("landmarks", {"duration_s": 3.0}, seed)
         write_log(log, recording.streams, run)
 
-    def replayed(crew=None) -> dict[str, bytes]:
+    def replayed(open_pool=None) -> dict[str, bytes]:
         experiment = experiment_of_logs(logs, ["ekf"]).with_settings({}, {})
-        run_experiment("drives", experiment, place, logs=1, errors=True, crew=crew)
+        run_experiment("drives", experiment, place, logs=1, errors=True, open_pool=open_pool)
         names = sorted(path for path in place.rglob("*") if path.is_file() and path.suffix != ".rrd")
         return {path.relative_to(place).as_posix(): path.read_bytes() for path in names}
 
@@ -248,7 +248,7 @@ def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
 
     @contextmanager
     def elsewhere():
-        yield Team(Elsewhere(hidden), 1, sees)
+        yield WorkerPool(Elsewhere(hidden), 1, sees)
 
     assert replayed(elsewhere) == files
     assert "estimates/run-0000.mcap" in files
@@ -258,7 +258,7 @@ def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
         replayed(elsewhere)
 
 
-class Elsewhere(Here):
+class Elsewhere(InlineExecutor):
     """Works as another machine would, where some folders are not."""
 
     def __init__(self, hidden: list[Path]) -> None:
@@ -307,8 +307,8 @@ def test_what_is_not_ours_stays(tmp_path):
         run(place, runs=130)
     assert note.read_text() == "years of work"
     note.unlink()
-    with kept_cells(place) as kept:
-        kept.begin()
+    with checkpoints_of(place) as checkpoints:
+        checkpoints.begin()
         with pytest.raises(BadInput, match="another fuselog command is working on it"):
             run(place, runs=130)
 
@@ -419,8 +419,8 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
 def test_dask_workers_give_the_same_bytes(place, files):
     """Of a cluster of its own, and of one that is there, whose worker shares no files with it."""
     distributed = pytest.importorskip("distributed")
-    assert run(place, crew_of(None, "local:2", RUNS)) == files
+    assert run(place, pool_for(None, "local:2", RUNS)) == files
     shutil.rmtree(place)
     loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **loopback) as cluster:
-        assert run(place, crew_of(None, cluster.scheduler_address, RUNS)) == files
+        assert run(place, pool_for(None, cluster.scheduler_address, RUNS)) == files

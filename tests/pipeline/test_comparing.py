@@ -1,4 +1,4 @@
-"""Comparing: what two sides are made of, what is said of them, what is refused."""
+"""Comparing: what two candidates are made of, what is said of them, what is refused."""
 
 import re
 import shlex
@@ -90,7 +90,7 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
     result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As one from before a change of the code: its own rows count, not those of today."""
-    import pipeline.comparing.sides as sides
+    import pipeline.comparing.candidates as candidates
 
     def changed(*logs: Any, **options: Any) -> Any:
         wrong = [{label: {"sigma_range_m": 0.2} if label == "ekf" else {}} for label in logs[1][0]]
@@ -98,7 +98,7 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
 
     kept = fl.compare(result, result, estimators=["ekf"])
     assert set(kept.table["verdict"]) == {"no difference"}
-    monkeypatch.setattr(sides, "replay", changed)
+    monkeypatch.setattr(candidates, "replay", changed)
     found = fl.compare(result, estimators=["dead-reckoning", "ekf"])
     [note] = [each for each in found.notes if "replayed now" in each]
     assert "of ekf" in note

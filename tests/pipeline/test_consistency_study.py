@@ -7,7 +7,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.output.claims import decide
 from pipeline.output.results import Outcome
+from pipeline.runs.experiment import load_experiment
 from pipeline.studies.toolkit import localization
 from pipeline.studies.toolkit.consistency import ConsistencyOptions, study
 
@@ -29,14 +31,16 @@ def test_stamps_count_once_aligned_and_each_estimator_is_claimed(monkeypatch: py
         return Outcome(tables={"steps": pd.concat([good, bad])})
 
     monkeypatch.setattr(localization, "study", judged)
-    setting = SimpleNamespace(options=ConsistencyOptions(aligned_s=5.0, least_share=0.9))
+    setting = SimpleNamespace(options=ConsistencyOptions(aligned_s=5.0))
     outcome = study(None, setting)  # type: ignore[arg-type]
     assert outcome.metrics == {
         "good.nees_aligned_within_95.body": 0.9,
+        "good.nees_aligned.body": pytest.approx(3.11),
         "bad.nees_aligned_within_95.body": 0.8,
+        "bad.nees_aligned.body": pytest.approx(3.0),
     }
-    assert [claim.verdict for claim in outcome.claims] == ["confirmed", "refuted"]
-    assert outcome.claims[0].claim.startswith(
-        "good: from 5 s on, the mean NEES over the runs lies in its"
-    )
-    assert outcome.claims[1].ours == "80.0% of 10 stamps, 7 runs; mean NEES 3.00"
+    _, experiment = load_experiment("navigation-heading", {}, {})
+    claims = decide(experiment.claims, outcome.metrics, {}, {"aligned_s": 5.0, "runs": 7.0})
+    assert [claim.verdict for claim in claims] == ["confirmed", "refuted"]
+    assert claims[0].claim.startswith("good: from 5 s on, the mean NEES over the runs lies in its")
+    assert claims[1].ours == "80.0 % of the stamps, 7 runs; mean NEES 3.00"

@@ -115,7 +115,7 @@ def test_outages_are_bridged_as_the_sheet_says(
     assert found("ekf.over_rmse_m") < 1.25 * filtered[1]
     assert found("smoother.over_rmse_m") < 1.25 * smoothed
     assert 0.3 < found("ekf.end_nees") < 5.0
-    windows = [key for key in result.metrics if key.startswith(f"ekf.over_rmse_m.{length_s}s-at-")]
+    windows = [key for key in result.metrics if key.startswith(f"ekf.window_rmse_m.{length_s}s-at-")]
     assert len(windows) == count
 
 

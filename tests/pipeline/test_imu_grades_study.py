@@ -1,10 +1,11 @@
 """Units of several grades while a receiver is silent: which errors count, what so many drives show."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from pipeline.studies.navigation.imu_grades import Limit, Span, _claim, horizontal
+from pipeline.output.claims import decide
+from pipeline.runs.experiment import load_experiment
+from pipeline.studies.navigation.imu_grades import Span, horizontal
 from replay.judging.errors.evaluation import Errors
 
 
@@ -36,22 +37,23 @@ def test_errors_count_in_the_outage_alone():
 
 
 @pytest.mark.parametrize(
-    ("errors_m", "runs", "verdict"),
+    ("largest_m", "runs", "verdict"),
     [
-        ([1.9] * 59, 59, "confirmed"),
-        ([1.9] * 58 + [2.1], 59, "refuted"),  # one beyond it, and it is not shown
-        ([1.9] * 58, 58, "refuted"),  # too few to show anything
+        (0.9, 59, "confirmed"),
+        (1.1, 59, "refuted"),  # one beyond it
+        (0.9, 58, "refuted"),  # too few to show anything
     ],
 )
-def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(errors_m, runs, verdict):
-    table = pd.DataFrame({"grade": "g", "estimator": "ekf", "after_s": 30.0, "error_m": errors_m})
-    assert _claim(Limit(grade="g", after_s=30.0, most_m=2.0), "ekf", table, runs).verdict == verdict
+def test_a_limit_is_held_where_no_drive_of_enough_is_beyond_it(largest_m, runs, verdict):
+    _, experiment = load_experiment("imu-grades", {}, {})
+    metrics = {"ekf.horizontal_95_m.tactical-30s": largest_m}
+    claims = decide(experiment.claims, metrics, {}, {"runs": runs})
+    [found] = [each for each in claims if each.claim.startswith("tactical: 30 s after")]
+    assert found.verdict == verdict
 
 
-def test_a_grade_that_is_not_there_and_a_drive_without_outage_are_named(fuselog, tmp_path):
-    limit = 'limits=[{grade="golden",after_s=1.0,most_m=1.0}]'
+def test_a_drive_without_outage_is_named(fuselog, tmp_path):
     command = ["run", "imu-grades", "--out", str(tmp_path / "out"), "--set"]
-    assert "no grade 'golden'; there are consumer" in fuselog(*command, f"options.{limit}").err
     assert (
         "0 outages; give exactly one"
         in fuselog(*command, "gnss.outages_s=[]", "--set", "duration_s=12.0", "--set", "runs=1").err

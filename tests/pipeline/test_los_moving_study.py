@@ -4,7 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.studies.optical.moving import _claims, prior_sigmas, seconds_of, unknowns, weakest
+from pipeline.output.claims import decide
+from pipeline.output.results import Outcome
+from pipeline.runs.experiment import load_experiment
+from pipeline.studies.optical.moving import _measure, prior_sigmas, seconds_of, unknowns, weakest
 from recorders.simulators.moving_optical import MovingOpticalParameters
 from replay.judging.errors.evaluation import Errors
 
@@ -73,8 +76,14 @@ def verdicts(case: str, least: float, left: float) -> list[str]:
     square = left * 25e-6 / 3
     rows = [("smoother", run, 60, square * (1 + run / 9), 1.0) for run in range(4)]
     columns = ["estimator", "run", "second", "common_roll_rad2", "nees_per_component"]
-    claims = _claims(case, pd.DataFrame(rows, columns=columns), told, sigma)
-    return [claim.verdict for claim in claims[:2]]
+    table = pd.DataFrame(rows, columns=columns)
+    unjudged = ("target_m2", "bias_rad2", "clock_s2")
+    outcome = Outcome()
+    _measure(case, table.assign(**dict.fromkeys(unjudged, np.nan)), told, sigma, outcome)
+    _, experiment = load_experiment("los-moving", {}, {})
+    claims = decide(experiment.claims, outcome.metrics, outcome.intervals, {})
+    beginnings = (f"{case}: what is measured", f"{case}: the roll")
+    return [claim.verdict for claim in claims if claim.claim.startswith(beginnings)]
 
 
 def test_what_is_expected_depends_on_the_case():

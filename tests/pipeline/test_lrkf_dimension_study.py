@@ -4,14 +4,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.output.claims import decide
+from pipeline.output.results import Outcome
 from pipeline.runs.experiment import Experiment, load_experiment, run_experiment
 from pipeline.studies.sampling.lrkf_dimension import (
     Drive,
     Options,
     Waves,
-    _drive_claims,
-    _drive_metrics,
     exact,
+    measure_drives,
     moment_errors,
     sampled,
     samplings_of,
@@ -55,12 +56,17 @@ def test_a_share_that_pays_has_its_whole_interval_beyond_it():
         rows += [("s2kf-100", run, ratio, 1.0, 100) for run, ratio in enumerate(ratios)]
         columns = ["estimator", "run", "position_rmse_m", "nees_per_component", "samples"]
         table = pd.DataFrame(rows, columns=columns).assign(drive="d")
-        pays = _drive_metrics(table, Options())["lrkf.samples_that_pay.d"]
-        return [claim.verdict for claim in _drive_claims(table, Options())], pays
+        table = pd.concat([table, table[table["estimator"] == "ukf"].assign(estimator="ekf")])
+        outcome = Outcome()
+        measure_drives(table, Options(), outcome)
+        _, experiment = load_experiment("lrkf-dimension", {}, {})
+        claims = decide(experiment.claims, outcome.metrics, outcome.intervals, {})
+        [found] = [each.verdict for each in claims if each.claim.startswith("d: 100 LCD samples")]
+        return found, outcome.metrics["lrkf.samples_that_pay.d"]
 
-    assert verdicts([0.98, 0.981, 0.979, 0.98]) == (["confirmed"], 100.0)
-    assert verdicts([0.7, 1.2, 0.8, 1.22]) == (["refuted"], 100.0)
-    assert verdicts([0.995, 0.994, 0.995, 0.996]) == (["refuted"], 7.0)
+    assert verdicts([0.98, 0.981, 0.979, 0.98]) == ("confirmed", 100.0)
+    assert verdicts([0.7, 1.2, 0.8, 1.22]) == ("not shown", 100.0)
+    assert verdicts([0.995, 0.994, 0.995, 0.996]) == ("refuted", 7.0)
 
 
 def test_the_study_runs_without_drives_and_asks_for_samplings(tmp_path):

@@ -219,10 +219,11 @@ def test_the_verdict_says_which_claims_hold() -> None:
         Claim("A is 1", "1", "1", "confirmed"),
         Claim("B is 2", "2", "3", "refuted"),
         Claim("C is 3", "3", "", "not reproducible"),
+        Claim("D is 4", "4", "3 to 5", "not shown"),
     ]
     assert verdict(_result({}, claims)) == (
         "a, b over 4 runs of s, seed 7.",
-        "1 of 3 claims confirmed; 1 refuted: “B is 2”; 1 not reproducible.",
+        "1 of 4 claims confirmed; 1 refuted: “B is 2”; 1 not shown; 1 not reproducible.",
     )
 
 

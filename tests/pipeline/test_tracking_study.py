@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from pipeline.output.results import Outcome
 from pipeline.runs.experiment import load_experiment, run_experiment
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval
-from pipeline.studies.tracking.tracking import difference, figures_of, lower
+from pipeline.studies.toolkit.repetitions import mean_interval
+from pipeline.studies.tracking.tracking import figures_of, measure_changes
 from replay.judging.tracks.errors import TracksAt
 
 
@@ -40,22 +41,23 @@ def test_an_interval_of_a_mean():
     assert mean_interval([2.0])[0] == 2
 
 
-def test_a_claim_holds_where_all_of_its_intervals_do():
+def test_estimators_are_compared_run_by_run():
+    """What one of them lacks, as a target that it never follows, has no number."""
     table = pd.DataFrame(
         {
             "estimator": ["a"] * 5 + ["b"] * 5,
             "run": [*range(5)] * 2,
             "gospa_m": [0.0] * 5 + [1, 2, 3, 4, 5],
+            "target1_rmse_m": [1.0] * 5 + [np.nan] * 5,
         }
     )
-    gained = difference(table, "gospa_m", "a", "b")
-    assert gained.mean == -3
-    assert gained.high == pytest.approx(-3 + 2.776 * 0.7071, abs=1e-3)
-    assert lower("a is better", "", "m", {"GOSPA": gained}).verdict == "confirmed"
-    unsure = lower("both", "", "m", {"GOSPA": gained, "RMSE": Interval(-1.0, -3.0, 1.0)}, "few runs")
-    assert (unsure.verdict, unsure.why) == ("refuted", "the interval of RMSE holds zero; few runs")
-    worse = lower("worse", "", "m", {"GOSPA": Interval(2.0, 1.0, 3.0)})
-    assert (worse.verdict, worse.why) == ("refuted", "")
+    outcome = Outcome()
+    measure_changes(table, [("a", "b"), ("a", "missing")], outcome, "case")
+    low, high = outcome.intervals["a.change_in_gospa_m.b-case"]
+    assert outcome.metrics["a.change_in_gospa_m.b-case"] == -3
+    assert (low, high) == pytest.approx((-3 - 2.776 * 0.7071, -3 + 2.776 * 0.7071), abs=1e-3)
+    assert np.isnan(outcome.metrics["a.change_in_target1_rmse_m.b-case"])
+    assert len(outcome.metrics) == 2
 
 
 def test_crossing_targets(tmp_path: Path):

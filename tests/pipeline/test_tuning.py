@@ -19,7 +19,7 @@ import pytest
 
 import fuselog as fl
 from pipeline.output.results import read_result
-from pipeline.runs.executors import Here
+from pipeline.runs.executors import InlineExecutor
 from pipeline.tuning.objective import Best
 from pipeline.tuning.search import Cost, curvature
 from recorders.log import RunMetadata
@@ -418,7 +418,7 @@ def test_any_number_of_cores_finds_the_same(
     assert found[0] == found[1]
 
 
-class Away(Here):
+class Away(InlineExecutor):
     """Does the work as another process would: what comes and goes is pickled."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any) -> Future[Any]:
@@ -445,7 +445,7 @@ def test_workers_find_the_same(seen: list[fl.MemorySource]) -> None:
             executor=Away(),
         )
 
-    class Dying(Here):
+    class Dying(InlineExecutor):
         def submit(self, *_: Any, **__: Any) -> Future[Any]:
             future: Future[Any] = Future()
             future.set_exception(BrokenExecutor("it was killed"))

@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, expon, kstest, norm, poisson, uniform
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from recorders.models.geodesy import into_tangent_plane
 from recorders.models.planar import drive, range_bearing, wrap_angle
-from recorders.recording import SIMULATION_EPOCH_NS, record_run
+from recorders.recording import SIMULATION_EPOCH_NS, named_generator, record_run
+from recorders.simulators import landmarks
+from recorders.simulators.landmarks_parameters import Fixes, LandmarksParameters, Sensor
 
 Floats = NDArray[np.float64]
 SURE = 1e-4  # how rarely an honest simulator fails one of these tests; the seeds are fixed
@@ -43,6 +45,38 @@ def assert_share(count: int, total: int, probability: float) -> None:
 
 
 # Sensors.
+
+
+class WithSonar(LandmarksParameters):
+    """One sensor more."""
+
+    sonar: Sensor = Sensor(rate_hz=4.0, outages_per_minute=10.0)
+
+
+def test_one_more_sensor_changes_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever it stands among them; its own values are like no other's."""
+    others = {name: Sensor(rate_hz=4.0, dropout_probability=0.1) for name in landmarks.SENSORS}
+    values = {"duration_s": 10.0, "robots": 2, "fix": Fixes(rate_hz=1.0), **others}
+    before = landmarks.simulate(LandmarksParameters(**values), np.random.default_rng(3)).streams
+    monkeypatch.setattr(landmarks, "SENSORS", {"sonar": schemas.RANGE, **landmarks.SENSORS})
+    after = landmarks.simulate(WithSonar(**values), np.random.default_rng(3)).streams
+    streams = {stream.topic: stream for stream in after}
+    assert set(streams) - {stream.topic for stream in before} == {
+        f"/robot{number}/sonar{leaf}" for number in (1, 2) for leaf in ("", "/outages")
+    }
+    for stream in before:
+        for name, column in stream.columns.items():
+            assert_array_equal(streams[stream.topic][name], column, err_msg=f"{stream.topic} {name}")
+    first, second = (streams[f"/robot{number}/sonar"]["range_m"] for number in (1, 2))
+    assert not np.isin(first, second).any()
+    assert not np.isin(first, streams["/robot1/range"]["range_m"]).any()
+
+
+def test_sensors_draw_as_before_they_had_generators_by_name() -> None:
+    children = np.random.default_rng(5).spawn(7)
+    for name, number in landmarks.NUMBERS.items():
+        own = named_generator(np.random.default_rng(5), name, landmarks.NUMBERS)
+        assert own.random() == children[number].random()
 
 
 def test_noise_and_bias_are_gaussian_as_stated():

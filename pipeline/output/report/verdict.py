@@ -55,8 +55,9 @@ def _of_claims(result: Result) -> str:
         named = [f"“{shorten(each, LONGEST_CLAIM, placeholder=' …')}”" for each in refuted[:MOST_CLAIMS]]
         more = f" and {len(refuted) - MOST_CLAIMS} more" if len(refuted) > MOST_CLAIMS else ""
         said.append(f"{len(refuted)} refuted: {', '.join(named)}{more}")
-    if counts["not reproducible"]:
-        said.append(f"{counts['not reproducible']} not reproducible")
+    for other in ("not shown", "not reproducible"):
+        if counts[other]:
+            said.append(f"{counts[other]} {other}")
     return "; ".join(said) + "."
 
 

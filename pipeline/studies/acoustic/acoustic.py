@@ -10,14 +10,17 @@ from scipy.stats import skew
 from pipeline.output.results import Outcome
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.studies.acoustic.cases import (
+    CROSS,
+    LOCAL,
+    NATIVE,
     AcousticOptions,
     Case,
     Maps,
     area_ratios,
+    hearing,
     range_errors_m,
     run_case,
 )
-from pipeline.studies.acoustic.claims import claims
 from pipeline.studies.acoustic.figures import figures
 from pipeline.studies.toolkit.repetitions import require_spread
 from replay.judging.consistency.consistency import component_error_squared, ellipse_area
@@ -37,7 +40,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         run_case(experiment, setting, *pair)
         for pair in setting.progress(pairs, "scenarios and noises", len(pairs))
     ]
-    outcome = Outcome(claims=claims(cases, options), figures=figures(cases, options, experiment.runs))
+    outcome = Outcome(figures=figures(cases, options, experiment.runs))
     outcome.tables = {
         "sweep": _table_of_sweep(cases, experiment.runs),
         "components": _table_of_components(cases),
@@ -47,6 +50,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     }
     for number in range(1, len(options.scenarios) + 1):
         outcome.metrics |= _metrics([case for case in cases if case.number == number])
+    outcome.metrics |= _metrics_of_maps(outcome.tables["maps"])
     hashes = "".join(case.input_sha256 for case in cases)
     outcome.input_sha256 = hashlib.sha256(hashes.encode()).hexdigest()
     return outcome
@@ -158,14 +162,47 @@ def _metrics(cases: list[Case]) -> dict[str, Any]:
                 f"{label}.position_rmse_m.{name}": mode.rmse_m,
                 f"{label}.position_bound_m.{name}": mode.bound_m,
                 f"{label}.ellipse_area_m2.{name}": mode.area_m2,
+                f"{label}.ellipse_area_ratio.{name}": mode.area_ratio,
                 f"{label}.far_per_1000.{name}": mode.far_per_1000,
                 f"{label}.converged_share.{name}": mode.converged,
             }
-    for label in cases[0].modes:
+        errors = [error for error, _ in range_errors_m(case).values()]
+        values |= {
+            f"shockwave.heard_by.{name}": hearing(case),
+            f"range.skew.{name}": [float(skew(error)) for error in errors],
+            f"range.mean_error_m.{name}": [float(error.mean()) for error in errors],
+        }
+        native = case.modes[NATIVE]
+        for component, sigma in zip(native.components, np.sqrt(np.diagonal(native.bound)), strict=True):
+            if component.startswith("sensor_"):
+                gain = 100.0 * (1.0 - float(sigma) / case.parameters.sigma_position_m)
+                values[f"{NATIVE}.sensor_gain_percent.{name}-{component}"] = gain
+    for label in (CROSS, LOCAL):
+        if label in cases[-1].modes:
+            far = cases[-1].modes[label].far_per_1000
+            values[f"{label}.far_per_1000_at_most_noise.{name}"] = far
+    for label in [each for each in cases[0].modes if all(each in case.modes for case in cases)]:
         swept = [case.modes[label] for case in cases]
         values[f"{label}.nees_by_noise.{name}"] = [mode.mean_nees for mode in swept]
+        medians = [float(np.nanmedian(mode.nees)) for mode in swept]
+        values[f"{label}.median_nees_by_noise.{name}"] = medians
+        values[f"{label}.converged_share_by_noise.{name}"] = [mode.converged for mode in swept]
         values[f"{label}.position_rmse_m_by_noise.{name}"] = [mode.rmse_m for mode in swept]
         values[f"{label}.position_bound_m_by_noise.{name}"] = [mode.bound_m for mode in swept]
+    return values
+
+
+def _metrics_of_maps(maps: pd.DataFrame) -> dict[str, Any]:
+    """Where an ellipse is smallest beside that of bearings only, by how much there, and the median."""
+    values: dict[str, Any] = {}
+    for label, rows in maps.groupby("mode", sort=False):
+        best = rows.iloc[int(np.nanargmax(rows["ratio"]))]
+        values |= {
+            f"{label}.map_aim_m": [float(best["aim_x_m"]), float(best["aim_y_m"])],
+            f"{label}.map_best_place_m": [float(best["x_m"]), float(best["y_m"])],
+            f"{label}.map_best_ratio": float(best["ratio"]),
+            f"{label}.map_median_ratio": float(rows["ratio"].median()),
+        }
     return values
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, load_scenario
+from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.inputs import Record
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square
 from recorders.models.acoustic import local_estimate_covariances, range_from_time_difference
@@ -24,7 +25,7 @@ from replay.estimators.localization.acoustic_streams import ShooterParameters, g
 from replay.judging.consistency.consistency import ellipse_area
 
 BEARINGS, LOCAL, NATIVE = "bearings-only", "local-estimates", "native-measurements"
-CROSS, FIXED = "cross-covariances", "fixed-sensors"
+CROSS = "cross-covariances"
 FAR_M = 50.0
 
 Place = tuple[float, float]
@@ -122,6 +123,11 @@ class Mode:
         return float(ellipse_area(self.bound[:2, :2]))
 
     @property
+    def area_ratio(self) -> float:
+        """Of the estimates' 95 % ellipse by that of the CRLB."""
+        return float(ellipse_area(self.covariance)) / self.area_m2
+
+    @property
     def far_per_1000(self) -> float:
         """Solutions that are missing, or more than 50 m off."""
         return 1000.0 * float(np.mean(~(self.distance_m <= FAR_M)))
@@ -207,20 +213,26 @@ def _heard(sources: list[MemorySource]) -> Detections:
     return gather_detections(*streams)[1]
 
 
+def hearing(case: Case) -> list[float]:
+    """The numbers of the sensors that hear the shockwave."""
+    true = acoustic.noise_free(case.parameters.medium, *truth_of(case.parameters))
+    return [float(sensor + 1) for sensor in np.flatnonzero(np.isfinite(true.shockwave_rad[0]))]
+
+
 def range_errors_m(case: Case) -> dict[int, tuple[Floats, float]]:
     """Errors of the range estimates of each sensor that hears the shockwave, and sigma_r of eq (26)."""
     parameters, heard = case.parameters, case.heard
     shooter, trajectory, sensors = truth_of(parameters)
     true = acoustic.noise_free(parameters.medium, shooter, trajectory, sensors)
     found = {}
-    for sensor in np.flatnonzero(np.isfinite(true.shockwave_rad[0])):
+    for sensor in [int(number) - 1 for number in hearing(case)]:
         distance = float(np.linalg.norm(shooter[0] - sensors[sensor]))
         separation = heard.muzzle_blast_rad[:, sensor] - heard.shockwave_rad[:, sensor]
         delay = heard.time_difference_s[:, sensor]
         estimate = range_from_time_difference(delay, separation, parameters.medium)
         exact = true.muzzle_blast_rad[0, sensor] - true.shockwave_rad[0, sensor]
         variance, _, _ = local_estimate_covariances(distance, exact, parameters.noise, parameters.medium)
-        found[int(sensor) + 1] = (estimate - distance, float(np.sqrt(variance)))
+        found[sensor + 1] = (estimate - distance, float(np.sqrt(variance)))
     return found
 
 

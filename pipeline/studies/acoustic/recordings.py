@@ -8,24 +8,20 @@ from typing import Annotated
 
 import numpy as np
 import pandas as pd
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveInt
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
-from pipeline.output.results import Outcome
+from pipeline.output.results import MetricValue, Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.recorded import record_ensemble
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import share_holds
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.distributions import chi2
 from replay.engine.arrays import Floats
 from replay.engine.streams.sources import MemorySource
-from replay.judging.errors.evaluation import Errors, chi_square_interval
-
-OWN = "(own limit)"
+from replay.judging.errors.evaluation import Errors
 
 
 class Published(Parameters):
@@ -33,11 +29,9 @@ class Published(Parameters):
 
     Attributes:
         delay_s: how much later than the first microphone the others heard it, in their numbers' order.
-        within_s: what ours are held to.
     """
 
     delay_s: Annotated[list[float], Field(min_length=2)]
-    within_s: PositiveFloat = 1e-3
 
 
 class Simulated(Parameters):
@@ -61,14 +55,10 @@ class Options(Parameters):
 
     Attributes:
         published: differences that were published, by the name of a sound.
-        same: pairs of sounds that are one, the second in files that begin later.
-        error_m: error that is allowed where truth is known.
         simulated: simulated recordings.
     """
 
     published: dict[str, Published] = {}
-    same: list[tuple[str, str]] = []
-    error_m: PositiveFloat = 0.05
     simulated: Simulated = Simulated()
 
 
@@ -87,11 +77,11 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.tables["differences"] = table
     for errors in replayed.errors:
         if errors.estimator == label:
-            outcome.claims += known_place(errors, options.error_m)
-    outcome.claims += _published(table, options, outcome)
+            outcome.metrics |= known_place(errors)
+    outcome.metrics |= delays_of(table, options)
     for each in replayed.innovations:
         if each.estimator == label:
-            outcome.claims.append(_explained(each.case, each.squared, table))
+            outcome.metrics |= _explained(each.case, each.squared, table)
     if options.simulated.snr_db:
         _judge_simulated(simulate(runner, options.simulated, label), label, outcome)
     return outcome
@@ -104,9 +94,11 @@ def _judge_simulated(simulated: pd.DataFrame, label: str, outcome: Outcome) -> N
         outcome.metrics |= {
             f"{label}.median_error_m.snr-{snr_db:g}": float(rows["error_m"].median()),
             f"{label}.nees.snr-{snr_db:g}": float(rows["nees"].mean()),
+            f"{label}.median_nees.snr-{snr_db:g}": float(rows["nees"].median()),
             f"{label}.coverage_share.snr-{snr_db:g}": float(rows["inside"].mean()),
+            f"simulated.sounds.snr-{snr_db:g}": float(len(rows)),
+            f"simulated.coordinates.snr-{snr_db:g}": float(rows["coordinates"].iloc[0]),
         }
-        outcome.claims += covariance_claims(float(str(snr_db)), rows)
 
 
 def differences_of(source: MemorySource) -> pd.DataFrame:
@@ -138,28 +130,24 @@ def differences_of(source: MemorySource) -> pd.DataFrame:
     return pd.concat(tables, ignore_index=True)
 
 
-def known_place(errors: Errors, most_m: float) -> list[Claim]:
-    """Whether a sound of known place is located, and its stated region has the place in it."""
+def known_place(errors: Errors) -> dict[str, MetricValue]:
+    """How far a sound of known place is from it, in how many coordinates, and the largest NEES."""
     axes = [errors.components.index(name) for name in ("x_m", "y_m", "z_m") if name in errors.components]
-    places = errors.error[:, axes]
-    away_m = float(np.linalg.norm(places, axis=1).max())
-    limit = float(chi2.ppf(0.95, len(axes)))
-    nees = float(errors.nees.max())
-    return [
-        judged(f"{errors.case}: located within {most_m:g} m", OWN, f"{away_m:.4f} m", away_m < most_m),
-        judged(
-            f"{errors.case}: the stated 95 % region has the true place in it",
-            f"NEES below {limit:.2f}",
-            f"NEES {nees:.2f}",
-            nees < limit,
-        ),
-    ]
+    away_m = np.linalg.norm(errors.error[:, axes], axis=1)
+    found = {
+        "largest_error_m": float(away_m.max()),
+        "largest_nees": float(errors.nees.max()),
+        "known_coordinates": float(len(axes)),
+    }
+    return {f"{errors.estimator}.{name}.{errors.case}": value for name, value in found.items()}
 
 
-def _published(table: pd.DataFrame, options: Options, outcome: Outcome) -> list[Claim]:
-    """Whether differences are as published, and the same sound gives the same ones."""
-    claims = []
+def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
+    """The differences of every sound, and how far they are from those that were published."""
     delays = {name: rows["delay_s"].to_numpy() for name, rows in table.groupby("sound", sort=False)}
+    found: dict[str, MetricValue] = {
+        f"sound.delay_s.{name!s}": of.tolist() for name, of in delays.items()
+    }
     for name, known in options.published.items():
         if name not in delays:
             continue
@@ -168,42 +156,21 @@ def _published(table: pd.DataFrame, options: Options, outcome: Outcome) -> list[
                 f"options.published.{name}: {len(known.delay_s)} delays for {len(delays[name])} "
                 "microphones that heard it; give one for each"
             )
-        off_s = float(np.abs(delays[name] - np.array(known.delay_s)).max())
-        outcome.metrics[f"published.off_s.{name}"] = off_s
-        claims.append(
-            judged(
-                f"{name}: all differences are within {1e3 * known.within_s:g} ms of the published ones",
-                ", ".join(f"{1e3 * each:g}" for each in known.delay_s) + " ms",
-                ", ".join(f"{1e3 * each:.2f}" for each in delays[name]) + " ms",
-                off_s < known.within_s,
-            )
-        )
-    for first, second in options.same:
-        if first in delays and second in delays and len(delays[first]) == len(delays[second]):
-            apart_s = float(np.abs(delays[first] - delays[second]).max())
-            statement = f"{second}: a file that begins later gives the same differences as in {first}"
-            claims.append(
-                judged(statement, "within 1 us", f"{1e6 * apart_s:.3f} us apart", apart_s < 1e-6)
-            )
-    return claims
+        found[f"published.delay_s.{name}"] = known.delay_s
+        found[f"published.off_s.{name}"] = float(np.abs(delays[name] - np.array(known.delay_s)).max())
+    return found
 
 
-def _explained(name: str, squared: Floats, table: pd.DataFrame) -> Claim:
-    """Whether the differences agree with one place as well as their variances say.
+def _explained(name: str, squared: Floats, table: pd.DataFrame) -> dict[str, MetricValue]:
+    """How well one place explains the differences of a sound, and how many are more than it needs.
 
     The sum of squared innovations, less those that the start leaves nothing of, has as many degrees of
     freedom as there are differences beyond the coordinates.
     """
     heights_m = table["z_m"][table["sound"] == name]
     extra = len(squared) - (2 if np.ptp(heights_m) == 0.0 else 3)
-    limit = float(chi2.ppf(0.95, extra)) if extra > 0 else np.nan
     total = float(np.sum(squared)) if extra > 0 else np.nan
-    return judged(
-        f"{name}: one place explains all differences within what their variances allow",
-        f"chi-square below {limit:.2f}",
-        f"{total:.2f}, {extra} more than are needed",
-        total < limit,
-    )
+    return {f"sound.misfit.{name}": total, f"sound.spare_differences.{name}": float(extra)}
 
 
 def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
@@ -232,27 +199,6 @@ def simulate(runner: Runner, asked: Simulated, label: str) -> pd.DataFrame:
             )
         )
     return pd.concat(tables, ignore_index=True)
-
-
-def covariance_claims(snr_db: float, rows: pd.DataFrame) -> list[Claim]:
-    """Whether stated covariances are right over many sounds: mean NEES, and 95 % regions."""
-    size, count = int(rows["coordinates"].iloc[0]), len(rows)
-    low, high = chi_square_interval(size, count)
-    nees, share = float(rows["nees"].mean()), float(rows["inside"].mean())
-    return [
-        judged(
-            f"simulated, {snr_db:g} dB: the mean NEES is as of covariances that are right",
-            f"{low:.2f} to {high:.2f}",
-            f"{nees:.2f}, median {rows['nees'].median():.2f}, of {count} sounds",
-            low <= nees <= high,
-        ),
-        judged(
-            f"simulated, {snr_db:g} dB: 95 % regions have the true place in them",
-            "95 %, less two standard errors",
-            f"{share:.0%} of {count} sounds",
-            share_holds(share, count),
-        ),
-    ]
 
 
 def _chart(simulated: pd.DataFrame) -> Chart:

@@ -14,17 +14,17 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import pandas as pd
 from pydantic import Field, PositiveFloat, PositiveInt
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
+from pipeline.studies.biometrics.watched import Labelled, faulty, watching
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Floats, Integers
 from replay.judging.consistency.sequential import (
     Decisions,
     Rates,
@@ -45,15 +45,10 @@ WAYS = {
     "alike": "probes of one person alike",
     "matchers": "one person, matcher after matcher",
 }
-FAULTS = {
-    "misses": "the person scores as an impostor",
-    "accepts": "impostors score as the person",
-    "drifts": "genuine scores have fallen by one standard deviation",
-}
-BOUNDS = ["value", "low", "high"]
+# The person scores as an impostor, impostors as the person, or genuine scores have fallen.
+FAULTS = ("misses", "accepts", "drifts")
 FIXED_PROBES = 50  # more than any matcher needs
 IMPOSTORS = 100_000  # so many that their tail is that of all
-DRIFT_SIGMA = 1.0
 
 
 class Options(Parameters):
@@ -70,7 +65,6 @@ class Options(Parameters):
         watched: number of stretches of probes over which a matcher is watched.
         watched_probes: probes in a stretch without a fault.
         fault_probes: probes in a stretch with a fault.
-        noticed_probes: stated mean number of probes until the alarm, by fault.
     """
 
     rates: list[tuple[Share, Share]] = [(0.01, 0.01), (0.001, 0.01)]
@@ -83,7 +77,6 @@ class Options(Parameters):
     watched: PositiveInt = 20
     watched_probes: PositiveInt = 5000
     fault_probes: PositiveInt = 500
-    noticed_probes: dict[str, PositiveFloat] = {"misses": 20.0, "accepts": 20.0, "drifts": 100.0}
 
 
 class Drawn(NamedTuple):
@@ -130,7 +123,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         watches.append(pd.DataFrame(watched(drawn, options, rng)).assign(replicate=number))
     outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     _tell_tests(_intervals(pd.concat(tests), ["way", "matcher", "rates"]), ratios, options, outcome, rng)
-    _tell_watches(_intervals(pd.concat(watches), ["fault", "matcher"]), options, outcome)
+    _tell_watches(_intervals(pd.concat(watches), ["fault", "matcher"]), outcome)
     return outcome
 
 
@@ -269,13 +262,6 @@ def watched(
             }
 
 
-class Labelled(NamedTuple):
-    """Probes of a matcher: its ratio (n,), and whether the other matchers say that it is the person."""
-
-    ratio: Floats
-    is_genuine: Booleans
-
-
 def labelled(
     drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
 ) -> Labelled:
@@ -288,52 +274,6 @@ def labelled(
     told = label[probe, gallery]
     clear = np.abs(told) >= least
     return Labelled(drawn.ratios[probe, gallery][clear], told[clear] > 0.0)
-
-
-def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    """The ratios (n,) of probes by a matcher with a fault.
-
-    `steady` are the ratios of impostors and of persons before, in rising order.
-    """
-    others, own = steady
-    match fault:
-        case "misses":
-            return np.where(seen.is_genuine, rng.choice(others, len(seen.ratio)), seen.ratio)
-        case "accepts":
-            return np.where(seen.is_genuine, seen.ratio, rng.choice(own, len(seen.ratio)))
-        case "drifts":
-            fallen = ndtr(normal_scores(seen.ratio, own) - DRIFT_SIGMA) * len(own)
-            return np.where(seen.is_genuine, own[fallen.astype(int)], seen.ratio)
-    return seen.ratio
-
-
-def normal_scores(values: Floats, reference: Floats) -> Floats:
-    """Where values (n,) lie in a reference in rising order, as normal numbers; ties in the middle."""
-    rank = 0.5 * (
-        np.searchsorted(reference, values, "left") + np.searchsorted(reference, values, "right")
-    )
-    return ndtri((rank + 0.5) / (len(reference) + 1.0))
-
-
-def watching(seen: Labelled, steady: Sequence[Floats]) -> Floats:
-    """Log-likelihood ratios (4, n) of four changes, zero for probes that say nothing of them.
-
-    That the person's ratios become those of impostors, or fall by `DRIFT_SIGMA` of their normal scores;
-    that those of impostors become the person's, or rise so.
-    """
-    others, own = (
-        DRIFT_SIGMA * sign * normal_scores(seen.ratio, reference) - 0.5 * DRIFT_SIGMA**2
-        for sign, reference in zip((1.0, -1.0), steady, strict=True)
-    )
-    is_genuine = seen.is_genuine
-    return np.stack(
-        [
-            np.where(is_genuine, -seen.ratio, 0.0),
-            np.where(is_genuine, own, 0.0),
-            np.where(is_genuine, 0.0, seen.ratio),
-            np.where(is_genuine, 0.0, others),
-        ]
-    )
 
 
 def _intervals(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:
@@ -356,85 +296,37 @@ def _tell_tests(
     outcome: Outcome,
     rng: np.random.Generator,
 ) -> None:
-    """Metrics, claims and the figure of Wald's tests."""
+    """Metrics and the figure of Wald's tests."""
     for row in records(table):
         quantity, case = row["quantity"], f"{row['matcher']}-{_case(row['rates'])}"
-        if quantity in ("false_accept", "false_reject", "undecided"):
-            outcome.metrics[f"{row['way']}.{quantity}_percent.{case}"] = 100.0 * row["value"]
-        else:
-            outcome.metrics[f"{row['way']}.{quantity}.{case}"] = row["value"]
+        is_share = quantity in ("false_accept", "false_reject", "undecided")
+        key = f"{row['way']}.{quantity}{'_percent' if is_share else ''}.{case}"
+        _measure(row, key, 100.0 if is_share else 1.0, outcome)
     outcome.tables["tests"] = table.assign(rates=table["rates"].map(_percents))
-    for stated, way, error in product(options.rates, WAYS, Rates._fields):
-        if way == "one-identity" and error == "false_reject":
-            continue
-        chosen = _chosen(table, way=way, rates=stated, quantity=error)
-        bound = getattr(wald_bounds(Rates(*stated)), error)
-        what = {"false_accept": "false accepts", "false_reject": "false rejects"}[error]
-        claim = f"{_percents(stated)} stated, {WAYS[way]}: {what} are held"
-        outcome.claims.append(_held(claim, bound, chosen))
-    fewer: list[tuple[str, float, float]] = []
-    near: list[tuple[str, float, dict[str, Any]]] = []
     for stated in options.rates:
         rates = Rates(*stated)
-        rows = _chosen(table, way="independent", rates=stated)
+        for error, bound in wald_bounds(rates)._asdict().items():
+            outcome.metrics[f"wald.{error}_percent.{_case(stated)}"] = 100.0 * bound
         for matcher, matrix in ratios.items():
-            own = rows[rows["matcher"] == matcher].set_index("quantity")
-            fixed = fixed_number(matrix, rates, rng)
             case = f"{matcher}-{_case(stated)}"
-            outcome.metrics[f"fixed.probes.{case}"] = fixed
-            probes = [records(own.loc[[f"{kind}_probes"]])[0] for kind in ("genuine", "impostor")]
-            fewer.append((case, fixed, max(each["high"] for each in probes)))
+            outcome.metrics[f"fixed.probes.{case}"] = fixed_number(matrix, rates, rng)
             means = np.diag(matrix).mean(), matrix[~np.eye(len(matrix), dtype=bool)].mean()
-            for kind, found, mean in zip(("genuine", "impostor"), probes, means, strict=True):
+            for kind, mean in zip(("genuine", "impostor"), means, strict=True):
                 wald = wald_probes(rates, float(mean), genuine=kind == "genuine")
                 outcome.metrics[f"wald.{kind}_probes.{case}"] = wald
-                near.append((f"{case} {kind}", wald, found))
-    outcome.claims.append(
-        judged(
-            "independent probes: fewer on average than the fixed number that holds these rates",
-            "(Wald and Wolfowitz, 1948)",
-            ", ".join(f"{case} {most:.2f} of {fixed:.0f}" for case, fixed, most in fewer),
-            all(most < fixed for _, fixed, most in fewer),
-        )
-    )
-    outcome.claims.append(
-        judged(
-            "independent probes: Wald's approximation of their mean number is right within 20 %",
-            "(4.8) of Wald, 1945",
-            ", ".join(f"{case} {row['value']:.2f} for {wald:.2f}" for case, wald, row in near),
-            all(0.8 * wald < row["low"] and row["high"] < 1.2 * wald for _, wald, row in near),
-        )
-    )
     outcome.figures["tests"] = _chart_of_tests(table, options)
 
 
-def _tell_watches(table: pd.DataFrame, options: Options, outcome: Outcome) -> None:
-    """Metrics and claims of the watch over matchers."""
+def _tell_watches(table: pd.DataFrame, outcome: Outcome) -> None:
+    """Metrics of the watch over matchers."""
     outcome.tables["watch"] = table
     for row in records(table):
         name, scale = ("silent_percent", 100.0) if row["quantity"] == "silent" else ("probes", 1.0)
-        outcome.metrics[f"watch.{name}.{row['fault']}-{row['matcher']}"] = scale * row["value"]
-    steady = _chosen(table, fault="none", quantity="probes")
-    outcome.claims.append(
-        _decided(
-            f"a matcher without a fault: {options.run_length:g} probes or more until a false alarm",
-            f"{options.run_length:g} (stated)",
-            _of_matchers(steady, "{:.0f}"),
-            holds=bool((steady["low"] >= options.run_length).all()),
-            fails=bool((steady["high"] < options.run_length).any()),
-        )
-    )
-    for fault, words in FAULTS.items():
-        found = _chosen(table, fault=fault, quantity="probes")
-        most = options.noticed_probes[fault]
-        outcome.claims.append(
-            judged(
-                f"noticed within {most:g} probes on average: {words}",
-                f"{most:g} (own limit)",
-                _of_matchers(found, "{:.1f}"),
-                bool((found["high"] <= most).all()),
-            )
-        )
+        _measure(row, f"watch.{name}.{row['fault']}-{row['matcher']}", scale, outcome)
+
+
+def _measure(row: Mapping[str, Any], key: str, scale: float, outcome: Outcome) -> None:
+    outcome.measure(key, *(scale * row[name] for name in ("value", "low", "high")))
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -448,33 +340,6 @@ def _chosen(table: pd.DataFrame, **of: Any) -> pd.DataFrame:
     for name, value in of.items():
         table = table[table[name] == value]
     return table
-
-
-def _held(claim: str, bound: float, rows: pd.DataFrame) -> Claim:
-    """Whether a stated rate is held."""
-    return _decided(
-        claim,
-        f"at most {100.0 * bound:.3g} % (Wald's inequality)",
-        _of_matchers(rows.assign(**{name: 100.0 * rows[name] for name in BOUNDS}), "{:.2f}") + " %",
-        holds=bool((rows["high"] <= bound).all()),
-        fails=bool((rows["low"] > bound).any()),
-    )
-
-
-def _decided(claim: str, paper: str, ours: str, *, holds: bool, fails: bool) -> Claim:
-    """A claim that holds where all intervals lie within what is stated; it fails by one beyond."""
-    if holds or fails:
-        return judged(claim, paper, ours, holds)
-    return Claim(claim, paper, ours, "not reproducible", "too few users to tell")
-
-
-def _of_matchers(rows: pd.DataFrame, form: str) -> str:
-    """Values with their intervals, matcher by matcher."""
-    return ", ".join(
-        f"{row['matcher']} {form.format(row['value'])} "
-        f"({form.format(row['low'])} to {form.format(row['high'])})"
-        for row in records(rows)
-    )
 
 
 def _percents(rates: tuple[float, float]) -> str:

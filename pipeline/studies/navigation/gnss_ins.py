@@ -7,14 +7,13 @@ inertial unit: the last velocity, and a cubic between both ends.
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pandas as pd
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
@@ -48,51 +47,6 @@ CHI_SQUARE_95 = 7.81  # of three components
 RUNS_AT_ONCE = 2  # in memory, with their estimates
 
 
-class Bridged(Parameters):
-    """What an independent implementation has for outages of one length, in m.
-
-    Attributes:
-        filter_end: the filter's error at the end of an outage.
-        filter_over: the filter's error over an outage.
-        smoother_over: the smoother's error over an outage.
-        coasted_end: error at the end where the last velocity is kept.
-        coasted_over: error over an outage where the last velocity is kept.
-        hermite_over: error over an outage of a Hermite spline between its ends.
-    """
-
-    filter_end: PositiveFloat
-    filter_over: PositiveFloat
-    smoother_over: PositiveFloat
-    coasted_end: PositiveFloat
-    coasted_over: PositiveFloat
-    hermite_over: PositiveFloat
-
-
-class Sheet(Parameters):
-    """Numbers of an independent implementation, for one recording.
-
-    Attributes:
-        recording: name of the recording.
-        outages: errors by the length of outages in s.
-        factor: accepted is at most so many times the errors of its filter and smoother.
-        position_nis: mean NIS of positions.
-        velocity_nis: mean NIS of velocities.
-        ignored_delay_over: the smoother's error over an outage where the velocity's delay is ignored, in
-            m.
-        gyro_bias_degps: bias of the gyro at the end (x, y, z).
-        force_bias_z_mps2: bias of the accelerometer's z axis at the end.
-    """
-
-    recording: str
-    outages: dict[str, Bridged]
-    factor: PositiveFloat = 1.25
-    position_nis: float
-    velocity_nis: float
-    ignored_delay_over: PositiveFloat
-    gyro_bias_degps: tuple[float, float, float]
-    force_bias_z_mps2: float
-
-
 class GnssInsOptions(Parameters):
     """The protocol of the outages.
 
@@ -106,7 +60,6 @@ class GnssInsOptions(Parameters):
         apart: windows share a run that are so many times `every_s` apart.
         settle_s: fixes are used from so long after the first inertial sample on.
         innovations_from_s: from when on innovations count.
-        sheet: what claims about one recording are held to; others have none of them.
     """
 
     filter: str = "ekf"
@@ -118,7 +71,6 @@ class GnssInsOptions(Parameters):
     apart: PositiveInt = 6
     settle_s: NonNegativeFloat = 0.2
     innovations_from_s: NonNegativeFloat = 20.75
-    sheet: Sheet | None = None
 
 
 class Innovations(NamedTuple):
@@ -147,7 +99,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     ]
     if not runs:
         raise BadInput(
-            f"{folder}: no window of {listed(options.lengths_s, 0, ', ')} s has a truth throughout; "
+            f"{folder}: no window of {', '.join(f'{each:g}' for each in options.lengths_s)} s has a "
+            "truth throughout; "
             "options.first_s, options.every_s and options.lengths_s move them"
         )
     runner = Runner(experiment, setting)
@@ -169,7 +122,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for name, value in zip(by_length.columns[3:], values, strict=True):
             outcome.metrics[f"{label}.{name}.{length_s:g}s"] = value
     for label, name, value in by_window[["estimator", "window", "over_rmse_m"]].to_numpy():
-        outcome.metrics[f"{label}.over_rmse_m.{name}"] = value
+        outcome.metrics[f"{label}.window_rmse_m.{name}"] = value
     kinds = innovations_of(outputs, rows, options)
     for kind, each in kinds.items():
         outcome.metrics[f"{options.filter}.{kind}_nis"] = each.nis
@@ -191,9 +144,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         "notes": pd.DataFrame(notes, columns=["what", "count"]),
     }
     outcome.figures["outages"] = _chart(errors)
-    outcome.claims = _claims(by_length, "".join(begun[:1]).partition("; ")[2], options)
-    if options.sheet is not None and folder.name == options.sheet.recording:
-        outcome.claims += _claims_of_sheet(by_length, kinds, end, options, options.sheet)
+    outcome.metrics[f"receiver.rows.{folder.name}"] = float(len(rows.time_ns))
     return outcome
 
 
@@ -280,111 +231,6 @@ def _chart(errors: pd.DataFrame) -> Chart:
             )
         panels.append(panel)
     return Chart(panels=panels, columns=len(panels))
-
-
-def _claims(by_length: pd.DataFrame, doubt: str, options: GnssInsOptions) -> list[Claim]:
-    """What is expected of every recording, and what its start leaves in doubt."""
-    over = by_length.pivot_table("over_rmse_m", "length_s", "estimator")
-    end = by_length.pivot_table("end_rmse_m", "length_s", "estimator")
-    nees = by_length.pivot_table("end_nees", "length_s", "estimator")[options.filter]
-    lengths = f"outages of {listed(over.index, 0, ', ')} s"
-    return [
-        judged(
-            f"the smoother bridges {lengths} better than a cubic between both ends",
-            "an inertial unit knows what happened between",
-            f"{listed(over[options.smoother], 3, ', ')} m against {listed(over[HERMITE], 2, ', ')} m",
-            bool((over[options.smoother] < over[HERMITE]).all()),
-        ),
-        judged(
-            f"the filter errs less at the end of {lengths} than the last velocity does",
-            "an inertial unit knows what happens",
-            f"{listed(end[options.filter], 2, ', ')} m against {listed(end[COASTED], 2, ', ')} m",
-            bool((end[options.filter] < end[COASTED]).all()),
-        ),
-        judged(
-            f"the filter's covariance can be believed at the end of {lengths}",
-            "mean NEES of 2 components .3 to 5, of few windows",
-            listed(nees, 2, ", "),
-            bool(nees.between(0.3, 5.0).all()),
-            doubt,
-        ),
-    ]
-
-
-def _claims_of_sheet(
-    by_length: pd.DataFrame,
-    kinds: Mapping[str, Innovations],
-    end: Mapping[str, float],
-    options: GnssInsOptions,
-    sheet: Sheet,
-) -> list[Claim]:
-    """What an independent implementation has for this recording, with the tolerances that it states."""
-    found: Any = by_length.set_index(["estimator", "length_s"]).to_dict("index")
-    claims = []
-    for text, theirs in sheet.outages.items():
-        length_s = float(text)
-        if (options.filter, length_s) not in found:
-            continue
-        own, back, coast, cubic = (
-            found[label, length_s] for label in (options.filter, options.smoother, COASTED, HERMITE)
-        )
-        simple = [coast["end_rmse_m"], coast["over_rmse_m"], cubic["over_rmse_m"]]
-        printed = [theirs.coasted_end, theirs.coasted_over, theirs.hermite_over]
-        claims += [
-            judged(
-                f"outages of {text} s: without the inertial unit, which checks the protocol",
-                f"{listed(printed, 2, ', ')} m within 1 %: last velocity at the end, over; cubic over",
-                f"{listed(simple, 2, ', ')} m",
-                bool(np.allclose(simple, printed, rtol=0.01)),
-            ),
-            judged(
-                f"outages of {text} s: the filter",
-                f"{theirs.filter_end:g} m at the end, {theirs.filter_over:g} m over; at most "
-                f"{sheet.factor:g} times",
-                f"{own['end_rmse_m']:.2f} m, {own['over_rmse_m']:.2f} m",
-                own["end_rmse_m"] <= sheet.factor * theirs.filter_end
-                and own["over_rmse_m"] <= sheet.factor * theirs.filter_over,
-            ),
-            judged(
-                f"outages of {text} s: the smoother",
-                f"{theirs.smoother_over:g} m over; at most {sheet.factor:g} times",
-                f"{back['over_rmse_m']:.3f} m",
-                back["over_rmse_m"] <= sheet.factor * theirs.smoother_over,
-            ),
-        ]
-    if (options.delayed, 15.0) in found:
-        ignored, heeded = (
-            found[label, 15.0]["over_rmse_m"] for label in (options.delayed, options.smoother)
-        )
-        claims.append(
-            judged(
-                "the delay of the velocity, .125 s, matters: the smoother over 15 s that ignores it",
-                f"{sheet.ignored_delay_over:g} m, within 15 %",
-                f"{ignored:.3f} m instead of {heeded:.3f} m",
-                abs(ignored / sheet.ignored_delay_over - 1.0) <= 0.15 and ignored > heeded,
-            )
-        )
-    nis = {"position": sheet.position_nis, "velocity": sheet.velocity_nis}
-    measured = [kinds[name].nis for name in nis]
-    shares = [kinds[name].share_above for name in nis]
-    bias = [float(np.degrees(end[f"gyro_bias_{axis}_radps"])) for axis in "xyz"]
-    bias.append(end["accelerometer_bias_z_mps2"])
-    wanted = [*sheet.gyro_bias_degps, sheet.force_bias_z_mps2]
-    return [
-        *claims,
-        judged(
-            "NIS of fixed positions and velocities, 3 components",
-            f"{listed(list(nis.values()), 2, ', ')} within .4; at most 10 % above {CHI_SQUARE_95:g}",
-            f"{listed(measured, 2, ', ')}; {listed(100 * np.array(shares), 1, ', ')} %",
-            bool(np.allclose(measured, list(nis.values()), rtol=0, atol=0.4)) and max(shares) <= 0.1,
-        ),
-        judged(
-            "biases at the end: gyro x, y, z in deg/s, accelerometer z in m/s2",
-            f"{listed(wanted, 3, ', ')} within .03",
-            listed(bias, 3, ", "),
-            bool(np.allclose(bias, wanted, rtol=0, atol=0.03)),
-        ),
-    ]
 
 
 GNSS_INS = Study("a receiver with an inertial unit: how well outages are bridged", study, GnssInsOptions)

@@ -5,15 +5,12 @@ above that which a share q of all runs stays below, with the probability 1 - q^n
 q = .95 (Wilks, Annals of Mathematical Statistics 12(1), 1941).
 """
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from pydantic import PositiveFloat
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -24,33 +21,15 @@ from recorders.simulators.navigation_parameters import NavigationParameters
 from replay.engine.streams.sources import MemorySource
 from replay.judging.errors.evaluation import Errors
 
-SHARE = 0.95
-
-
-class Limit(Parameters):
-    """How far off the first estimator may be, for most of the drives.
-
-    Attributes:
-        grade: grade of the unit.
-        after_s: so long after the last fix.
-        most_m: largest error of the position then.
-    """
-
-    grade: str
-    after_s: PositiveFloat
-    most_m: PositiveFloat
-
 
 class Options(Parameters):
-    """The grades, and what is demanded.
+    """The grades.
 
     Attributes:
         grades: parameters of the scenario's inertial unit, by grade.
-        limits: how far off the first estimator may be.
     """
 
     grades: dict[str, dict[str, float]]
-    limits: list[Limit] = []
 
 
 class Span(NamedTuple):
@@ -63,10 +42,6 @@ class Span(NamedTuple):
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.runs.experiment.Study`."""
     options: Options = setting.options
-    if unknown := {limit.grade for limit in options.limits} - options.grades.keys():
-        raise BadInput(
-            f"options.limits: no grade '{unknown.pop()}'; there are {', '.join(options.grades)}"
-        )
     outcome = Outcome()
     sources: list[MemorySource] = []
     tables: list[pd.DataFrame] = []
@@ -83,9 +58,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     for grade, estimator, after_s, error_m in largest.itertuples(index=False):
         if after_s in (10.0, 20.0, 30.0):
             outcome.metrics[f"{estimator}.horizontal_95_m.{grade}-{after_s:g}s"] = float(error_m)
-    label = next(iter(experiment.estimators))
-    outcome.claims = [_claim(limit, label, table, experiment.runs) for limit in options.limits]
-    outcome.claims += _order(list(options.grades), label, largest)
     outcome.input_sha256 = hash_streams(sources)
     outcome.tables["largest"] = largest
     outcome.figures["outage"] = _chart(largest)
@@ -109,35 +81,6 @@ def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
     error_m = np.linalg.norm(errors.error[inside][:, plane], axis=1)
     after_s = np.round(errors.elapsed_s[inside] - span.begin_s, 6)
     return pd.DataFrame({"run": errors.run[inside], "after_s": after_s, "error_m": error_m})
-
-
-def _claim(limit: Limit, label: str, table: pd.DataFrame, runs: int) -> Claim:
-    """Whether 95 % of all drives stay within a limit, as sure as the number of runs allows."""
-    chosen = (table["grade"] == limit.grade) & (table["estimator"] == label)
-    errors = table[chosen & np.isclose(table["after_s"], limit.after_s)]["error_m"]
-    found = float(errors.max()) if len(errors) == runs else np.nan
-    return judged(
-        f"{limit.grade}: {limit.after_s:g} s after the last fix 95 % of drives are within "
-        f"{limit.most_m:g} m",
-        f"{limit.most_m:g} m (own limit)",
-        f"at most {found:.2f} m in {runs} drives, which shows it with {1.0 - SHARE**runs:.1%}",
-        found <= limit.most_m and SHARE**runs <= 1.0 - SHARE,
-    )
-
-
-def _order(grades: list[str], label: str, largest: pd.DataFrame) -> list[Claim]:
-    """Whether each grade is at least three times as good as the one before it at the end."""
-    own = largest[largest["estimator"] == label]
-    end = own[own["after_s"] == own["after_s"].max()].set_index("grade")["error_m"]
-    return [
-        judged(
-            f"{better} units are off by at most a third of {worse} ones at the end of the outage",
-            "(own limit)",
-            f"{end[better]:.2f} against {end[worse]:.2f} m",
-            end[better] <= end[worse] / 3.0,
-        )
-        for worse, better in pairwise(grades)
-    ]
 
 
 def _chart(largest: pd.DataFrame) -> Chart:

@@ -11,42 +11,25 @@ import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
-from recorders.parameters import Parameters
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import Errors
 
 
-class InertialOptions(Parameters):
-    """What is claimed: a mean error over the trials.
-
-    Attributes:
-        estimator: label of the estimator that is claimed about.
-        target_deg: its mean error over the trials is to be at most this.
-    """
-
-    estimator: str = "bingham"
-    target_deg: float = 3.5
-
-
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.runs.experiment.Study`."""
-    options: InertialOptions = setting.options
     replayed = Runner(experiment, setting).run()
     trials = movement_table(replayed.errors, replayed.sources)
     means = {
         str(name): float(rows["movement_rmse_deg"].mean())
         for name, rows in trials.groupby("estimator", sort=False)
     }
-    if options.estimator not in means:
-        raise BadInput(
-            f"no estimates of '{options.estimator}' during movement with truth; give a trial with both"
-        )
+    if not means:
+        raise BadInput("no estimates during movement with truth; give a trial with both")
     outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     outcome.metrics.update({f"{name}.movement_rmse_deg": value for name, value in means.items()})
     for trial, estimator, rmse_deg, _ in trials.to_numpy():
@@ -54,7 +37,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     outcome.metrics.update(replayed.metrics(experiment.metrics))
     outcome.tables["trials"] = trials
     outcome.figures["trials"] = trials_figure(trials)
-    outcome.claims = _claims(means, options, int((trials["estimator"] == options.estimator).sum()))
     return outcome
 
 
@@ -94,30 +76,4 @@ def trials_figure(trials: pd.DataFrame) -> Figure:
     return figure
 
 
-def _claims(means: dict[str, float], options: InertialOptions, trials: int) -> list[Claim]:
-    own = means[options.estimator]
-    rivals = {name: value for name, value in means.items() if name != options.estimator}
-    claims = [
-        judged(
-            f"mean total orientation RMSE over movement at most {options.target_deg:g} deg",
-            f"{options.target_deg:g} deg (own target; no tuning per trial)",
-            f"{own:.3f} deg over {trials} trials",
-            own <= options.target_deg,
-        )
-    ]
-    if rivals:
-        best = min(rivals, key=rivals.__getitem__)
-        claims.append(
-            judged(
-                "better than gyro alone, gyro minus bias and TRIAD alone",
-                "smaller mean error than each of them",
-                f"{own:.3f} deg against {rivals[best]:.3f} deg of {best}, the best of them",
-                own < rivals[best],
-            )
-        )
-    return claims
-
-
-INERTIAL = Study(
-    "orientation from inertial samples: error over movement, trial by trial", study, InertialOptions
-)
+INERTIAL = Study("orientation from inertial samples: error over movement, trial by trial", study)

@@ -16,7 +16,6 @@ from pydantic import NonNegativeFloat, PositiveFloat
 from scipy.spatial.transform import Rotation
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
@@ -51,30 +50,8 @@ PRIOR_SIGMA = np.concatenate(
 )
 
 
-class Row(Parameters):
-    """RMSE of filter and smoother, and the mean NIS, as an independent implementation has them.
-
-    Attributes:
-        recording: name of the recording.
-        offset: which offset of the unit's clock it used.
-        position_m: of the position, by filter and smoother.
-        horizontal_m: of the position in the plane, by filter and smoother.
-        velocity_mps: of the velocity, by filter and smoother.
-        heading_deg: of the heading, by filter and smoother.
-        nis: mean NIS of the filter.
-    """
-
-    recording: str
-    offset: str = KNOWN
-    position_m: tuple[float, float]
-    horizontal_m: tuple[float, float]
-    velocity_mps: tuple[float, float]
-    heading_deg: tuple[float, float]
-    nis: float
-
-
 class QuadInertialOptions(Parameters):
-    """What is known of the recordings, and what the claims are held to.
+    """What is known of the recordings.
 
     Attributes:
         filter: label of the filter.
@@ -86,7 +63,6 @@ class QuadInertialOptions(Parameters):
         truth_sigma_m: standard deviation of the truth's positions where they stand for fixes in that
             search.
         scored_from_s: from when on errors count.
-        sheet: rows of an independent implementation, for one unit.
     """
 
     filter: str = "ekf"
@@ -95,7 +71,6 @@ class QuadInertialOptions(Parameters):
     search_s: tuple[float, float, PositiveFloat] = (-1.0, 0.2, 0.1)
     truth_sigma_m: PositiveFloat = 0.1
     scored_from_s: NonNegativeFloat = 5.0
-    sheet: list[Row] = []
 
 
 class Flight(NamedTuple):
@@ -145,6 +120,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             outcome.metrics[f"{options.filter}.offset_from_{how}_s.{flight.name}"] = offsets_s[
                 flight.name
             ]
+        known_s = options.offsets_s.get(flight.name, found["truth"][flight.name])
+        outcome.metrics[f"{options.filter}.known_offset_s.{flight.name}"] = known_s
     runs = {case: run for run, case in enumerate(cases)}
     rows = [
         {"recording": flight.name, "offset": offset, "units": units, "estimator": label, **errors}
@@ -159,7 +136,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             outcome.metrics[f"{label}.{name}.{recording}-{offset}-{units}"] = value
     outcome.tables |= {"summary": summary_table(outcome.metrics), "flights": table}
     outcome.figures["units"] = _chart(table, options)
-    outcome.claims = _claims(table, found, options)
     return outcome
 
 
@@ -393,99 +369,6 @@ def _chart(table: pd.DataFrame, options: QuadInertialOptions) -> Chart:
         panels.append(panel)
     return Chart(title=f"{options.smoother}: units and offset of their clock", panels=panels, columns=2)
 
-
-def _claims(
-    table: pd.DataFrame, found: Mapping[str, Mapping[str, float]], options: QuadInertialOptions
-) -> list[Claim]:
-    errors: Any = table.set_index(["recording", "offset", "units", "estimator"]).to_dict("index")
-    here = list(dict.fromkeys(table["recording"]))
-    claims = [
-        claim
-        for row in options.sheet
-        if row.recording in here
-        for claim in _claims_of_row(row, errors, options)
-    ]
-
-    def smoothed(units: str, name: str, offset: str = KNOWN) -> list[float]:
-        return [errors[each, offset, units, options.smoother][name] for each in here]
-
-    alone, mean, fused = (smoothed(units, "position_rmse_m") for units in (ONE, MEAN, INTERSECTION))
-    turned, turned_mean = (smoothed(units, "heading_rmse_deg") for units in (ONE, MEAN))
-    claims += [
-        judged(
-            "the mean of the units has the position of one within .02 m",
-            "vibration and fixes dominate, not the noise of the unit",
-            f"{listed(mean, 3, ', ')} m against {listed(alone, 3, ', ')} m of one",
-            bool(np.all(np.abs(np.subtract(mean, alone)) <= 0.02)),
-        ),
-        judged(
-            "the heading gains from the mean of the units",
-            "path 9: 1.0 to .5 deg",
-            f"{listed(turned_mean, 1, ', ')} deg against {listed(turned, 1, ', ')} deg of one",
-            bool(np.all(np.less(turned_mean, turned))),
-        ),
-        judged(
-            "covariance intersection of a filter for each unit has the position of one within .05 m",
-            "own expectation: all filters have the same fixes",
-            f"{listed(fused, 3, ', ')} m against {listed(alone, 3, ', ')} m of one",
-            bool(np.all(np.abs(np.subtract(fused, alone)) <= 0.05)),
-        ),
-    ]
-    known = [each for each in here if each in options.offsets_s]
-    if known:
-        wanted = [options.offsets_s[each] for each in known]
-        by_truth, by_fixes = ([found[how][each] for each in known] for how in ("truth", "fixes"))
-        worst = {
-            how: float(np.max(np.abs(np.subtract(offsets, wanted))))
-            for how, offsets in (("truth", by_truth), ("fixes", by_fixes))
-        }
-        claims += [
-            judged(
-                "positions at 10 Hz tell the offset of the unit's clock, by likelihood",
-                f"{listed(wanted, 2, ', ')} s within .075 s",
-                f"{listed(by_truth, 3, ', ')} s",
-                worst["truth"] <= 0.075,
-            ),
-            judged(
-                "fixes of .5 m once a second tell it less well",
-                "path 3: -.2 to -.3 s",
-                f"{listed(by_fixes, 3, ', ')} s",
-                worst["fixes"] > worst["truth"],
-            ),
-        ]
-    lost = smoothed(ONE, "position_rmse_m", IGNORED)
-    claims.append(
-        judged(
-            "an offset that is ignored costs accuracy where it is more than .1 s",
-            "path 9: .37 m with it, 1.37 m without",
-            f"{listed(lost, 2, ', ')} m against {listed(alone, 2, ', ')} m",
-            all(
-                bad > good
-                for each, bad, good in zip(here, lost, alone, strict=True)
-                if abs(options.offsets_s.get(each, found["truth"][each])) > 0.1
-            ),
-        )
-    )
-    return claims
-
-
-def _claims_of_row(row: Row, errors: Any, options: QuadInertialOptions) -> Iterator[Claim]:
-    """Filter and smoother with one unit, within 15 %, the heading 30 %."""
-    for number, label in enumerate((options.filter, options.smoother)):
-        own = errors[row.recording, row.offset, ONE, label]
-        ours = [own[f"{name}_rmse_{unit}"] for name, unit in _FIGURES]
-        theirs = [getattr(row, f"{name}_{unit}")[number] for name, unit in _FIGURES]
-        bounds = np.array([0.15, 0.15, 0.15, 0.30])
-        yield judged(
-            f"{row.recording}, offset {row.offset}, {label}: position, 2-D, velocity, heading; NIS",
-            f"{listed(theirs, 2, ', ')}, {row.nis:g} within 15 %, the heading 30 %",
-            f"{listed(ours, 2, ', ')}, {own['nis']:.2f}",
-            bool(np.all(np.abs(np.divide(ours, theirs) - 1.0) <= bounds))
-            and abs(own["nis"] / row.nis - 1.0) <= 0.15,
-        )
-
-
-_FIGURES = (("position", "m"), ("horizontal", "m"), ("velocity", "mps"), ("heading", "deg"))
 
 QUAD_INERTIAL = Study(
     "several inertial units on one body, whose clocks are off", study, QuadInertialOptions

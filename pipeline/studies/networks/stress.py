@@ -14,13 +14,12 @@ import pandas as pd
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from pipeline.studies.toolkit.repetitions import mean_interval
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.streams.blocks import Ragged
@@ -28,8 +27,6 @@ from replay.estimators.networks.networks import message_bytes
 
 CALM, CI, NAIVE = "calm", "ci", "naive"
 INTERVAL, NEWS = "at most once in an interval", "when it has news"
-OWN = "(own claim)"
-BEYOND = 1.1  # times the number of states: NEES of what is not consistent
 
 
 class StressOptions(Parameters):
@@ -44,7 +41,6 @@ class StressOptions(Parameters):
         liar: number of the node that lies.
         lie_after_s: from when on it lies.
         lies_m: what it adds to its estimates, in m; all are tried.
-        great_lie_m: the lie that the claims are about.
         gate_probability: honest estimates pass the gate with at least this probability.
     """
 
@@ -55,7 +51,6 @@ class StressOptions(Parameters):
     liar: PositiveInt = 2
     lie_after_s: NonNegativeFloat = 3.0
     lies_m: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0)
-    great_lie_m: float = 1.0
     gate_probability: Annotated[float, Field(gt=0, lt=1)] = 0.999
 
 
@@ -79,35 +74,52 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     sending = _sending(runner, calm, options)
     lying = _lying(runner, calm, options)
     for (case, estimator), rows in stressed.groupby(["case", "estimator"], sort=False):
-        outcome.metrics[f"{estimator}.nees.{case}"] = float(rows["nees"].mean())
-        outcome.metrics[f"{estimator}.position_rmse_m.{case}"] = float(
-            np.sqrt(rows["squared_m2"].mean())
-        )
+        _measure(rows, f"{estimator}.{{}}.{case}", outcome)
     outcome.tables |= {
         "stressed": stressed,
         "sending": summarised(sending, ["estimator", "policy", "limit"]),
         "lying": summarised(lying, ["estimator", "lie_m"]),
     }
-    for row in outcome.tables["sending"].to_dict("records"):
-        case = ("every" if row["policy"] == INTERVAL else "news") + f"-{row['limit']:g}"
-        for quantity in ("position_rmse_m", "nees", "bytes_per_s"):
-            outcome.metrics[f"{row['estimator']}.{quantity}.{case.replace('.', '_')}"] = row[quantity]
-    for row in outcome.tables["lying"].to_dict("records"):
-        case = f"lie-{row['lie_m']:g}m".replace(".", "_")
-        for quantity in ("position_rmse_m", "nees", "liar_refused", "honest_refused"):
-            outcome.metrics[f"{row['estimator']}.{quantity}.{case}"] = row[quantity]
-    outcome.claims = [
-        *(_consistent(name, stressed) for name in options.cases),
-        _naive(stressed),
-        *_economy(sending),
-        *_lie_claims(lying, options),
-    ]
+    for (estimator, policy, limit), rows in sending.groupby(
+        ["estimator", "policy", "limit"], sort=False
+    ):
+        case = ("every" if policy == INTERVAL else "news") + f"-{limit:g}".replace(".", "_")
+        _measure(rows, f"{estimator}.{{}}.{case}", outcome)
+        outcome.metrics[f"{estimator}.bytes_per_s.{case}"] = float(rows["bytes_per_s"].mean())
+    _measure_economy(sending[sending["estimator"] == CI], outcome)
+    lying["refused"] = lying["liar_refused"] + lying["honest_refused"]
+    for (estimator, lie_m), rows in lying.groupby(["estimator", "lie_m"], sort=False):
+        case = f"lie-{lie_m:g}m".replace(".", "_")
+        _measure(rows, f"{estimator}.{{}}.{case}", outcome)
+        for share in ("liar_refused", "honest_refused", "refused"):
+            outcome.measure(f"{estimator}.{share}.{case}", *mean_interval(rows[share].to_list()))
     outcome.figures |= {
         "bandwidth": _bandwidth_chart(outcome.tables["sending"]),
         "lies": _lie_chart(outcome.tables["lying"]),
     }
     outcome.input_sha256 = hash_streams(sources)
     return outcome
+
+
+def _measure(rows: pd.DataFrame, key: str, outcome: Outcome) -> None:
+    """The mean NEES and the RMSE of rows by run; `key` has a place for the quantity."""
+    outcome.measure(key.format("nees"), *mean_interval(rows["nees"].to_list()))
+    outcome.metrics[key.format("position_rmse_m")] = float(np.sqrt(rows["squared_m2"].mean()))
+
+
+def _measure_economy(rows: pd.DataFrame, outcome: Outcome) -> None:
+    """RMSE of sending news over that of sending in intervals at equal bandwidth, between its points."""
+    by_interval, by_news = (rows[rows["policy"] == policy] for policy in (INTERVAL, NEWS))
+    grid = by_interval.pivot_table(index="bytes_per_s", columns="run", values="squared_m2").sort_index()
+    for limit, own in by_news.groupby("limit", sort=False):
+        bytes_per_s = float(own["bytes_per_s"].iloc[0])
+        if grid.index[0] <= bytes_per_s <= grid.index[-1]:
+            place = np.log(bytes_per_s)
+            usual = [np.interp(place, np.log(grid.index), np.log(grid[run])) for run in own["run"]]
+            difference = 0.5 * (np.log(own["squared_m2"].to_numpy()) - np.array(usual))
+            ratio = np.exp(mean_interval(difference.tolist()))
+            case = f"news-{float(str(limit)):g}".replace(".", "_")
+            outcome.measure(f"{CI}.rmse_ratio_to_intervals.{case}", *ratio)
 
 
 def of_runs(replayed: Replayed, settle_s: float, without: int | None = None) -> pd.DataFrame:
@@ -131,9 +143,7 @@ def summarised(rows: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 
 def _sending(runner: Runner, calm: Replayed, options: StressOptions) -> pd.DataFrame:
     """Errors and bytes a second and node, by run, estimator and how it is decided when to send."""
-    policies = [
-        ("at most once in an interval", "send_interval_s", value) for value in options.intervals_s
-    ]
+    policies = [(INTERVAL, "send_interval_s", value) for value in options.intervals_s]
     policies += [("when it has news", "send_divergence", value) for value in options.divergences]
     parts = []
     for policy, parameter, value in policies:
@@ -198,121 +208,7 @@ def _refused(replayed: Replayed, options: StressOptions) -> dict[str, dict[int, 
     return shares
 
 
-def _nees(rows: pd.DataFrame) -> Interval:
-    return mean_interval(rows["nees"].to_list())
-
-
-def _told(interval: Interval) -> str:
-    return f"{interval.mean:.3g}, 95 % {interval.low:.3g} to {interval.high:.3g}"
-
-
 STATES = 4
-LIMIT = BEYOND * STATES
-TITLES = {
-    "late": "messages are late and overtake each other",
-    "joining": "nodes join and leave",
-    "all": "messages are late, lost and doubled, and nodes join and leave",
-}
-
-
-def _consistent(case: str, table: pd.DataFrame) -> Claim:
-    found = _nees(table[(table["case"] == case) & (table["estimator"] == CI)])
-    return judged(
-        f"CI is consistent where {TITLES.get(case, case)}",
-        OWN,
-        f"mean NEES of 4 states {_told(found)}",
-        found.high <= LIMIT,
-        f"confirmed if the interval's upper end is {LIMIT:g} or less",
-    )
-
-
-def _naive(table: pd.DataFrame) -> Claim:
-    found = [_nees(rows) for _, rows in table[table["estimator"] == NAIVE].groupby("case", sort=False)]
-    return judged(
-        "fusing as if estimates were independent is inconsistent in all of these cases",
-        OWN,
-        f"mean NEES of 4 states from {min(each.mean for each in found):.3g} on",
-        min(each.low for each in found) > LIMIT,
-        f"confirmed if all intervals' lower ends are above {LIMIT:g}",
-    )
-
-
-def _economy(table: pd.DataFrame) -> list[Claim]:
-    """Whether sending news beats sending in intervals, and whether CI stays consistent."""
-    own = table[table["estimator"] == CI]
-    by_interval, by_news = (own[own["policy"] == policy] for policy in (INTERVAL, NEWS))
-    grid = by_interval.pivot_table(index="bytes_per_s", columns="run", values="squared_m2").sort_index()
-    gains = []
-    for _, rows in by_news.groupby("limit", sort=False):
-        bytes_per_s = float(rows["bytes_per_s"].iloc[0])
-        if grid.index[0] <= bytes_per_s <= grid.index[-1]:
-            place = np.log(bytes_per_s)
-            usual = [np.interp(place, np.log(grid.index), np.log(grid[run])) for run in rows["run"]]
-            difference = 0.5 * (np.log(rows["squared_m2"].to_numpy()) - np.array(usual))
-            gains.append(
-                (float(bytes_per_s), Interval(*np.exp(mean_interval(difference.tolist())).tolist()))
-            )
-    told = "; ".join(f"{at:.0f} B/s: {_told(gain)}" for at, gain in gains)
-    nees = [_nees(rows) for _, rows in own.groupby(["policy", "limit"], sort=False)]
-    worst = max(nees, key=lambda each: each.high)
-    return [
-        judged(
-            "at equal bandwidth sending news has smaller errors than sending in intervals",
-            OWN,
-            f"RMSE over that of intervals at {told}",
-            bool(gains) and all(gain.high < 1.0 for _, gain in gains),
-            "confirmed if all intervals are below 1",
-        ),
-        judged(
-            "CI is consistent at any bandwidth",
-            OWN,
-            f"largest mean NEES of 4 states {_told(worst)}",
-            worst.high <= LIMIT,
-            f"confirmed if the interval's upper end is {LIMIT:g} or less",
-        ),
-    ]
-
-
-def _lie_claims(table: pd.DataFrame, options: StressOptions) -> list[Claim]:
-    """What a great lie does without a gate and with one, and what the gate keeps out."""
-    great = table[table["lie_m"] == options.great_lie_m]
-    plain, gated = (great[great["estimator"] == name] for name in (CI, "gated"))
-    misled, guarded = _nees(plain), _nees(gated)
-    noticed = mean_interval(gated["liar_refused"].to_list())
-    honest = table[(table["lie_m"] == 0.0) & (table["estimator"] == "gated")]
-    false = mean_interval((honest["honest_refused"] + honest["liar_refused"]).to_list())
-    allowed = 2.0 * (1.0 - options.gate_probability)
-    lie = f"a node that lies by {options.great_lie_m:g} m"
-    return [
-        judged(
-            f"{lie} makes honest nodes inconsistent where they fuse all that they hear",
-            OWN,
-            f"mean NEES of 4 states {_told(misled)}",
-            misled.low > LIMIT,
-            f"confirmed if the interval's lower end is above {LIMIT:g}",
-        ),
-        judged(
-            f"{lie} is noticed by the gate",
-            OWN,
-            f"share of its messages refused {_told(noticed)}",
-            noticed.low >= 0.9,
-            "confirmed if the interval's lower end is .9 or more",
-        ),
-        judged(
-            f"with the gate honest nodes stay consistent beside {lie}",
-            OWN,
-            f"mean NEES of 4 states {_told(guarded)}",
-            guarded.high <= LIMIT,
-            f"confirmed if the interval's upper end is {LIMIT:g} or less",
-        ),
-        judged(
-            "where nobody lies the gate refuses no more than it says",
-            OWN,
-            f"share of messages refused {_told(false)}; allowed {allowed:.2g}",
-            false.high <= allowed,
-            "the sum of the shares of the node that could lie and of the others",
-        ),
-    ]
 
 
 def _bandwidth_chart(table: pd.DataFrame) -> Chart:

@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, load_scenario
+from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.inputs import Record
 from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square
@@ -48,7 +49,6 @@ class Printed(Parameters):
         table_of_biases: number of the table of biases' errors.
         table_of_means: number of the table of biases' mean errors.
         position_scenario: number of the scenario that position errors are printed of, from 1.
-        field_of_view_deg: field of view of the sensors that the paper states.
         runs: number of runs that the paper averages.
         sensor_position_m: positions of the sensors (x, y, z), by scenario.
         position_rmse_m: RMSE of the targets' positions, by scheme.
@@ -62,7 +62,6 @@ class Printed(Parameters):
     table_of_biases: str
     table_of_means: str
     position_scenario: int = 1
-    field_of_view_deg: float | None = None
     runs: int = 100
     sensor_position_m: list[list[tuple[float, float, float]]]
     position_rmse_m: dict[str, list[float]]

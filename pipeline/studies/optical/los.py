@@ -1,7 +1,7 @@
 """The study of bias estimation from lines of sight: tables I-VIII and figures of Belfadel et al. 2014.
 
 Every scenario is recorded with and without biases under several conditions. The paper does not state
-those that its tables follow from, so each condition has claims of its own.
+those that its tables follow from, so each condition is judged on its own.
 """
 
 import hashlib
@@ -24,8 +24,13 @@ from pipeline.studies.optical.cases import (
     one_bias_known,
     run_case,
 )
-from pipeline.studies.optical.claims import claims
 from pipeline.studies.optical.figures import figures
+from pipeline.studies.optical.printed import (
+    metrics_beside_print,
+    metrics_of_geometry,
+    metrics_of_print,
+    steepest_deg,
+)
 from pipeline.studies.toolkit.repetitions import require_spread, root_mean_square
 from recorders.models.optical import ANGLES
 
@@ -39,7 +44,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for condition in options.conditions
         for number, name in enumerate(options.scenarios, start=1)
     ]
-    outcome = Outcome(claims=claims(cases, options), figures={**figures(cases, experiment.runs)})
+    outcome = Outcome(figures={**figures(cases, experiment.runs)})
     outcome.tables = {
         "sensors": _table_of_sensors(cases, options.paper),
         "positions": _table_of_positions(cases, options.paper),
@@ -51,7 +56,14 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     if len(cases[0].scene.position_m) == 2:
         outcome.tables["one-bias-known"] = _table_of_one_bias_known(cases)
     for case in cases:
-        outcome.metrics |= _metrics(case)
+        outcome.metrics |= _metrics(case) | metrics_beside_print(case, options.paper)
+    for name, condition in options.conditions.items():
+        outcome.metrics[f"condition.bias_deg.{name}"] = condition.bias_deg
+        outcome.metrics[f"condition.sigma_mrad.{name}"] = 1e3 * condition.sigma_rad
+    first = [case for case in cases if case.condition == cases[0].condition]
+    for case in first:
+        outcome.metrics |= metrics_of_geometry(case, options.paper)
+    outcome.metrics |= metrics_of_print(options.paper)
     outcome.input_sha256 = hashlib.sha256("".join(c.input_sha256 for c in cases).encode()).hexdigest()
     return outcome
 
@@ -180,6 +192,10 @@ def _metrics(case: Case) -> dict[str, Any]:
         f"{JOINT}.nees_at_estimate.{name}": float(np.nanmean(case.nees_at_estimate)),
         f"{JOINT}.bias_rmse_mrad.{name}": root_mean_square(case.bias_error_mrad, (0, 1)).tolist(),
         f"{JOINT}.bias_sigma_mrad.{name}": case.sigma_mrad.tolist(),
+        f"{JOINT}.component_nees.{name}": case.component_nees.tolist(),
+        f"{JOINT}.parameters.{name}": float(len(case.truth)),
+        f"{JOINT}.repetitions.{name}": float(len(case.nees)),
+        f"scene.steepest_deg.{name}": steepest_deg(case),
     }
     for scheme in (ALONE, BLIND, JOINT):
         values[f"{scheme}.position_rmse_m.{name}"] = case.position_rmse_m(scheme).tolist()

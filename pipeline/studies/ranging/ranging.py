@@ -102,8 +102,8 @@ def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
     return float(np.mean(innovations["normalised_innovation_squared"][inside]))
 
 
-def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> tuple[Outcome, pd.DataFrame]:
-    """Metrics and tables of figures by estimator and recording, and the table of all."""
+def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
+    """Metrics and tables of figures by estimator and recording."""
     table = pd.DataFrame(rows)
     outcome = Outcome(input_sha256=hash_streams([each.source for each in found]))
     for row in rows:
@@ -115,7 +115,7 @@ def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> tuple[Outco
     outcome.tables |= {"recordings": table, "summary": summary_table(outcome.metrics)}
     notes = [(each.recording.name, *note) for each in found for note in each.source.run.notes.items()]
     outcome.tables["notes"] = pd.DataFrame(notes, columns=["recording", "what", "count"])
-    return outcome, table
+    return outcome
 
 
 def errors_chart(errors: Mapping[str, tuple[Integers, Floats]], label: str) -> Chart:

@@ -6,13 +6,12 @@ Published tracks are scored at their stamps, ours at the rows of the truth.
 """
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import PositiveFloat
 
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.studies.ranging.ranging import (
@@ -68,30 +67,16 @@ class Window(Parameters):
     end: Place = Place()
 
 
-class Target(Parameters):
-    """What the best filter and the smoother are held to.
-
-    Attributes:
-        filter_m: error of the best filter.
-        smoother_m: error of the smoother.
-    """
-
-    filter_m: PositiveFloat
-    smoother_m: PositiveFloat
-
-
 class UwbOutdoorOptions(RangingOptions):
     """Windows, and what errors are held to.
 
     Attributes:
         windows: the part of a path that is scored, by the name of a folder that a recording lies in;
             without one all of it is.
-        targets: what errors are held to, by the name of a recording.
         level_m: how far from the path's median height a row of the truth may lie.
     """
 
     windows: dict[str, Window] = {}
-    targets: dict[str, Target] = {}
     level_m: PositiveFloat = 0.5
 
 
@@ -101,7 +86,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     folders = [path.parent for path in recordings(setting, "trajectory.csv")]
     named = [Recording("-".join(each.resolve().parts[-3:]), each) for each in folders]
     found = list(replayed(experiment, setting, named))
-    rows, claims, drawn = [], [], {}
+    rows: list[dict[str, Any]] = []
+    drawn = {}
     for each in found:
         window = next(
             (
@@ -132,15 +118,15 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             printed(each.recording.path) if window else {}
         )  # errors of other paths are of unknown parts
         rows += [{"estimator": label, "recording": name, **figures} for label, figures in own.items()]
-        rows += [
-            {"estimator": f"published-{track}", "recording": name, "position_rmse_m": rmse[0]}
-            for track, rmse in published.items()
-        ]
-        claims += _claims(name, paper, published, own, options.targets.get(name))
-    outcome, _ = outcome_of(found, rows)
+        for track, (plane, space) in published.items():
+            figures = {"position_rmse_m": plane, "space_rmse_m": space}
+            rows.append({"estimator": f"published-{track}", "recording": name, **figures})
+            if f"{track}_2d" in paper:
+                figures = {"position_rmse_m": paper[f"{track}_2d"], "space_rmse_m": paper[track]}
+                rows.append({"estimator": f"printed-{track}", "recording": name, **figures})
+    outcome = outcome_of(found, rows)
     outcome.metrics = {key: value for key, value in outcome.metrics.items() if value == value}
     outcome.figures["errors"] = errors_chart(drawn, f"position error (m), {found[0].recording.name}")
-    outcome.claims = claims
     return outcome
 
 
@@ -180,77 +166,6 @@ def printed(folder: Path) -> dict[str, float]:
         return {}
     lines = re.findall(r"(\w+) RMSE(_2d)?: *([\d.]+)", path.read_text(encoding="utf-8"))
     return {f"{track}{plane}": float(value) for track, plane, value in lines}
-
-
-def _claims(
-    name: str,
-    paper: Mapping[str, float],
-    published: Mapping[str, tuple[float, float]],
-    own: dict[str, dict[str, float]],
-    target: Target | None,
-) -> list[Claim]:
-    """What is claimed of one recording, as far as its files and the estimators that were run allow."""
-    rmse = {label: figures["position_rmse_m"] for label, figures in own.items()}
-    claims = []
-    if "LS_2d" in paper and "LS" in published:
-        plane, space = published["LS"]
-        claims.append(
-            judged(
-                f"{name}: the published least squares errs as is printed, to four digits",
-                f"{paper['LS_2d']:.5g} m in the plane, {paper.get('LS', np.nan):.5g} m in space",
-                f"{plane:.5g} m, {space:.5g} m",
-                abs(plane - paper["LS_2d"]) < 5e-5 and abs(space - paper.get("LS", space)) < 5e-5,
-            )
-        )
-    filters = {each: rmse[each] for each in ("ekf", "earlier", "student") if each in rmse}
-    if filters and published:
-        best, rival = min(filters, key=lambda each: filters[each]), min(published.values())[0]
-        limit = target.filter_m if target else rival
-        claims.append(
-            judged(
-                f"{name}: robust filters of ranges alone are better than the published tracks",
-                ", ".join(f"{track} {each[0]:.3f} m" for track, each in published.items())
-                + (f"; own target {limit:g} m" if target else ""),
-                f"{', '.join(f'{label} {value:.3f} m' for label, value in filters.items())}",
-                max(filters.values()) < rival and filters[best] <= limit,
-                "one setting for all recordings",
-            )
-        )
-    if target and "smoother:ekf" in rmse:
-        claims.append(
-            judged(
-                f"{name}: the smoother gains over the filter",
-                f"own target {target.smoother_m:g} m",
-                f"{rmse['smoother:ekf']:.3f} m",
-                rmse["smoother:ekf"] <= target.smoother_m,
-            )
-        )
-    wanted = ("ekf", "not-robust", "dropping", "dropping-with-a-way-back", "earlier")
-    if not set(wanted) <= rmse.keys():
-        return claims
-    robust, plain, dropping, returning, earlier = (rmse[each] for each in wanted)
-    return [
-        *claims,
-        judged(
-            f"{name}: ranges that are off spoil a filter that takes them as they are",
-            "more than 1 m",
-            f"{plain:.2f} m against {robust:.3f} m",
-            plain > 1.0 and plain > 2.0 * robust,
-        ),
-        judged(
-            f"{name}: leaving them out needs a way back",
-            "dropping can lose the track",
-            f"{dropping:.2f} m when dropped, {returning:.2f} m with a way back after 1 s, "
-            f"{robust:.3f} m inflated",
-            dropping > robust and returning < dropping,
-        ),
-        judged(
-            f"{name}: ranges lag: stamps .1 s earlier fit better",
-            ".834 m (A), .297 m (B)" if target else "own expectation",
-            f"{earlier:.3f} m against {robust:.3f} m",
-            earlier < robust,
-        ),
-    ]
 
 
 UWB_OUTDOOR = Study(

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from pydantic import NonNegativeFloat
 
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.studies.ranging.ranging import (
@@ -29,8 +28,6 @@ from recorders.errors import BadInput
 from recorders.models.orientation import heading
 from recorders.models.planar import wrap_angle
 from replay.engine.arrays import Floats, Integers
-
-ASKED = 0.05  # how near the reference's figures ours have to be
 
 
 class UwbPoseOptions(RangingOptions):
@@ -66,11 +63,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             rows.append({"estimator": label, "recording": each.recording.name, **figures})
             if each is found[0]:
                 drawn[label] = time_ns, np.hypot(error[:, 0], error[:, 1])
-    outcome, table = outcome_of(found, rows)
+    outcome = outcome_of(found, rows)
     outcome.figures["errors"] = errors_chart(drawn, f"position error (m), {found[0].recording.name}")
-    for name in table["recording"].unique():
-        of_one: Any = table[table["recording"] == name].set_index("estimator").to_dict("index")
-        outcome.claims += _claims(str(name), of_one)
     return outcome
 
 
@@ -110,53 +104,6 @@ def figures_of(
         "nees_around_mean": nees_around,
     }
     return figures, stamps[rows], error
-
-
-def _claims(name: str, figures: dict[Any, dict[str, float]]) -> list[Claim]:
-    """What is claimed of one recording, where the estimators that it is of were run."""
-    if not {"biased", "ekf", "cautious", "likeliest", "links"} <= figures.keys():
-        return []
-    biased, plain, cautious, likeliest, links = (
-        figures[label] for label in ("biased", "ekf", "cautious", "likeliest", "links")
-    )
-    return [
-        judged(
-            f"{name}: a common bias that is known halves the error of the position",
-            ".154 m without, .0758 m with",
-            f"{biased['position_rmse_m']:.3f} m without, {plain['position_rmse_m']:.4f} m with",
-            plain["position_rmse_m"] < 0.6 * biased["position_rmse_m"],
-        ),
-        judged(
-            f"{name}: the likeliest white noise has an NIS of 1 and is too sure of itself",
-            "NIS 1.00, NEES 54 of 3, position no better (.078 m)",
-            f"NIS {likeliest['nis']:.2f}, NEES {likeliest['nees']:.0f}, "
-            f"{likeliest['position_rmse_m']:.4f} m",
-            abs(likeliest["nis"] - 1.0) < 0.1
-            and likeliest["nees"] > 30.0
-            and likeliest["position_rmse_m"] > plain["position_rmse_m"] * (1.0 - ASKED),
-            "errors of ranges last for seconds; innovations do not see them",
-        ),
-        judged(
-            f"{name}: three times the noise is the plain mend: as accurate, and more nearly consistent",
-            ".0755 m, NIS .07, NEES 6.5",
-            f"{cautious['position_rmse_m']:.4f} m, NIS {cautious['nis']:.3f}, "
-            f"NEES {cautious['nees']:.1f}",
-            cautious["position_rmse_m"] < plain["position_rmse_m"] * (1.0 + ASKED)
-            and cautious["nees"] < 0.5 * plain["nees"],
-        ),
-        judged(
-            f"{name}: with errors of each link that last in the state, NIS is about 1 and the "
-            "uncertainty is told: NEES about the mean error below that of white noise, and at most 6 "
-            "of 3",
-            "own claim",
-            f"NIS {links['nis']:.2f}, NEES {links['nees_around_mean']:.1f} about the mean error, with "
-            f"the likeliest white noise {likeliest['nees_around_mean']:.1f}; "
-            f"{links['position_rmse_m']:.4f} m",
-            abs(links["nis"] - 1.0) < 0.2
-            and links["nees_around_mean"] <= 6.0
-            and links["nees_around_mean"] < likeliest["nees_around_mean"],
-        ),
-    ]
 
 
 UWB_POSE = Study("poses in the plane from ranges between anchors and tags", study, UwbPoseOptions)

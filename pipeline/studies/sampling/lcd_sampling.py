@@ -5,7 +5,6 @@ section V, Figs. 1 and 5. No filter runs here: the logs hold the sample sets.
 """
 
 import hashlib
-from itertools import pairwise
 from time import process_time
 from typing import Annotated
 
@@ -15,7 +14,6 @@ from matplotlib.figure import Figure
 from pydantic import Field, PositiveInt
 from scipy.spatial.distance import pdist
 
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.experiment import Experiment, Setting, Study
 from recorders.log import LogWriter, RunMetadata, make_stream, schemas
@@ -64,7 +62,10 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for name in sets.columns[2:].drop("cpu_per_start_s"):  # no two runs take the same time
             outcome.metrics[f"lcd.{name}.{case}"] = float(row[name])
     outcome.metrics |= {f"{name}.distance.drawn": value for name, value in distances.items()}
-    outcome.claims += claims(options, sets, distances, experiment.seed)
+    for dimension in options.contained:
+        unlike = unlikeness_to_ukf(dimension, options.starts, experiment.seed)
+        for kind, value in zip(("optimised", "corrected"), unlike, strict=True):
+            outcome.metrics[f"lcd.unlike_ukf.n{dimension}-{kind}"] = value
     outcome.input_sha256 = _write(experiment, setting, drawn)
     return outcome
 
@@ -107,54 +108,6 @@ def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, fl
 
 def _invariants(points: np.ndarray) -> np.ndarray:
     return np.concatenate([np.sort(pdist(points)), np.sort(np.linalg.norm(points, axis=1))])
-
-
-def claims(
-    options: LcdOptions, sets: pd.DataFrame, distances: dict[str, float], seed: int
-) -> list[Claim]:
-    """The paper's statements about the sample sets."""
-    unlike = {each: unlikeness_to_ukf(each, options.starts, seed) for each in options.contained}
-    least = sets["least_eigenvalue"]
-    raised = sets["corrected_distance"] / sets["distance"] - 1
-    plane = sets[sets["dimension"] == 2].sort_values("count")
-    found = [
-        judged(
-            f"The S2KF contains the UKF as 2N+1 samples, N = {dimension}, {kind}",
-            "contains the UKF with equally weighted samples as a special case",
-            f"distances differ by at most {unlike[dimension][column]:.2g}",
-            unlike[dimension][column] < 1e-4,
-        )
-        for dimension in options.contained
-        for column, kind in enumerate(("as optimised", "moment-corrected"))
-    ]
-    found += [
-        judged(
-            "The optimised sets have the covariance of N(0, I) without a correction",
-            "used as they are optimised (no correction is mentioned)",
-            f"least eigenvalues from {least.min():.4f} to {least.max():.4f}",
-            bool((least > 0.999).all()),
-            f"the correction raises D by {raised.min():.0%} to {raised.max():.0%}; without it a filter "
-            "thinks itself too sure",
-        ),
-        judged(
-            "More samples approximate N(0, I) better",
-            "accuracy grows with L",
-            f"D from {plane['distance'].max():.2e} to {plane['distance'].min():.2e} in the plane",
-            all(later < earlier for earlier, later in pairwise(plane["distance"])),
-        ),
-    ]
-    smart = [name for name in distances if name.startswith("s2kf")]
-    others = [name for name in distances if not name.startswith("s2kf")]
-    if smart and others:
-        found.append(
-            judged(
-                "LCD samples cover the state space better than the other samplings (Fig. 1)",
-                "homogeneous coverage",
-                "D: " + ", ".join(f"{name} {value:.2e}" for name, value in distances.items()),
-                max(distances[name] for name in smart) < min(distances[name] for name in others),
-            )
-        )
-    return found
 
 
 def sample_figure(drawn: dict[str, Samples], distances: dict[str, float]) -> Figure:

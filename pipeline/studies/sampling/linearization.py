@@ -4,7 +4,7 @@ An experiment's runs are replayed for several seeds, because errors differ more 
 between sample sets of one kind; each seed is an ensemble of its own.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -118,14 +118,3 @@ def error_panel(steps: pd.DataFrame, quantity: str, label: str) -> Panel:
         y=Axis(label=label),
         series=[curve(name, line.index, line) for name, line in lines.items()],
     )
-
-
-def falling(values: Sequence[float]) -> bool:
-    """Whether every value is below the one before it."""
-    return bool(np.all(np.diff(values) < 0))
-
-
-def averages(rows: pd.DataFrame, quantity: str) -> dict[str, float]:
-    """The average over steps and seeds by estimator."""
-    mean = rows.groupby("estimator", sort=False)[quantity].mean()
-    return {str(name): float(value) for name, value in mean.items()}

@@ -16,14 +16,13 @@ import pandas as pd
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
-from pipeline.output.claims import Claim, judged
-from pipeline.output.results import MetricValue, Outcome
+from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.inputs import Record
 from pipeline.runs.recorded import judge, replay_in_memory
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval, rmse_of_runs
-from pipeline.studies.tracking.tracking import lower
+from pipeline.studies.toolkit.repetitions import mean_interval, rmse_of_runs
 from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.arrays import Floats
@@ -32,7 +31,7 @@ from replay.engine.streams.sources import MemorySource
 from replay.sampling import Sampler, Samples, parse_sampling
 
 DIRECTIONS = {"all": "in all directions", "axes": "along the axes"}
-OWN = "(not in the paper)"
+RATED = "s2kf-100"  # the sampling whose errors stand beside those of the others
 X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
@@ -93,13 +92,11 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         tables.append(table.assign(drive=name, samples=table["estimator"].map(counts)))
         sources += recorded
     outcome = Outcome(input_sha256=hash_streams(sources), tables={"moments": moments})
-    outcome.metrics |= _moment_metrics(moments)
-    outcome.claims += _moment_claims(moments)
+    _measure_moments(moments, outcome)
     runs = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
     if tables:
         outcome.tables["runs"] = runs
-        outcome.metrics |= _drive_metrics(runs, options)
-        outcome.claims += _drive_claims(runs, options)
+        measure_drives(runs, options, outcome)
     outcome.figures["samples"] = _chart(moments, runs)
     return outcome
 
@@ -213,18 +210,23 @@ def driven(
     return sources, pd.DataFrame(rows, columns=columns)
 
 
-def _moment_metrics(moments: pd.DataFrame) -> dict[str, MetricValue]:
-    quantities = ["mean_error", "covariance_error", "cross_error"]
-    means: Any = moments.groupby(["estimator", "dimension", "direction"], sort=False)[quantities].mean()
-    return {
-        f"{label}.{quantity}.n{dimension}-{direction}": float(value)
-        for (label, dimension, direction), row in means.iterrows()
-        for quantity, value in row.items()
-    }
+def _measure_moments(moments: pd.DataFrame, outcome: Outcome) -> None:
+    """Errors with their intervals over the functions; logarithms of `RATED`'s over those of others."""
+    for (dimension, direction), rows in moments.groupby(["dimension", "direction"], sort=False):
+        case = f"n{dimension}-{direction}"
+        for quantity in ("mean_error", "covariance_error", "cross_error"):
+            wide: Any = rows.pivot_table(quantity, "function", "estimator", sort=False)
+            for label in wide:
+                outcome.measure(f"{label}.{quantity}.{case}", *mean_interval(wide[label].tolist()))
+            if quantity == "mean_error" and RATED in wide:
+                for label in wide.columns.drop(RATED):
+                    ratio = mean_interval(np.log(wide[RATED] / wide[label]).tolist())
+                    outcome.measure(f"{label}.log_ratio.{case}", *ratio)
 
 
-def _drive_metrics(runs: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
-    found: dict[str, MetricValue] = {}
+def measure_drives(runs: pd.DataFrame, options: Options, outcome: Outcome) -> None:
+    """Errors by drive, and by how much (%) those of the position change with other samples."""
+    found = outcome.metrics
     for drive, of_drive in runs.groupby("drive", sort=False):
         quantities = ["position_rmse_m", "nees_per_component", "samples"]
         means: Any = of_drive.groupby("estimator", sort=False)[quantities].mean()
@@ -232,71 +234,12 @@ def _drive_metrics(runs: pd.DataFrame, options: Options) -> dict[str, MetricValu
             found |= {f"{label}.{name}.{drive}": float(value) for name, value in row.dropna().items()}
         enough = means["position_rmse_m"] <= (1.0 + options.pays) * means["position_rmse_m"].min()
         found[f"lrkf.samples_that_pay.{drive}"] = float(means["samples"][enough].min())
-    return found
-
-
-def _moment_claims(moments: pd.DataFrame) -> list[Claim]:
-    """What more samples are expected to be worth, of the samplings that the experiment has."""
-    known, claims = set(moments["estimator"]), []
-    for direction, words in DIRECTIONS.items():
-        of_direction = moments[moments["direction"] == direction]
-        for label, other, statement in (
-            ("s2kf-100", "s2kf-25", "100 LCD samples err less than 25"),
-            ("s2kf-100", "ukf", "100 LCD samples err less than the UKF's"),
-            ("s2kf-100", "rukf-12", "100 LCD samples err less than RUKF-12's, however many these are"),
-        ):
-            if {label, other} <= known:
-                apart = {
-                    f"N = {dimension}": _log_ratio(rows, label, other)
-                    for dimension, rows in of_direction.groupby("dimension", sort=False)
-                }
-                claims.append(lower(f"mean of waves {words}: {statement}", OWN, "(log ratio)", apart))
-        if "ukf" in known:
-            claims.append(_grows(of_direction, words))
-    return claims
-
-
-def _log_ratio(rows: pd.DataFrame, label: str, other: str) -> Interval:
-    by_function: Any = rows.pivot_table("mean_error", "function", "estimator")
-    return mean_interval(np.log(by_function[label] / by_function[other]).tolist())
-
-
-def _grows(rows: pd.DataFrame, words: str) -> Claim:
-    own = rows[rows["estimator"] == "ukf"]
-    first, last = (
-        mean_interval(own["mean_error"][own["dimension"] == dimension].tolist())
-        for dimension in (own["dimension"].min(), own["dimension"].max())
-    )
-    return judged(
-        f"mean of waves {words}: the UKF's error grows from {own['dimension'].min()} to "
-        f"{own['dimension'].max()} dimensions",
-        OWN,
-        f"{first.mean:.3f} ({first.low:.3f} to {first.high:.3f}) and "
-        f"{last.mean:.3f} ({last.low:.3f} to {last.high:.3f}) standard deviations",
-        last.low > first.high,
-    )
-
-
-def _drive_claims(runs: pd.DataFrame, options: Options) -> list[Claim]:
-    claims, share = [], options.pays
-    for drive, rows in runs.groupby("drive", sort=False):
-        rmse_m: Any = rows.pivot_table("position_rmse_m", "run", "estimator")
-        for label, other, more in (
-            ("ukf", "ekf", "samples instead of derivatives"),
-            ("s2kf-100", "ukf", "100 LCD samples instead of the UKF's"),
-        ):
+        rmse_m: Any = of_drive.pivot_table("position_rmse_m", "run", "estimator")
+        for label, other in (("ukf", "ekf"), (RATED, "ukf")):
             if {label, other} <= set(rmse_m):
-                ratio = (100.0 * (rmse_m[label] / rmse_m[other] - 1.0)).tolist()
-                gain = mean_interval(ratio)
-                claims.append(
-                    judged(
-                        f"{drive}: {more} lower the RMSE of the position by {share:.0%} or more",
-                        OWN,
-                        f"{gain} %",
-                        gain.high <= -100.0 * share,
-                    )
-                )
-    return claims
+                change = 100.0 * (rmse_m[label] / rmse_m[other] - 1.0)
+                key = f"{label}.rmse_change_percent.{drive}-{other}"
+                outcome.measure(key, *mean_interval(change.tolist()))
 
 
 def _chart(moments: pd.DataFrame, runs: pd.DataFrame) -> Chart:

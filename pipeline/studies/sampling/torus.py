@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pydantic import PositiveFloat, PositiveInt
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -135,9 +134,10 @@ def study_propagation(experiment: Experiment, setting: Setting) -> Outcome:
         for name, errors in found.items():
             outcome.metrics[f"{name}.mean_error_rad.{case}"] = float(errors.mean.mean())
             outcome.metrics[f"{name}.covariance_error_rad2.{case}"] = float(errors.covariance.mean())
+            for part, values in errors._asdict().items():
+                by_correlation = np.atleast_2d(values).mean(axis=0).tolist()
+                outcome.metrics[f"{name}.{part}_errors_by_correlation.{case}"] = by_correlation
             tables.append(_rows(options, coupling_rad, name, errors))
-        own = found[f"five-w{100 * options.central_weights[0]:g}"]
-        outcome.claims += _propagation_claims(case, own, found["ukf"], found["random"])
     outcome.tables["errors"] = pd.concat(tables)
     outcome.figures["errors"] = propagation_chart(outcome.tables["errors"], options)
     return outcome
@@ -156,28 +156,6 @@ def _rows(
             "covariance_error_rad2": covariance,
         }
     )
-
-
-def _propagation_claims(
-    case: str, own: MomentErrors, ukf: MomentErrors, random: MomentErrors
-) -> list[Claim]:
-    """Who wins at how many correlations: in the mean, and in the covariance."""
-    claims = []
-    for rival, name in ((ukf, "the UKF's five"), (random, "random samples (mean over the runs)")):
-        wins, count = [], len(own.mean)
-        for ours, theirs in zip(own, rival, strict=True):
-            wins.append(int((ours < np.atleast_2d(theirs).mean(axis=0)).sum()))
-        claims.append(
-            judged(
-                f"significantly outperforms {name}: {case}",
-                "smaller errors of mean and covariance at every correlation",
-                f"mean {own.mean.mean():.4f} against {rival.mean.mean():.4f} rad, wins {wins[0]} of "
-                f"{count}; covariance {own.covariance.mean():.4f} against "
-                f"{rival.covariance.mean():.4f} rad^2, wins {wins[1]} of {count}",
-                min(wins) == count,
-            )
-        )
-    return claims
 
 
 def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart:
@@ -211,21 +189,15 @@ class FilterOptions(Parameters):
     Attributes:
         cases: what differs in the scenario's parameters, by the name of a case.
         grid_cells: cells of the grid per angle.
-        estimator: label of the estimator that is judged.
     """
 
     cases: dict[str, dict[str, float]] = {}
     grid_cells: PositiveInt = 48
-    estimator: str = "torus"
 
 
 def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
     """The recursive toroidal filter beside unscented filters; see `pipeline.runs.experiment.Study`."""
     options: FilterOptions = setting.options
-    if options.estimator not in experiment.estimators:
-        raise BadInput(
-            f"experiment '{experiment.title}': estimator {options.estimator} is missing; add it"
-        )
     outcome = Outcome()
     sources: list[MemorySource] = []
     errors_rad: dict[str, dict[str, Floats]] = {}
@@ -237,7 +209,6 @@ def study_filter(experiment: Experiment, setting: Setting) -> Outcome:
         found["grid"] = _grid_errors_rad(replayed, options.grid_cells)
         rmse = {name: float(np.sqrt(np.nanmean(error**2))) for name, error in found.items()}
         outcome.metrics.update({f"{name}.angle_rmse_rad.{case}": each for name, each in rmse.items()})
-        outcome.claims += _filter_claims(case, rmse, options.estimator)
         errors_rad[case] = found
         sources += replayed.sources
     outcome.input_sha256 = hash_streams(sources)
@@ -268,30 +239,6 @@ def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
     found = run_torus_grid_filter(model, state, offsets, measured)
     squared = (wrap_angle(found.mean - truth) ** 2).mean(axis=1)
     return np.sqrt(np.add.reduceat(squared, offsets[:-1]) / np.diff(offsets))
-
-
-def _filter_claims(case: str, rmse: dict[str, float], estimator: str) -> list[Claim]:
-    own = rmse[estimator]
-    claims = [
-        judged(
-            f"at least as good as {name}: {case}",
-            "announced as future work, without numbers",
-            f"{own:.4f} against {rival:.4f} rad per angle",
-            own <= 1.005 * rival,
-        )
-        for name, rival in rmse.items()
-        if name not in (estimator, "grid")
-    ]
-    excess = own / rmse["grid"] - 1.0
-    return [
-        *claims,
-        judged(
-            f"nearly optimal, within 2 % of Bayes' rule on a grid: {case}",
-            "(not in the paper)",
-            f"{own:.4f} against {rmse['grid']:.4f} rad per angle, {100 * excess:.1f} % more",
-            excess < 0.02,
-        ),
-    ]
 
 
 def filter_figure(errors_rad: dict[str, dict[str, Floats]]) -> Figure:

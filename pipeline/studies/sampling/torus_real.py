@@ -17,7 +17,6 @@ from scipy.special import expit, logsumexp
 from threadpoolctl import threadpool_limits
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -51,6 +50,17 @@ Filter = Callable[..., tuple[WrappedNormal, WrappedNormal]]
 
 _PRIOR = np.diag([0.1, 0.5]) ** 2
 _TURNS = 2.0 * np.pi * np.arange(-5, 6)
+
+
+# The simpler density that each is judged beside.
+SIMPLER = {
+    "wrapped": "moments",
+    "wrapped-mixture": "wrapped",
+    "sine": "wrapped",
+    "cosine": "wrapped",
+    "sine-mixture": "wrapped-mixture",
+    "cosine-mixture": "wrapped-mixture",
+}
 
 
 class Options(Parameters):
@@ -143,16 +153,9 @@ def _judge_fits(table: pd.DataFrame, options: Options, outcome: Outcome) -> None
     for name, column in table.items():
         outcome.metrics[f"{name}.log_density.dihedrals"] = float(column.mean())
     outcome.tables["dihedrals"] = table.rename_axis("residue").reset_index()
-    for claim, better, worse in (
-        ("maximum likelihood fits a wrapped normal better than moments", "wrapped", "moments"),
-        ("a mixture is needed", "wrapped-mixture", "wrapped"),
-        ("a von Mises density with sines fits better than a wrapped normal", "sine", "wrapped"),
-        ("a von Mises density with cosines fits better than a wrapped normal", "cosine", "wrapped"),
-        ("mixtures: sines fit better than wrapped normals", "sine-mixture", "wrapped-mixture"),
-        ("mixtures: cosines fit better than wrapped normals", "cosine-mixture", "wrapped-mixture"),
-    ):
-        gain = interval(table[better] - table[worse], options.block_residues)
-        outcome.claims.append(_gains(f"dihedrals: {claim}", gain, "a residue"))
+    for name, simpler in SIMPLER.items():
+        gain = interval(table[name] - table[simpler], options.block_residues)
+        outcome.measure(f"{name}.log_density_gain.{simpler}", *gain)
 
 
 def _judge_predictions(
@@ -178,50 +181,18 @@ def _judge_predictions(
         outcome.metrics |= {f"{name}.{key}.wind": value for key, value in parameters.items()}
     outcome.figures["wind"] = _chart(outcome.tables["wind"], half)
 
-    def gain(name: str, other: str) -> Interval:
-        return interval(later[name].log_density - later[other].log_density, options.block_hours)
-
-    outcome.claims += [
-        _gains(f"wind: five samples predict better than {other}", gain("torus", name), "an hour")
-        for name, other in (
-            ("persistence", "persistence"),
-            ("persistence-with-jumps", "persistence with jumps anywhere"),
-            ("ukf", "the wrapped UKF"),
-        )
-    ]
-    lost = gain("torus", "grid")
-    outcome.claims.append(
-        judged(
-            "wind: five samples are enough, within .02 an hour of Bayes' rule on a grid",
-            "(not in the paper)",
-            f"log density {_said(lost)} an hour",
-            lost.low > -0.02,
-        )
-    )
-    nearer = interval(later["persistence"].error_rad - later["torus"].error_rad, options.block_hours)
-    outcome.claims.append(
-        judged(
-            "wind: five samples are nearer to the next direction than persistence",
-            "(not in the paper)",
-            f"circular distance {_said(nearer)} rad less",
-            nearer.low > 0.0,
-        )
-    )
+    own = later["torus"]
+    for name in ("persistence", "persistence-with-jumps", "ukf", "grid"):
+        gain = interval(own.log_density - later[name].log_density, options.block_hours)
+        outcome.measure(f"torus.log_density_gain.{name}", *gain)
+    nearer = interval(later["persistence"].error_rad - own.error_rad, options.block_hours)
+    outcome.measure("torus.error_gain_rad.persistence", *nearer)
 
 
 def interval(values: Floats | pd.Series, block: int) -> Interval:
     """The mean, and where it lies with 95 % by Student's distribution of the means of whole blocks."""
     whole = np.asarray(values)[: len(values) // block * block]
     return mean_interval(whole.reshape(-1, block).mean(axis=1).tolist())
-
-
-def _said(gain: Interval) -> str:
-    return f"{gain.mean:+.3f} ({gain.low:+.3f} to {gain.high:+.3f})"
-
-
-def _gains(claim: str, gain: Interval, unit: str) -> Claim:
-    """A claim that holds where the whole interval is above zero."""
-    return judged(claim, "(not in the paper)", f"log density {_said(gain)} {unit}", gain.low > 0.0)
 
 
 FILTERS: dict[str, Filter] = {

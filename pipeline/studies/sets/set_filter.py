@@ -1,22 +1,22 @@
 """The study of guaranteed sets over time: area, containment, how much the past helps, what was isolated.
 
-The claims are ours, papers have no numbers of this; each was set before its numbers were seen. What is
-compared are the frames for which all estimators have a set or an ellipse; intervals are over the robots.
+What is compared are the frames for which all estimators have a set or an ellipse; intervals are over the
+robots.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import MetricValue, Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
 from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval
+from pipeline.studies.toolkit.repetitions import mean_interval
 from replay.distributions import chi2
 from replay.judging.errors.evaluation import Errors
 from replay.judging.sets.evaluation import JudgedSets, judge_sets
@@ -32,7 +32,6 @@ from replay.regions.frames import (
 ELLIPSE = 0.99
 FRAMES, FILTER, L8, EKF, BEARINGS = "frames", "filter", "filter-l8", "ekf", "ekf-bearings"
 KEYS = ["case", "run", "time_ns"]
-OWN = "(own claim)"
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -53,7 +52,12 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         outcome.metrics[key.format("area_median_m2")] = row["area_m2"]
         outcome.metrics[key.format("containment_share")] = row["inside"]
     outcome.metrics |= filter_metrics(filters)
-    outcome.claims = _claims(outcome.metrics, summary, filters)
+    _compare(summary, outcome)
+    of_filter = [each for each in filters if each.sets.estimator == FILTER]
+    shares = [float(each.guaranteed[each.sets.known].mean()) for each in of_filter]
+    if shares:
+        outcome.measure(f"{FILTER}.guaranteed_share", *mean_interval(shares))
+    outcome.metrics |= isolation_metrics(filters)
     outcome.figures["sets"] = _chart(summary)
     outcome.input_sha256 = hash_streams(sources)
     return outcome
@@ -117,6 +121,7 @@ def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
         values = {
             "frames": known.sum(),
             "violations": each.violations,
+            "guaranteed": each.guaranteed.sum(),
             "guaranteed_share": each.guaranteed[known].mean(),
             "frames_beyond_bounds": (known & ~each.frame_holds).sum(),
             "odometry_beyond_bounds": (known & ~each.odometry_holds).sum(),
@@ -134,121 +139,35 @@ def filter_metrics(found: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
     return metrics
 
 
-def _claims(
-    metrics: Mapping[str, MetricValue], summary: pd.DataFrame, filters: Sequence[JudgedFilter]
-) -> list[Claim]:
-    """What is demanded of the sets; those claims whose estimators were run."""
-    claims = [_guarantee(filters)]
+def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
+    """The filter's areas over those of the others, and how much more often it holds the robot."""
     wide = summary.pivot_table(index=["case", "run"], columns="estimator")
     area, inside = wide["area_m2"], wide["inside"]
-
-    def ratio(one: str, other: str) -> Interval:
-        return _exponential(mean_interval(np.log(area[one] / area[other]).to_list()))
-
-    if {FRAMES, FILTER} <= set(area):
-        past = ratio(FILTER, FRAMES)
-        claims.append(
-            judged(
-                "the past halves the sets of single frames",
-                OWN,
-                f"median area over that of frames alone {_told(past)}",
-                past.high <= 0.5,
-                "confirmed if the interval's upper end is .5 or less",
-            )
-        )
-    if {L8, FILTER} <= set(area):
-        loss = ratio(L8, FILTER)
-        claims.append(
-            judged(
-                "L = 8 in place of polygons costs less than half of the area again",
-                OWN,
-                f"median area over that of polygons {_told(loss)}",
-                loss.high <= 1.5,
-                "confirmed if the interval's upper end is 1.5 or less",
-            )
-        )
-    for name in (EKF, BEARINGS):
-        if {name, FILTER} <= set(area):
-            more = mean_interval((inside[FILTER] - inside[name]).to_list())
-            size = ratio(FILTER, name)
-            claims.append(
-                judged(
-                    f"the sets hold the robot more often than the 99 % ellipses of {name}",
-                    OWN,
-                    f"in {inside[FILTER].mean():.1%} and {inside[name].mean():.1%} of frames, "
-                    f"difference {100 * more.mean:.1f} %, 95 % {100 * more.low:.1f} to "
-                    f"{100 * more.high:.1f} %; area over that of the ellipses {_told(size)}",
-                    more.low > 0.0,
-                    "confirmed if the interval is above 0",
-                )
-            )
-    held = mean_interval(
-        [
-            float(value)
-            for key, value in metrics.items()
-            if key.startswith(f"{FILTER}.guaranteed_share.") and isinstance(value, float)
-        ]
-    )
-    claims.append(
-        judged(
-            "bounds taken from other robots are worth something: nine sets of ten are guaranteed",
-            OWN,
-            f"share of the sets {_told(held)}",
-            held.low >= 0.9,
-            "confirmed if the interval's lower end is .9 or more",
-        )
-    )
-    claims.append(_isolation(filters))
-    return claims
+    for other in (FRAMES, L8, EKF, BEARINGS):
+        if {other, FILTER} <= set(area):
+            ratio = mean_interval(np.log(area[FILTER] / area[other]).to_list())
+            outcome.measure(f"{FILTER}.area_ratio.{other}", *np.exp(ratio))
+            more = mean_interval((inside[FILTER] - inside[other]).to_list())
+            outcome.measure(f"{FILTER}.containment_gain.{other}", *more)
 
 
-def _guarantee(filters: Sequence[JudgedFilter]) -> Claim:
-    """That no set misses the truth that must hold it."""
-    counts: dict[str, list[int]] = {}
+def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
+    """How often the wrong one of a frame and the past is isolated, by the truth; by filter."""
+    counts: dict[str, Counter[str]] = {}
     for each in filters:
-        count = counts.setdefault(each.sets.estimator, [0, 0])
-        count[0] += each.violations
-        count[1] += int(each.guaranteed.sum())
-    told = ", ".join(f"{name} {missed} of {held}" for name, (missed, held) in counts.items())
-    return judged(
-        "sets hold the robot where odometry, bearings and arena have kept their bounds since one did",
-        OWN,
-        f"sets that miss it although they must not: {told}",
-        not any(missed for missed, _ in counts.values()),
-    )
-
-
-def _isolation(filters: Sequence[JudgedFilter]) -> Claim:
-    """That frames that are isolated as wrong are so, by the truth."""
-    right = isolated = open_ = 0
-    for each in filters:
-        if each.sets.estimator != FILTER:
-            continue
+        count = counts.setdefault(each.sets.estimator, Counter())
         doubted = -1
         for step, finding in enumerate(each.finding.tolist()):
             if finding in (CONTRADICTS_PAST, UNDECIDED):
-                open_ += doubted >= 0
+                count["undecided"] += doubted >= 0
                 doubted = step
             elif finding in (FRAME_WRONG, PAST_WRONG):
-                isolated += 1
-                right += bool(each.frame_holds[doubted]) == (finding == PAST_WRONG)
+                is_right = bool(each.frame_holds[doubted]) == (finding == PAST_WRONG)
+                count["isolated_rightly" if is_right else "isolated_wrongly"] += 1
                 doubted = -1
-        open_ += doubted >= 0
-    return judged(
-        "of a frame and a past that contradict each other the wrong one is isolated by later frames",
-        OWN,
-        f"{right} rightly, {isolated - right} wrongly, {open_} not decided",
-        right >= 0.9 * (isolated + open_),
-        "confirmed if nine of ten contradictions are rightly decided",
-    )
-
-
-def _exponential(interval: Interval) -> Interval:
-    return Interval(*np.exp(interval).tolist())
-
-
-def _told(interval: Interval) -> str:
-    return f"{interval.mean:.3g}, 95 % {interval.low:.3g} to {interval.high:.3g}"
+        count["undecided"] += doubted >= 0
+    names = ("isolated_rightly", "isolated_wrongly", "undecided")
+    return {f"{label}.{name}": float(of[name]) for label, of in counts.items() for name in names}
 
 
 def _chart(summary: pd.DataFrame) -> Chart:

@@ -1,6 +1,6 @@
 """The study of set-valued fixes: areas, containment of the truth, faults.
 
-Claims: Briechle, Hanebeck (2004), whose figures have no numbers; section V is recorded besides the
+Its paper, Briechle, Hanebeck (2004), has figures without numbers; section V is recorded besides the
 experiment's own runs wherever these are simulated.
 """
 
@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, path
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import MetricValue, Outcome
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Record, Setting, Study
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.inputs import Record
 from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from replay.judging.errors.evaluation import split_topic
@@ -38,10 +38,8 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         shown = _section_v(runner, outcome)
         runner.keep(replayed.sources, replayed.outputs, drawn=None)
         runner.draw(shown.sources, shown.outputs)
-        outcome.claims = _claims(outcome.metrics)
     else:
         outcome.figures["bounds"] = _bounds_chart(outcome.metrics)
-        outcome.claims = [_guarantee(outcome.metrics)]
         runner.keep(replayed.sources, replayed.outputs)
     outcome.input_sha256 = hash_streams(replayed.sources)
     return outcome
@@ -157,100 +155,6 @@ def _bounds_chart(metrics: Mapping[str, MetricValue]) -> Chart:
         values = [_value(metrics, f"{name}.{quantity}") for name in names]
         panels.append(Panel(y=Axis(label=label), series=[curve(label, names, values, "line+markers")]))
     return Chart(columns=2, panels=panels)
-
-
-def _claims(metrics: Mapping[str, MetricValue]) -> list[Claim]:
-    """The paper's statements against the measured areas; those whose estimators were run."""
-
-    def value(key: str) -> float:
-        return _value(metrics, key)
-
-    def area(name: str, case: str) -> float:
-        return value(f"{name}.area_m2.{case}")
-
-    def ratio(name: str, case: str = "") -> float:
-        return value(f"{name}.area_ratio_median{case}")
-
-    def share(name: str, case: str = "") -> float:
-        return value(f"{name}.below_box_share{case}")
-
-    first, final, frames = FIRST_PAIR, SECTION_V, value(f"{L8}.frames")
-    rows = [
-        (
-            "L = 8 approximates the first pair's set tighter than L = 4 (Figs. 5, 6)",
-            "figures without numbers",
-            f"L8 {area(L8, first):.4f}, L4 {area(L4, first):.4f}, exact {area(EXACT, first):.4f} m²",
-            area(EXACT, first) < area(L8, first) < area(L4, first),
-            "",
-        ),
-        (
-            "after the first pair L = 4 is much tighter than the smallest box",
-            "text to Fig. 6",
-            f"L4 {area(L4, first):.4f}, box {area(BOX, first):.4f} m²",
-            area(L4, first) < 0.5 * area(BOX, first),
-            "",
-        ),
-        (
-            "the final set with L = 8 is much tighter than the tightest box (Fig. 8)",
-            "figure without numbers",
-            f"L8 {area(L8, final):.5f}, box {area(BOX, final):.5f}, exact {area(EXACT, final):.5f} m²",
-            area(EXACT, final) < area(L8, final) < 0.8 * area(BOX, final),
-            "",
-        ),
-        (
-            "the volume of the approximation is smaller than that of the box",
-            "section III-B, tighter bound",
-            f"final set: L4 {area(L4, final):.5f}, box {area(BOX, final):.5f} m²",
-            area(L4, final) < area(BOX, final) and area(L8, final) < area(BOX, final),
-            "false for L = 4 after three pairs, true for L = 8",
-        ),
-        *(
-            (
-                f"the approximation with {title} outperforms boxes",
-                "section VI",
-                f"smaller in {100 * share(name):.0f} %, without errors {100 * share(name, FREE):.0f} %, "
-                f"of {frames:.0f} random scenes; median of area / exact area {ratio(name):.2f}, box "
-                f"{ratio(BOX):.2f}, without errors {ratio(name, FREE):.2f}, box {ratio(BOX, FREE):.2f}",
-                min(share(name), share(name, FREE)) > 0.5 + 1 / np.sqrt(frames),
-                "in more than half of the scenes, by two standard errors",
-            )
-            for title, name in (("L = 8", L8), ("L = 4", L4))
-        ),
-    ]
-    claims = [
-        judged(claim, paper, ours, holds, why)
-        for claim, paper, ours, holds, why in rows
-        if "nan" not in ours
-    ]
-    return [
-        _guarantee(metrics),
-        *claims,
-        Claim(
-            "the areas of Figs. 5 to 8",
-            "not printed",
-            "ours are in the metrics",
-            "not reproducible",
-            "the criterion of lambda, the number of sweeps and the prior are unstated",
-        ),
-    ]
-
-
-def _guarantee(metrics: Mapping[str, MetricValue]) -> Claim:
-    """That no set misses the truth whose bounds hold; a bound that is broken guarantees nothing."""
-    names = [key.partition(".")[0] for key in metrics if key.endswith(".containment_share")]
-    missed = {name: _value(metrics, f"{name}.violations") for name in names}
-    outside = max((_value(metrics, f"{name}.outside_arena") for name in names), default=0.0)
-    told = ", ".join(
-        f"{name} {missed[name]:.0f} ({_value(metrics, f'{name}.containment_share'):.4f})"
-        for name in names
-    )
-    return judged(
-        "the sets are guaranteed to hold the robot's position where the bound holds",
-        "section III-B, conservativeness",
-        f"sets that miss it although it does (share of all sets that hold it): {told}",
-        not any(missed.values()),
-        f"{outside:.0f} frames are left out: the robot was outside the arena" if outside else "",
-    )
 
 
 def _value(metrics: Mapping[str, MetricValue], key: str) -> float:

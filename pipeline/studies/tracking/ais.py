@@ -6,10 +6,9 @@ assigned when tracks and vessels are paired one to one: see `replay.judging.trac
 
 import numpy as np
 import pandas as pd
-from pydantic import NonNegativeInt, PositiveFloat
+from pydantic import PositiveFloat
 
 from pipeline.output.charts import Axis, Chart, Panel, curve, level, thinned
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
@@ -22,7 +21,6 @@ from replay.judging.metrics.measuring import Output
 from replay.judging.tracks.tracks import (
     KEPT_SHARE,
     MANY_REPORTS,
-    kept,
     live_counts,
     reports_of,
     track_tables,
@@ -30,20 +28,12 @@ from replay.judging.tracks.tracks import (
 
 
 class AisOptions(Parameters):
-    """Which estimator is held to what.
+    """How tracks are counted.
 
     Attributes:
-        estimator: label of the estimator that is held to the targets.
-        kept_share: share of vessels that are to keep one track.
-        mean_share: mean share of a vessel's reports that are to be in its own track.
-        more_reports_than: vessels with more reports than this count.
         live_s: a track is called live for so long after a report.
     """
 
-    estimator: str = "report-tracker"
-    kept_share: PositiveFloat = 0.7
-    mean_share: PositiveFloat = 0.88
-    more_reports_than: NonNegativeInt = MANY_REPORTS
     live_s: PositiveFloat = 600.0
 
 
@@ -52,11 +42,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     options: AisOptions = setting.options
     replayed = Runner(experiment, setting).run()
     vessels = vessel_table(replayed)
-    if options.estimator not in set(vessels["estimator"]):
-        raise BadInput(
-            f"no tracks of '{options.estimator}', or no identities to judge them by; give a log with "
-            "both"
-        )
     outcome = Outcome(input_sha256=hash_streams(replayed.sources))
     outcome.metrics.update(replayed.metrics(experiment.metrics))
     outcome.tables["summary"] = summary_table(outcome.metrics)
@@ -64,7 +49,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     notes = replayed.sources[0].run.notes.items()
     outcome.tables["notes"] = pd.DataFrame(notes, columns=["what", "count"])
     outcome.figures["tracks"] = tracks_chart(replayed, vessels, options)
-    outcome.claims = _claims(vessels, options)
     return outcome
 
 
@@ -85,7 +69,7 @@ def vessel_table(replayed: Replayed) -> pd.DataFrame:
 
 def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions) -> Chart:
     """The share of every vessel's reports in its own track, and live tracks and vessels over time."""
-    many = vessels[vessels["reports"] > options.more_reports_than]
+    many = vessels[vessels["reports"] > MANY_REPORTS]
     shares = {
         str(estimator): np.sort(rows["share"])[::-1]
         for estimator, rows in many.groupby("estimator", sort=False)
@@ -95,7 +79,7 @@ def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions)
     ]
     most = max(map(len, shares.values()), default=1)
     above = Panel(
-        x=Axis(label=f"vessels with more than {options.more_reports_than} reports, best first"),
+        x=Axis(label=f"vessels with more than {MANY_REPORTS} reports, best first"),
         y=Axis(label="share of reports in the own track", limits=(0, 1.02)),
         series=[*series, level(f"kept: {KEPT_SHARE:g}", np.arange(most), KEPT_SHARE)],
     )
@@ -113,27 +97,6 @@ def tracks_chart(replayed: Replayed, vessels: pd.DataFrame, options: AisOptions)
         elapsed_s = (at_ns[rows] - source.epoch_ns) * 1e-9
         below.series.append(curve(label, elapsed_s, live[rows], reference=label == "vessels"))
     return Chart(panels=[above, below])
-
-
-def _claims(vessels: pd.DataFrame, options: AisOptions) -> list[Claim]:
-    own = kept(vessels[vessels["estimator"] == options.estimator], reports=options.more_reports_than)
-    if own.targets == 0:
-        return []
-    who = f"{own.targets} vessels with more than {options.more_reports_than} reports"
-    return [
-        judged(
-            f"{options.kept_share:.0%} of {who} keep one track for {KEPT_SHARE:.0%} of their reports",
-            "own target; plain nearest neighbour on position and velocity: 62 %",
-            f"{100 * own.kept_share:.1f} %",
-            own.kept_share >= options.kept_share,
-        ),
-        judged(
-            f"mean share of reports in the own track of {who}: {options.mean_share:g}",
-            "own target; plain nearest neighbour on position and velocity: .84",
-            f"{own.mean_share:.3f}",
-            own.mean_share >= options.mean_share,
-        ),
-    ]
 
 
 AIS = Study("tracks of reports without identities, against the identities", study, AisOptions)

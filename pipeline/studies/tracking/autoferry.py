@@ -9,10 +9,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from pydantic import PositiveFloat
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged, listed
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.estimates import hash_streams
@@ -20,9 +18,8 @@ from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.recorded import replay_in_memory
 from pipeline.runs.runner import Runner
 from pipeline.studies.tracking.tracking import (
-    difference,
-    lower,
     means_of,
+    measure_changes,
     nis_metrics,
     sets_of,
     table_of,
@@ -34,22 +31,18 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.judging.tracks.errors import Judged, instants_of, tracks_at
 
-EQUAL_M = 1e-9
-
 
 class AutoferryOptions(Parameters):
-    """What trackers are held to, and late scans.
+    """What is compared, and late scans.
 
     Attributes:
-        best_gospa_m: mean GOSPA of the best tracker is to be at most this.
-        radar_lidar_gospa_m: mean GOSPA with radar and lidar is to be at most this.
+        compared: pairs of estimators whose figures are compared, the first with the second.
         late: ways to treat late scans that are tried in the order of arrival.
         late_estimators: labels of the estimators that are replayed so; those that are not run are left
             out.
     """
 
-    best_gospa_m: PositiveFloat = 9.3
-    radar_lidar_gospa_m: PositiveFloat = 9.5
+    compared: list[tuple[str, str]] = []
     late: tuple[str, ...] = ("wait:1", "rewind:1", "drop")
     late_estimators: tuple[str, ...] = ()
 
@@ -67,6 +60,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         outcome.metrics |= {f"{label}.{name}": value for name, value in of_mean.items()}
     for label, name, value in table[["estimator", "run", "gospa_m"]].itertuples(index=False):
         outcome.metrics[f"{label}.gospa_m.{name}"] = float(value)
+    measure_changes(table, setting.options.compared, outcome)
     outcome.metrics |= nis_metrics(replayed.innovations)
     late = _late_table(experiment, setting.options, sources, replayed.outputs, runs)
     for (late_label, policy), rows in late.groupby(["estimator", "policy"], sort=False):
@@ -82,7 +76,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     ]
     outcome.tables["notes"] = pd.DataFrame(notes, columns=["scenario", "what", "count"])
     outcome.figures["gospa"] = _chart(table)
-    outcome.claims = _claims(table, late, setting.options)
     return outcome
 
 
@@ -161,136 +154,6 @@ def _chart(table: pd.DataFrame) -> Chart:
     for label, rows in table.groupby("estimator", sort=False):
         panel.series.append(curve(str(label), rows["run"], rows["gospa_m"], "line+markers"))
     return Chart(panels=[panel])
-
-
-BOTH, ALL, RADAR, LIDAR = (f"jipda-{each}" for each in ("radar-lidar", "all", "radar", "lidar"))
-RMSE = "target1_rmse_m", "target2_rmse_m"
-COVERAGE = "target1_coverage", "target2_coverage"
-
-
-def _claims(table: pd.DataFrame, late: pd.DataFrame, options: AutoferryOptions) -> list[Claim]:
-    """The sheet's statements, where the estimators that they are of were run."""
-    needed = {BOTH, ALL, RADAR, LIDAR, f"{BOTH}-no-lag", f"{RADAR}-no-lag", f"{BOTH}-smoothed"}
-    needed |= {"hungarian-radar-lidar", "hungarian-all", "hungarian-all-white"}
-    if not needed <= set(table["estimator"]):
-        return []
-    mean = means_of(table)
-    filters = [label for label in mean if label != f"{BOTH}-smoothed"]
-    best = min(filters, key=lambda label: mean[label]["gospa_m"])
-    both, scenarios = mean[BOTH], table["run"].nunique()
-    return [
-        judged(
-            f"the best tracker has a GOSPA of at most {options.best_gospa_m:g} m",
-            "own target; best reference 9.07 m",
-            f"{mean[best]['gospa_m']:.2f} m, {best}, mean of {scenarios} scenarios",
-            mean[best]["gospa_m"] <= options.best_gospa_m,
-            "of these scenarios; settings are the reference trackers', which were picked on them",
-        ),
-        judged(
-            f"radar and lidar have at most {options.radar_lidar_gospa_m:g} m, with either association",
-            "reference: GNN 9.32 m, JIPDA 9.16 m",
-            f"hungarian {mean['hungarian-radar-lidar']['gospa_m']:.2f} m, jipda {both['gospa_m']:.2f} m",
-            max(mean["hungarian-radar-lidar"]["gospa_m"], both["gospa_m"])
-            <= options.radar_lidar_gospa_m,
-        ),
-        judged(
-            "JIPDA with radar and lidar is as accurate as the reference, and covers as much",
-            "RMSE 4.89 and 3.92 m, coverage .92 and .81",
-            f"RMSE {listed([both[name] for name in RMSE], 2, ' and ')} m, coverage "
-            f"{listed([both[name] for name in COVERAGE], 2, ' and ')}",
-            both[RMSE[0]] <= 4.89 + 0.7
-            and both[RMSE[1]] <= 3.92 + 0.7
-            and both[COVERAGE[0]] >= 0.90
-            and both[COVERAGE[1]] >= 0.79,
-        ),
-        lower(
-            "a radar modelled with its lag lowers the GOSPA of radar alone",
-            "12.05 m without, 9.07 m with a lag of 1.5 s",
-            "m",
-            {"GOSPA": difference(table, "gospa_m", RADAR, f"{RADAR}-no-lag")},
-        ),
-        lower(
-            "with lidar, too, a lag sharpens tracks",
-            "localisation 65 m^2 without, 41 m^2 with",
-            "m^2",
-            {"localisation": difference(table, "localisation_m2", BOTH, f"{BOTH}-no-lag")},
-        ),
-        _unchanged(table),
-        lower(
-            "lidar sharpens what radar sees",
-            "RMSE smaller by .5 to 1.4 m",
-            "m",
-            {
-                f"target {number}": difference(table, name, BOTH, RADAR)
-                for number, name in enumerate(RMSE, start=1)
-            },
-        ),
-        lower(
-            "lidar alone covers less",
-            "coverage .63 and .59, with radar .92 and .81",
-            "",
-            {
-                f"target {number}": difference(table, name, LIDAR, BOTH)
-                for number, name in enumerate(COVERAGE, start=1)
-            },
-        ),
-        *(
-            lower(
-                f"bearings of cameras improve radar and lidar ({association})",
-                f"they do not: {theirs} m more GOSPA",
-                "m",
-                {
-                    "GOSPA": difference(
-                        table, "gospa_m", f"{association}-all", f"{association}-radar-lidar"
-                    )
-                },
-                "errors of bearings stay alike for seconds, and boxes move on long hulls",
-            )
-            for association, theirs in (("hungarian", ".3"), ("jipda", ".6"))
-        ),
-        lower(
-            "it is worse to take every bearing, as if its error were white",
-            "3.13 m less GOSPA with one a second, and errors by range",
-            "m",
-            {"GOSPA": difference(table, "gospa_m", "hungarian-all", "hungarian-all-white")},
-        ),
-        lower(
-            "smoothing tracks lowers their RMSE",
-            "own target",
-            "m",
-            {
-                f"target {number}": difference(table, name, f"{BOTH}-smoothed", BOTH)
-                for number, name in enumerate(RMSE, start=1)
-            },
-        ),
-        *_late_claims(late),
-    ]
-
-
-def _unchanged(table: pd.DataFrame) -> Claim:
-    """The other half of the sheet's statement on lag, with lidar."""
-    change = difference(table, "gospa_m", BOTH, f"{BOTH}-no-lag")
-    return judged(
-        "with lidar a lag leaves GOSPA unchanged within 1 m",
-        "9.53 m without, 9.16 m with",
-        f"{change} m",
-        max(-change.low, change.high) <= 1.0,
-    )
-
-
-def _late_claims(late: pd.DataFrame) -> list[Claim]:
-    """Going back for late scans is exact, and the scans that are late here are few."""
-    if late.empty:
-        return []
-    rewound = late.loc[late["policy"] == "rewind", "from_in_order_m"]
-    return [
-        judged(
-            "after the last late scan, tracks that went back are those in order",
-            "own target: within 1e-9 m",
-            f"at most {rewound.max():.1e} m apart in {len(rewound)} replays",
-            rewound.max() <= EQUAL_M,
-        )
-    ]
 
 
 AUTOFERRY = Study(

@@ -5,31 +5,33 @@ are the same in all cases.
 """
 
 from itertools import product
+from typing import Any
 
 import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, band, curve
-from pipeline.output.claims import Claim
 from pipeline.output.results import Outcome
 from pipeline.output.summary import summary_table
 from pipeline.runs.experiment import Experiment, Setting, Study
 from pipeline.runs.runner import Runner
-from pipeline.studies.toolkit.repetitions import Interval, mean_interval
-from pipeline.studies.tracking.tracking import difference, lower, means_of, table_of
+from pipeline.studies.toolkit.repetitions import mean_interval
+from pipeline.studies.tracking.tracking import means_of, measure_changes, table_of
 from recorders.parameters import Parameters
 from replay.judging.tracks.errors import instants_of
 
 
 class CrossingOptions(Parameters):
-    """The cases.
+    """The cases, and what is compared.
 
     Attributes:
         clutter_per_scan: mean numbers of false detections in a scan.
         detection_probability: probabilities of detection.
+        compared: pairs of estimators whose figures are compared, the first with the second.
     """
 
     clutter_per_scan: tuple[float, ...] = (10.0, 50.0, 100.0)
     detection_probability: tuple[float, ...] = (0.95, 0.8, 0.65)
+    compared: list[tuple[str, str]] = []
 
 
 def study(experiment: Experiment, setting: Setting) -> Outcome:
@@ -47,11 +49,12 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             table.insert(position, quantity, value)
         for label, of_mean in means_of(table.drop(columns=[*cases[name]])).items():
             outcome.metrics |= {f"{label}.{what}.{name}": value for what, value in of_mean.items()}
+        measure_changes(table, setting.options.compared, outcome, name)
         tables.append(table)
     every = pd.concat(tables, ignore_index=True)
     outcome.tables |= {"runs": every, "summary": summary_table(outcome.metrics)}
     outcome.figures["gospa"] = _chart(every)
-    outcome.claims = _claims(every)
+    _measure_growth(every, setting.options.compared, outcome)
     return outcome
 
 
@@ -77,97 +80,16 @@ def _chart(every: pd.DataFrame) -> Chart:
     return Chart(panels=panels, columns=3)
 
 
-def _claims(every: pd.DataFrame) -> list[Claim]:
-    """What associations and modes are expected to be worth, where they were run in all cases."""
-    estimators = set(every["estimator"])
-    claims = []
-    if {"jipda", "jpda", "hungarian", "nearest"} <= estimators:
-        claims += _association_claims(every)
-    if {"pmbm", "jipda"} <= estimators:
-        claims += [_lower_gospa(every, clutter, "pmbm", "jipda") for clutter in _clutters(every)]
-    if {"modes", "drive", "manoeuvre"} <= estimators:
-        claims += _mode_claims(every)
-    return claims
-
-
-def _association_claims(every: pd.DataFrame) -> list[Claim]:
-    least, most = min(_clutters(every)), max(_clutters(every))
-    claims = [
-        _lower_gospa(every, clutter, label, other)
-        for label, other in (("jipda", "nearest"), ("jpda", "nearest"), ("jpda", "hungarian"))
-        for clutter in _clutters(every)
-    ]
-    gained = {
-        f"p_D {probability:g}": _change(every, probability, "jpda", "nearest")
-        for probability in every["detection_probability"].unique()
-    }
-    statement = f"jpda gains more over nearest at {most:g} than at {least:g} false detections a scan"
-    claims.append(lower(statement, "expected", "m", gained))
-    statement = f"jpda switches tracks less often than nearest at {most:g} false detections a scan"
-    fewer = _differences(every, most, "switches", "jpda", "nearest")
-    return [*claims, lower(statement, "expected", "", fewer)]
-
-
-def _clutters(every: pd.DataFrame) -> list[float]:
-    return every["clutter_per_scan"].unique().tolist()
-
-
-def _lower_gospa(every: pd.DataFrame, clutter: float, label: str, other: str) -> Claim:
-    return lower(
-        f"{label} has a lower GOSPA than {other} at {clutter:g} false detections a scan",
-        "expected",
-        "m",
-        _differences(every, clutter, "gospa_m", label, other),
-    )
-
-
-def _mode_claims(every: pd.DataFrame) -> list[Claim]:
-    least = every["clutter_per_scan"].min()
-    straight = {
-        f"target {number}, {name}": interval
-        for number in (1, 2)
-        for name, interval in _differences(
-            every, least, f"target{number}_rmse_m", "modes", "manoeuvre"
-        ).items()
-    }
-    return [
-        lower(
-            f"modes lower the RMSE of the target that turns, against driving alone, at {least:g}",
-            "expected",
-            "m",
-            _differences(every, least, "target5_rmse_m", "modes", "drive"),
-        ),
-        lower(
-            f"modes lower the RMSE of targets that go straight, against manoeuvring alone, at {least:g}",
-            "expected",
-            "m",
-            straight,
-        ),
-    ]
-
-
-def _differences(
-    every: pd.DataFrame, clutter: float, quantity: str, label: str, other: str
-) -> dict[str, Interval]:
-    """The differences of two estimators at a rate of clutter, by probability of detection."""
-    return {
-        f"p_D {probability:g}": difference(_of(every, clutter, probability), quantity, label, other)
-        for probability in every["detection_probability"].unique()
-    }
-
-
-def _of(every: pd.DataFrame, clutter: float, probability: float) -> pd.DataFrame:
-    """The rows of one case."""
-    is_of_case = every["clutter_per_scan"] == clutter
-    return every[is_of_case & (every["detection_probability"] == probability)]
-
-
-def _change(every: pd.DataFrame, probability: float, label: str, other: str) -> Interval:
-    """By how much the difference in GOSPA of two estimators grows from the least clutter to the most."""
-    at_probability = every[every["detection_probability"] == probability]
-    by_run = at_probability.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
-    apart = by_run[label] - by_run[other]
-    return mean_interval((apart[max(apart)] - apart[min(apart)]).tolist())
+def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:
+    """By how much the differences in GOSPA grow from the least clutter to the most."""
+    for probability, rows in every.groupby("detection_probability", sort=False):
+        by_run: Any = rows.pivot_table("gospa_m", "run", ["estimator", "clutter_per_scan"], sort=False)
+        for label, other in pairs:
+            if {label, other} <= set(rows["estimator"]):
+                apart = by_run[label] - by_run[other]
+                growth = mean_interval((apart[max(apart)] - apart[min(apart)]).tolist())
+                case = f"{other}-detection-{100 * float(str(probability)):g}"
+                outcome.measure(f"{label}.growth_of_change_m.{case}", *growth)
 
 
 CROSSING = Study("associations over clutter and probability of detection", study, CrossingOptions)

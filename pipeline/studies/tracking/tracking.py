@@ -1,8 +1,6 @@
-"""What studies of trackers have in common: their tracks judged by run, and claims by intervals.
+"""What studies of trackers have in common: their tracks judged by run, and differences of trackers.
 
 Tracks are judged as `replay.judging.tracks.errors` says, at instants that are the same for all trackers.
-A claim that one tracker is better than another is judged by the mean of their differences over the runs,
-and holds where all of its 95 % interval does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.output.claims import Claim, judged
+from pipeline.output.results import Outcome
 from pipeline.studies.toolkit.repetitions import Interval, mean_interval
 from recorders.errors import BadInput
 from recorders.log import Stream
@@ -30,6 +28,11 @@ from replay.judging.tracks.errors import (
     tracks_at,
 )
 
+# The figures whose differences are told.
+COMPARED = (
+    *("gospa_m", "localisation_m2", "switches", "target1_rmse_m", "target1_coverage"),
+    *("target2_rmse_m", "target2_coverage", "target5_rmse_m"),
+)
 # What trajectory GOSPA takes for a target that goes on with another track: half a target missed.
 SWITCH_PENALTY_M = 10.0
 
@@ -99,16 +102,19 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
     }
 
 
+def measure_changes(
+    table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
+) -> None:
+    """By how much the figures of one estimator are above those of another, of pairs that were run."""
+    for label, other in pairs:
+        if {label, other} <= set(table["estimator"]):
+            for quantity in [name for name in COMPARED if name in table]:
+                change = difference(table, quantity, label, other)
+                of = "-".join(filter(None, (other, case)))
+                outcome.measure(f"{label}.change_in_{quantity}.{of}", *change)
+
+
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
     """By how much a quantity of one estimator is above that of another, over the runs."""
-    by_run: Any = table.pivot_table(quantity, "run", "estimator", sort=False)
+    by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
     return mean_interval((by_run[label] - by_run[other]).tolist())
-
-
-def lower(claim: str, paper: str, unit: str, gained: Mapping[str, Interval], why: str = "") -> Claim:
-    """A claim that quantities fall, by name: it holds where all intervals lie below zero."""
-    ours = "; ".join(f"{name} {interval} {unit}".strip() for name, interval in gained.items())
-    unsure = [name for name, each in gained.items() if each.low < 0.0 <= each.high]
-    if unsure:
-        why = "; ".join(filter(None, [f"the interval of {' and '.join(unsure)} holds zero", why]))
-    return judged(claim, paper, ours, all(each.high < 0.0 for each in gained.values()), why)

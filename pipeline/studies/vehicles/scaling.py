@@ -14,7 +14,6 @@ import pandas as pd
 from pydantic import PositiveFloat, PositiveInt
 
 from pipeline.output.charts import Axis, Chart, Panel, curve
-from pipeline.output.claims import Claim, judged
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -25,8 +24,6 @@ from recorders.errors import BadInput
 from recorders.parameters import Parameters
 from replay.engine.streams.sources import MemorySource
 
-# Of powers of N, no estimator here needs more than this one.
-HIGHEST_POWER = 5.0
 TICKS = (2, 5, 10, 20, 50, 100)
 
 
@@ -99,7 +96,6 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         outcome.metrics[f"{name}.most_vehicles"] = float(own["vehicles"].max())
         outcome.metrics[f"{name}.growth_power"] = growth[name].power
         outcome.metrics[f"{name}.growth_factor_per_vehicle"] = growth[name].factor
-    outcome.claims += _claims(table, growth, options)
     outcome.figures["scaling"] = _chart(table)
     outcome.input_sha256 = hash_streams(sources)
     return outcome
@@ -143,53 +139,6 @@ def growth_of(table: pd.DataFrame) -> Growth:
 def _table(growth: Mapping[Any, Growth], options: ScalingOptions) -> pd.DataFrame:
     rows = [(label, options.methods[label].growth, *each) for label, each in growth.items()]
     return pd.DataFrame(rows, columns=["estimator", "work", "power", "factor_per_vehicle"])
-
-
-def _claims(table: pd.DataFrame, growth: Mapping[Any, Growth], options: ScalingOptions) -> list[Claim]:
-    def named(work: str) -> list[str]:
-        return [label for label, swept in options.methods.items() if swept.growth == work]
-
-    polynomial, exponential = named("polynomial"), named("exponential")
-    most = table.groupby("estimator")["vehicles"].max()
-    found = []
-    if polynomial:
-        ours = ", ".join(f"{label} N^{growth[label].power:.1f} to {most[label]}" for label in polynomial)
-        found.append(
-            judged(
-                "association makes the demands grow exponentially with the number of vehicles",
-                "combinatorial growth of JPDA, PHD, MHT",
-                ours,
-                any(growth[label].power > HIGHEST_POWER for label in polynomial),
-                "the best association, the topology and the PHD are polynomial",
-            )
-        )
-    if exponential:
-        ours = ", ".join(
-            f"{label} x{growth[label].factor:.1f} per vehicle to {most[label]}" for label in exponential
-        )
-        found.append(
-            judged(
-                "the SME filter bypasses the combinatorial complexity of association",
-                "no enumeration",
-                ours,
-                all(growth[label].factor < 1.5 for label in exponential),
-                "the exact likelihood of the sums is a permanent: 2^N, or all N! maps of vehicles that "
-                "are close together",
-            )
-        )
-    if {"powers", "kf"} <= set(most.index):
-        errors = table.pivot_table(index="vehicles", columns="estimator", values="position_rmse_m")
-        ratio = (errors["powers"] / errors["kf"]).fillna(np.inf)
-        ratio = ratio[ratio.index <= most["powers"]]
-        found.append(
-            judged(
-                "sums of powers are unsuitable for many vehicles",
-                "10 vehicles need order 10",
-                ", ".join(f"{n}: {each:.3g}" for n, each in ratio.items()) + " times the KF's error",
-                ratio.iloc[-1] > 1.5,
-            )
-        )
-    return found
 
 
 def _chart(table: pd.DataFrame) -> Chart:

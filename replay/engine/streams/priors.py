@@ -95,7 +95,7 @@ class _Layout(NamedTuple):
 def _layout(names: str, kinds: str, wanted: tuple[tuple[str, Kind], ...], where: str) -> _Layout:
     """Make the layout of a channel that states these names and kinds.
 
-    Raises BadInput as `read_priors`.
+    Raises BadInput as `priors_of`.
     """
     metadata, components = {"components": names, "kinds": kinds}, dict(wanted)
     stated = stated_components(metadata, components, where)

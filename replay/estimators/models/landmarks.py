@@ -168,7 +168,7 @@ def align(
 
     To the covariance of the solution is added what the odometry errs by: the mean of a random walk over
     a span, seen from its end, has a third of the variance that it has grown to. None while the heading
-    is less sure than `COURSE_SIGMA_RAD`. See `model.Start`.
+    is less sure than `COURSE_SIGMA_RAD`. See `start.Start`.
     """
     weight = 2.0 / np.trace(covariances, axis1=1, axis2=2)
     middle, centre = (np.average(each, axis=0, weights=weight) for each in (path[:, :2], places))

@@ -180,8 +180,8 @@ def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None
     def residuals(shot: Floats) -> Floats:
         x, y, trajectory = shot
         still = np.zeros_like(x)
-        said = hear((x, y, trajectory, still, still), sensors.T, parameters)
-        off = heard - np.stack(np.broadcast_arrays(*said), axis=-1)
+        predicted = hear((x, y, trajectory, still, still), sensors.T, parameters)
+        off = heard - np.stack(np.broadcast_arrays(*predicted), axis=-1)
         off[..., :2] = wrap_angle(off[..., :2])
         return np.nan_to_num(off / sigma)
 

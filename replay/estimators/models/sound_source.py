@@ -114,10 +114,10 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
         for start in starts[np.argsort(costs.round(ALIKE), kind="stable")[:BEST]]
     ]
     best = min(fits, key=lambda fit: round(float(fit.cost), ALIKE))
-    place, told = _settled(residuals, slopes, best.x, float(size))
-    told = told / WIDER**2 + np.eye(free) / parameters.start_sigma_m**2
+    place, information = _settled(residuals, slopes, best.x, float(size))
+    information = information / WIDER**2 + np.eye(free) / parameters.start_sigma_m**2
     covariance = np.diag([0.0] * free + [parameters.height_sigma_m**2] * (3 - free) + [shared_s2])
-    covariance[:free, :free] = np.linalg.inv(told)
+    covariance[:free, :free] = np.linalg.inv(information)
     time_ns = int(first.publish_time_ns[0])
     return Started(time_ns, np.array([*place, *middle[free:], 0.0]), covariance, HOW)
 

@@ -23,8 +23,8 @@ from replay.estimators.navigation.samples import (
     NS,
     STANDARD_GRAVITY_MPS2,
     USUAL_SIGMA_M,
-    Moving,
-    Samples,
+    InertialSamples,
+    ReceiverVelocities,
     mounted,
     read_motion,
     read_samples,
@@ -132,29 +132,29 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     if "fix" not in streams:
         raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
     start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
-    moving, how = read_motion(streams, parameters), "levelled, its heading unknown"
+    velocities, how = read_motion(streams, parameters), "levelled, its heading unknown"
     mean, covariance = np.zeros(16), np.zeros((15, 15))
     mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
     covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
     roll, pitch = _tilt(samples, topic, parameters)
     tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
     heading, heading_sigma, bias_sigma = 0.0, np.pi, USUAL_BIAS_RADPS
-    if moving is not None:
-        row = int(np.argmin(np.abs(moving.time_ns - start_ns)))
-        spread = moving.covariance[row]
-        mean[3:6], covariance[3:6, 3:6] = moving.mps[row], _wide(parameters.start_sigma_mps, spread)
-        mean[10:13], bias_sigma = _bias(samples, topic, moving, row, parameters)
+    if velocities is not None:
+        row = int(np.argmin(np.abs(velocities.time_ns - start_ns)))
+        spread = velocities.covariance[row]
+        mean[3:6], covariance[3:6, 3:6] = velocities.mps[row], _wide(parameters.start_sigma_mps, spread)
+        mean[10:13], bias_sigma = _bias(samples, topic, velocities, row, parameters)
         turning = _turned(samples, start_ns, tilted, mean[10:13])
-        found = _heading(turning, start_ns, moving, row, parameters)
+        found = _heading(turning, start_ns, velocities, row, parameters)
         if found is not None:
             heading, heading_sigma = found[0], stated_or(parameters.heading_sigma_rad, found[1])
             how = "levelled, its heading the course"
-            how += _mounting(samples, turning, start_ns, moving, tilted, heading, parameters)
-        how += _leap(samples, moving, row, parameters)
+            how += _mounting(samples, turning, start_ns, velocities, tilted, heading, parameters)
+        how += _leap(samples, velocities, row, parameters)
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
     up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
     covariance[9:12, 9:12] = stated_or(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
-    unsteadiness_mps2 = _unsteadiness(samples, moving, parameters)
+    unsteadiness_mps2 = _unsteadiness(samples, velocities, parameters)
     tilts = np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])
     covariance[tilts] = _tilt_covariance(up, unsteadiness_mps2, parameters)
     covariance[6:9, 6:9] += heading_sigma**2 * np.outer(up, up)
@@ -178,13 +178,13 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
         _tilt(samples, topic, parameters)
     except BadInput as error:
         return [str(error)]
-    moving = read_motion(streams, parameters)
-    if moving is not None:
+    velocities = read_motion(streams, parameters)
+    if velocities is not None:
         try:
-            _bias(samples, topic, moving, 0, parameters)
+            _bias(samples, topic, velocities, 0, parameters)
         except BadInput as error:
             found.append(str(error))
-        found.append(_leap(samples, moving, 0, parameters).removeprefix("; "))
+        found.append(_leap(samples, velocities, 0, parameters).removeprefix("; "))
     return [each for each in found if each]
 
 
@@ -214,7 +214,7 @@ def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> F
 
 
 def _first_place(
-    fix: Stream, samples: Samples, topic: str, parameters: Any
+    fix: Stream, samples: InertialSamples, topic: str, parameters: Any
 ) -> tuple[int, Floats, Floats]:
     """When the first fix within the samples was measured, its place (3,) and covariance (3, 3).
 
@@ -235,7 +235,7 @@ def _first_place(
     return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
 
 
-def _tilt(samples: Samples, topic: str, parameters: Any) -> tuple[float, float]:
+def _tilt(samples: InertialSamples, topic: str, parameters: Any) -> tuple[float, float]:
     """Roll and pitch, rad, under which the mean of the first specific forces points up.
 
     Raises BadInput where that is not gravity in m/s2, or points down.
@@ -257,7 +257,9 @@ def _tilt(samples: Samples, topic: str, parameters: Any) -> tuple[float, float]:
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
 
 
-def _unsteadiness(samples: Samples, moving: Moving | None, parameters: Any) -> float:
+def _unsteadiness(
+    samples: InertialSamples, velocities: ReceiverVelocities | None, parameters: Any
+) -> float:
     """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
 
     It is as much as they differ among themselves, and as the velocity changes meanwhile.
@@ -266,16 +268,16 @@ def _unsteadiness(samples: Samples, moving: Moving | None, parameters: Any) -> f
     until_ns = begin_ns + round(parameters.level_s / NS)
     spread = samples.force[samples.time_ns < until_ns].std(axis=0)
     changed = np.zeros(3)
-    if moving is not None:
-        ends = np.interp([begin_ns, until_ns], moving.time_ns, np.arange(len(moving.time_ns)))
+    if velocities is not None:
+        ends = np.interp([begin_ns, until_ns], velocities.time_ns, np.arange(len(velocities.time_ns)))
         first, last = np.rint(ends).astype(int)
-        changed = (moving.mps[last] - moving.mps[first]) / parameters.level_s
+        changed = (velocities.mps[last] - velocities.mps[first]) / parameters.level_s
     plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
     return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))
 
 
 def _bias(
-    samples: Samples, topic: str, moving: Moving, row: int, parameters: Any
+    samples: InertialSamples, topic: str, velocities: ReceiverVelocities, row: int, parameters: Any
 ) -> tuple[Floats, float]:
     """The mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
 
@@ -283,8 +285,8 @@ def _bias(
 
     Raises BadInput where it is more than a gyro errs.
     """
-    moved = moving.first_above(row, parameters.still_mps)
-    end_ns = samples.time_ns[-1] if moved is None else moving.time_ns[moved]
+    moved = velocities.first_above(row, parameters.still_mps)
+    end_ns = samples.time_ns[-1] if moved is None else velocities.time_ns[moved]
     at_rest = samples.time_ns < end_ns - round(parameters.rest_margin_s / NS)
     if not at_rest.any():
         return np.zeros(3), USUAL_BIAS_RADPS
@@ -305,9 +307,9 @@ def _bias(
     return bias, float(np.sqrt(sigma + EARTH_RATE_RADPS**2))
 
 
-def _leap(samples: Samples, moving: Moving, row: int, parameters: Any) -> str:
+def _leap(samples: InertialSamples, velocities: ReceiverVelocities, row: int, parameters: Any) -> str:
     """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
-    moved = moving.first_above(row, parameters.still_mps)
+    moved = velocities.first_above(row, parameters.still_mps)
     level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / NS)
     if moved is None:
         return ""
@@ -316,18 +318,20 @@ def _leap(samples: Samples, moving: Moving, row: int, parameters: Any) -> str:
     sets_off = np.flatnonzero((np.abs(change) > noise).any(axis=1))
     if not len(sets_off):
         return ""
-    later_s = float(moving.time_ns[moved] - samples.time_ns[sets_off[0]]) * NS
+    later_s = float(velocities.time_ns[moved] - samples.time_ns[sets_off[0]]) * NS
     if abs(abs(later_s) - LEAP_SECONDS) > LEAP_MARGIN_S:
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {moving.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
+        f"; {velocities.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
         f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
         f"inertial_delay_s={shift_s:g} moves the unit's"
     )
 
 
-def _turned(samples: Samples, start_ns: int, tilted: Components, bias: Floats) -> tuple[Floats, Floats]:
+def _turned(
+    samples: InertialSamples, start_ns: int, tilted: Components, bias: Floats
+) -> tuple[Floats, Floats]:
     """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
     since = samples.time_ns >= start_ns
     since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
@@ -344,31 +348,35 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 
 
 def _heading(
-    turning: tuple[Floats, Floats], start_ns: int, moving: Moving, row: int, parameters: Any
+    turning: tuple[Floats, Floats],
+    start_ns: int,
+    velocities: ReceiverVelocities,
+    row: int,
+    parameters: Any,
 ) -> tuple[float, float] | None:
     """The heading at the start, rad, and its standard deviation; None where nothing moves.
 
     It is the first course, less what the body turned about up until then. A body that looks where it
     goes has the same of all later courses; how much they differ is how far it may be off.
     """
-    fast = moving.first_above(row, parameters.course_mps)
+    fast = velocities.first_above(row, parameters.course_mps)
     if fast is None:
         return None
-    until_ns = moving.time_ns[fast] + round(parameters.course_s / NS)
-    rows = np.arange(fast, np.searchsorted(moving.time_ns, until_ns))
-    rows = rows[np.hypot(*moving.mps[rows, :2].T) > parameters.course_mps]
-    east, north, _ = moving.mps[rows].T
-    heading = np.arctan2(north, east) - np.interp((moving.time_ns[rows] - start_ns) * NS, *turning)
+    until_ns = velocities.time_ns[fast] + round(parameters.course_s / NS)
+    rows = np.arange(fast, np.searchsorted(velocities.time_ns, until_ns))
+    rows = rows[np.hypot(*velocities.mps[rows, :2].T) > parameters.course_mps]
+    east, north, _ = velocities.mps[rows].T
+    heading = np.arctan2(north, east) - np.interp((velocities.time_ns[rows] - start_ns) * NS, *turning)
     apart = wrap_angle(heading - heading[0])
-    noise = moving.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
+    noise = velocities.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
     return float(heading[0]), float(min(np.sqrt(np.mean(apart**2) + noise), np.pi))
 
 
 def _mounting(
-    samples: Samples,
+    samples: InertialSamples,
     turning: tuple[Floats, Floats],
     start_ns: int,
-    moving: Moving,
+    velocities: ReceiverVelocities,
     tilted: Components,
     heading: float,
     parameters: Any,
@@ -378,16 +386,18 @@ def _mounting(
     Both are compared over the intervals of the velocities, in the plane and as complex numbers.
     """
     since_s, turned = turning
-    fast = moving.first_above(0, parameters.course_mps)
-    end_s = since_s[-1] if fast is None else (moving.time_ns[fast] - start_ns) * NS + parameters.course_s
-    stamps_s = (moving.time_ns - start_ns) * NS
+    fast = velocities.first_above(0, parameters.course_mps)
+    end_s = (
+        since_s[-1] if fast is None else (velocities.time_ns[fast] - start_ns) * NS + parameters.course_s
+    )
+    stamps_s = (velocities.time_ns - start_ns) * NS
     rows = np.flatnonzero((stamps_s >= 0.0) & (stamps_s <= min(end_s, since_s[-1])))
     if len(rows) < 3:
         return ""
     ahead, left, _ = into_plane(tilted, samples.force[samples.time_ns >= start_ns].T)
     gained = _integral((ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s)
     felt = np.diff(np.interp(stamps_s[rows], since_s, gained))
-    seen = np.diff(moving.mps[rows, 0] + 1j * moving.mps[rows, 1])
+    seen = np.diff(velocities.mps[rows, 0] + 1j * velocities.mps[rows, 1])
     together = np.vdot(felt, seen)
     apart = float(np.angle(together))
     if abs(together) < ALIKE * np.linalg.norm(felt) * np.linalg.norm(seen) or abs(apart) < SIDEWAYS_RAD:

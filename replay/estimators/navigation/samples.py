@@ -19,7 +19,7 @@ VELOCITY = components_of(NAVIGATION[3:6])
 NS = 1e-9
 
 
-class Samples(NamedTuple):
+class InertialSamples(NamedTuple):
     """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
 
     time_ns: Integers
@@ -27,7 +27,7 @@ class Samples(NamedTuple):
     rate: Floats
 
 
-class Moving(NamedTuple):
+class ReceiverVelocities(NamedTuple):
     """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
 
     topic: str
@@ -47,7 +47,7 @@ def mounted(sample: Any, parameters: Any) -> Any:
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
 
-def read_samples(inertial: Stream, parameters: Any) -> Samples:
+def read_samples(inertial: Stream, parameters: Any) -> InertialSamples:
     """The finite samples at the times at which they were measured."""
     columns = [
         np.stack(mounted(inertial[name].T, parameters), axis=1)
@@ -59,7 +59,7 @@ def read_samples(inertial: Stream, parameters: Any) -> Samples:
         raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / NS)
     force, rate = (column[finite] for column in columns)
-    return Samples(time_ns, force, rate)
+    return InertialSamples(time_ns, force, rate)
 
 
 def stated_or(sigma: float | None, otherwise: Any) -> Any:
@@ -67,7 +67,7 @@ def stated_or(sigma: float | None, otherwise: Any) -> Any:
     return otherwise if sigma is None or np.isnan(sigma) else sigma
 
 
-def read_motion(streams: Mapping[str, Stream], parameters: Any) -> Moving | None:
+def read_motion(streams: Mapping[str, Stream], parameters: Any) -> ReceiverVelocities | None:
     """The velocities that are finite; None where there are none."""
     stream = streams.get("velocity")
     if stream is None:
@@ -78,4 +78,6 @@ def read_motion(streams: Mapping[str, Stream], parameters: Any) -> Moving | None
     if not finite.any():
         return None
     time_ns = stream.publish_time_ns - round(parameters.velocity_delay_s / NS)
-    return Moving(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
+    return ReceiverVelocities(
+        stream.topic, time_ns[finite], found.value[finite], found.covariance[finite]
+    )

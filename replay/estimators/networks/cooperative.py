@@ -31,12 +31,12 @@ from replay.engine.streams.results import ALL_WELL, failures_by_run, failures_of
 from replay.estimators.models.landmarks import LANDMARKS, POSE
 from replay.estimators.networks.covariance_intersection import Criterion
 from replay.estimators.networks.encounters import (
-    Carried,
-    Events,
-    Fusion,
-    Results,
-    Settings,
-    Work,
+    RobotEvents,
+    RobotMemory,
+    RobotResults,
+    RobotSettings,
+    RobotStates,
+    SightingFusion,
     cooperate,
 )
 from replay.inference.kalman.steps import FAILURES
@@ -77,21 +77,21 @@ class CooperativeParameters(Parameters):
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
 
 
-class State(NamedTuple):
+class CooperativeState(NamedTuple):
     """What goes from block to block, and why robots take no part: (runs, robots), "" where they do.
 
-    `told` says of whom that was told, or need not be.
+    `announced` says of whom that was told, or need not be.
     """
 
-    carried: Carried
+    robots: RobotStates
     landmarks: Points
     reasons: NDArray[np.str_]
-    told: Booleans
+    announced: Booleans
 
 
-def memory(states: int) -> Work:
+def memory(states: int) -> RobotMemory:
     """Memory for one run of so many states."""
-    return Work(
+    return RobotMemory(
         np.empty(3),
         np.empty((3, 3)),
         np.empty((3, 2)),
@@ -112,7 +112,7 @@ def _compiled() -> Function:
     return compile_over_runs(cooperate, allocates=False)
 
 
-def begin(static: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
+def begin(static: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> CooperativeState:
     """All robots at their priors, and the maps.
 
     A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
@@ -126,14 +126,14 @@ def begin(static: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> State:
     covariance = np.zeros((runs, size, size))
     for index, each in enumerate(priors):
         covariance[:, 3 * index : 3 * index + 3, 3 * index : 3 * index + 3] = each.covariance
-    carried = Carried(
+    robots = RobotStates(
         np.nan_to_num(np.concatenate([each.mean for each in priors], axis=1)),
         np.nan_to_num(covariance),
         np.zeros((runs, len(prefixes), 2)),
         np.stack([each.time_ns for each in priors], axis=1),
         np.full(runs, ALL_WELL),
     )
-    return State(carried, points_of(static["/landmarks"], LANDMARKS), reasons, reasons == "")
+    return CooperativeState(robots, points_of(static["/landmarks"], LANDMARKS), reasons, reasons == "")
 
 
 def _prior(prior: Ragged) -> Priors:
@@ -144,27 +144,27 @@ def _prior(prior: Ragged) -> Priors:
 
 
 def run(
-    state: State,
+    state: CooperativeState,
     block: Block,
     *,
     name: str,
     prefixes: tuple[str, ...],
     mode: Mode,
     criterion: Criterion,
-    settings: Settings,
-) -> tuple[State, list[Ragged]]:
+    settings: RobotSettings,
+) -> tuple[CooperativeState, list[Ragged]]:
     """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
-    carried = copy.deepcopy(state.carried)
+    robots = copy.deepcopy(state.robots)
     events = _events(block, state, prefixes, mode, settings)
     count, topic = len(events.time_ns), f"/estimates/{name}"
-    results = Results(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
-    fusion = Fusion(mode == "joint", mode == "ci", criterion == "trace")
-    scratch = partial(memory, carried.mean.shape[1])
-    _compiled()(len(carried.mean), events, settings, fusion, carried, results, scratch=scratch)
-    said = np.isfinite(results.mean[:, 0])
+    results = RobotResults(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
+    fusion = SightingFusion(mode == "joint", mode == "ci", criterion == "trace")
+    scratch = partial(memory, robots.mean.shape[1])
+    _compiled()(len(robots.mean), events, settings, fusion, robots, results, scratch=scratch)
+    is_estimated = np.isfinite(results.mean[:, 0])
     made = [
         states_in(
-            np.flatnonzero(said & (events.robots[:, 0] == robot)),
+            np.flatnonzero(is_estimated & (events.robots[:, 0] == robot)),
             f"{topic}{prefix}/pose",
             events.time_ns,
             events.offsets,
@@ -174,25 +174,25 @@ def run(
         )
         for robot, prefix in enumerate(prefixes)
     ]
-    before, failed_ns = state.carried.failure, carried.time_ns.max(axis=1)
-    made.append(failures_of(topic, before, carried.failure, failed_ns, FAILURES))
-    told = state.told.copy()
+    before, failed_ns = state.robots.failure, robots.time_ns.max(axis=1)
+    made.append(failures_of(topic, before, robots.failure, failed_ns, FAILURES))
+    announced = state.announced.copy()
     for robot, prefix in enumerate(prefixes):  # who takes no part, each told at its first odometry
         odometry = block.streams[f"{prefix}/odometry"]
-        new = np.flatnonzero(~told[:, robot] & (np.diff(odometry.offsets) > 0))
-        told[new, robot] = True
+        new = np.flatnonzero(~announced[:, robot] & (np.diff(odometry.offsets) > 0))
+        announced[new, robot] = True
         times_ns = odometry.stream.publish_time_ns[odometry.offsets[new]]
         failures = {
             run: Failure(time_ns, str(state.reasons[run, robot]))
             for run, time_ns in zip(new.tolist(), times_ns.tolist(), strict=True)
         }
-        made.append(failures_by_run(f"{topic}{prefix}", failures, len(told)))
-    return state._replace(carried=carried, told=told), made
+        made.append(failures_by_run(f"{topic}{prefix}", failures, len(announced)))
+    return state._replace(robots=robots, announced=announced), made
 
 
 def _events(
-    block: Block, state: State, prefixes: Sequence[str], mode: Mode, settings: Settings
-) -> Events:
+    block: Block, state: CooperativeState, prefixes: Sequence[str], mode: Mode, settings: RobotSettings
+) -> RobotEvents:
     """The block's events as columns; a robot's estimate is due at its odometry."""
     order, is_able = block.events, state.reasons == ""
     value = np.stack(
@@ -208,9 +208,9 @@ def _events(
     is_fellow &= is_able[run_of, fellow]
     mapped = state.landmarks.rows(run_of, target_id)
     is_mapped = (sees == 1) & (mapped >= 0) & settings.anchor[robot] & acts
-    due = (sees == 0) & (order.time_ns >= state.carried.time_ns[run_of, robot]) & acts
+    due = (sees == 0) & (order.time_ns >= state.robots.time_ns[run_of, robot]) & acts
     kept = np.flatnonzero(((sees == 0) & acts) | is_mapped | (is_fellow & (mode != "alone")))
-    return Events(
+    return RobotEvents(
         np.searchsorted(kept, order.offsets),
         order.time_ns[kept],
         np.stack([robot, np.where(is_fellow, fellow, -1)], axis=1)[kept],
@@ -256,7 +256,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
         ]
         return np.array(found)
 
-    settings = Settings(
+    settings = RobotSettings(
         stated("odometry", "forward_noise_density", "turn_noise_density"),
         stated("range_bearing", "sigma_range_m", "sigma_bearing_rad") ** 2,
         np.isin(numbers, parameters.anchors),

@@ -40,16 +40,16 @@ class Fused(NamedTuple):
     gap: Floats
 
 
-class Memory(NamedTuple):
+class FusionMemory(NamedTuple):
     """What K estimates are fused in: their informations (K, n, n), and weights (K,) to come."""
 
     information: Floats
     better: Floats
 
 
-def memory_for(count: int, states: int) -> Memory:
+def fusion_memory(count: int, states: int) -> FusionMemory:
     """Memory for the fusion of so many estimates at most."""
-    return Memory(np.empty((count, states, states)), np.empty(count))
+    return FusionMemory(np.empty((count, states, states)), np.empty(count))
 
 
 def summed(count: int, weights: Floats, information: Floats, covariance: Floats) -> bool:
@@ -107,7 +107,7 @@ def weigh_optimally(
     by_trace: bool,
     count: int,
     covariances: Floats,
-    memory: Memory,
+    memory: FusionMemory,
     weights: Floats,
     tolerance: float,
 ) -> float:
@@ -185,7 +185,7 @@ def weigh(
     rule: int,
     count: int,
     covariances: Floats,
-    memory: Memory,
+    memory: FusionMemory,
     weights: Floats,
     tolerance: float,
 ) -> float:
@@ -210,7 +210,7 @@ def fuse_together(
     mean: Floats,
     covariance: Floats,
     tolerance: float,
-    memory: Memory,
+    memory: FusionMemory,
 ) -> float:
     """Add up weighted informations."""
     information = memory.information
@@ -238,7 +238,7 @@ def fuse_by(
     mean: Floats,
     covariance: Floats,
     tolerance: float,
-    memory: Memory,
+    memory: FusionMemory,
 ) -> float:
     """Fuse the first `count` estimates by the rule of a number; returns the certificate.
 
@@ -259,7 +259,7 @@ def fuse_run(
     covariances: Floats,
     independents: Floats,
     fused: Fused,
-    memory: Memory,
+    memory: FusionMemory,
 ) -> None:
     """Fuse the estimates of one run."""
     parts = Estimate(means[run], covariances[run], independents[run])
@@ -328,7 +328,7 @@ def fuse(
         covariance.reshape(runs, count, size, size),
         known.reshape(runs, count, size, size),
         fused,
-        scratch=partial(memory_for, count, size),
+        scratch=partial(fusion_memory, count, size),
     )
     if np.any(np.isinf(fused.gap)):
         raise BadInput(

@@ -17,7 +17,7 @@ from replay.inference.linear_algebra.small_matrices import UpdateMemory, update
 from replay.tracing.functions import traced
 
 
-class Carried(NamedTuple):
+class RobotStates(NamedTuple):
     """What goes from block to block; first axis = run. `failure` is one of gaussian's.
 
     The mean (3 n,) and covariance (3 n, 3 n) are of all n robots; only the joint filter has entries
@@ -31,7 +31,7 @@ class Carried(NamedTuple):
     failure: Integers
 
 
-class Settings(NamedTuple):
+class RobotSettings(NamedTuple):
     """Noise of the robots' odometry and sensors, both (n, 2), who is an anchor, and the gate."""
 
     density: Floats
@@ -40,7 +40,7 @@ class Settings(NamedTuple):
     gate: Floats
 
 
-class Fusion(NamedTuple):
+class SightingFusion(NamedTuple):
     """How a sighting of another robot is used: in one state of all, by an intersection, or naively.
 
     The weight of an intersection is that of the least trace or else of the least determinant.
@@ -51,7 +51,7 @@ class Fusion(NamedTuple):
     by_trace: bool
 
 
-class Events(NamedTuple):
+class RobotEvents(NamedTuple):
     """The events of all runs in order: whose they are, and what they say.
 
     `robots` (m, 2) are the one that speaks and the one that it sees, -1 where it sees none. Odometry has
@@ -68,14 +68,14 @@ class Events(NamedTuple):
     is_due: Booleans
 
 
-class Results(NamedTuple):
+class RobotResults(NamedTuple):
     """The speaker's pose (m, 3) and covariance (m, 3, 3) after every event; NaN where none is said."""
 
     mean: Floats
     covariance: Floats
 
 
-class Work(NamedTuple):
+class RobotMemory(NamedTuple):
     """Memory of one run.
 
     Attributes:
@@ -118,7 +118,9 @@ linear_sight = derivative(
 )
 
 
-def advance(carried: Carried, run: int, robot: int, time_ns: int, density: Floats, work: Work) -> None:
+def advance(
+    carried: RobotStates, run: int, robot: int, time_ns: int, density: Floats, work: RobotMemory
+) -> None:
     """Move one robot to a time by its odometry, with its correlations."""
     duration_s = (time_ns - carried.time_ns[run, robot]) * 1e-9
     if duration_s <= 0.0:
@@ -157,7 +159,12 @@ def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) ->
 
 
 def look(
-    mean: Floats, robot: int, place: tuple[float, float], value: Floats, difference: Floats, work: Work
+    mean: Floats,
+    robot: int,
+    place: tuple[float, float],
+    value: Floats,
+    difference: Floats,
+    work: RobotMemory,
 ) -> None:
     """Fill the innovation of a robot's sighting of a place, and its rows by both robots."""
     first = 3 * robot
@@ -169,7 +176,7 @@ def look(
             work.both[1, row, k] = -work.rows[row, k] if k < 2 else 0.0
 
 
-def see_through(covariance: Floats, first: int, side: int, work: Work) -> float:
+def see_through(covariance: Floats, first: int, side: int, work: RobotMemory) -> float:
     """Fill what a sighting says of one robot's block of the covariance; returns the block's trace."""
     rows, trace = work.both[side], 0.0
     fill_spread(covariance, first, rows, work.spread[side])
@@ -201,8 +208,8 @@ def meet(
     difference: Floats,
     variance: Floats,
     gate: float,
-    fusion: Fusion,
-    work: Work,
+    fusion: SightingFusion,
+    work: RobotMemory,
 ) -> bool:
     """Use a sighting; False where a covariance is not positive definite."""
     own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
@@ -236,12 +243,12 @@ def meet(
 
 def cooperate(
     run: int,
-    events: Events,
-    settings: Settings,
-    fusion: Fusion,
-    carried: Carried,
-    results: Results,
-    work: Work,
+    events: RobotEvents,
+    settings: RobotSettings,
+    fusion: SightingFusion,
+    carried: RobotStates,
+    results: RobotResults,
+    work: RobotMemory,
 ) -> None:
     """Move the robots of one run through its events, until these end or an update fails."""
     mean, covariance = carried.mean[run], carried.covariance[run]

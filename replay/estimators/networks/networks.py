@@ -27,7 +27,14 @@ from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL, failures_of, states_in
 from replay.engine.vectors.components import components_of
 from replay.estimators.networks.covariance_intersection import rule_number
-from replay.estimators.networks.nodes import Activities, Fusion, Results, Sensing, follow, work_for
+from replay.estimators.networks.nodes import (
+    Activities,
+    NodeFusion,
+    NodeResults,
+    Sensing,
+    follow,
+    node_memory,
+)
 
 ALONE, CENTRALISED, TRAP = "alone", "centralised", "own-again"
 Rule = Literal[
@@ -78,14 +85,14 @@ def _compiled() -> Function:
     return compile_over_runs(follow, allocates=False)
 
 
-def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> Fusion:
+def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> NodeFusion:
     name, liar = parameters.rule, parameters.liar
     if liar is not None and liar not in sensors:
         raise BadInput(
             f"liar = {liar} is not one of the nodes {', '.join(map(str, sensors))}; name one of them"
         )
     rule = {ALONE: "naive", CENTRALISED: "naive", TRAP: "ci-trace"}.get(name, name)
-    return Fusion(
+    return NodeFusion(
         rule_number(rule),
         parameters.tolerance,
         name == TRAP,
@@ -124,7 +131,7 @@ def solve(
     count = len(activities.node)
     blank = np.full((count, size), np.nan)
     square = np.full((count, size, size), np.nan)
-    results = Results(
+    results = NodeResults(
         blank,
         square,
         blank.copy(),
@@ -145,7 +152,7 @@ def solve(
         _fusion(parameters, sensors, size),
         results,
         failed_ns,
-        scratch=partial(work_for, len(sensing.density), most, size),
+        scratch=partial(node_memory, len(sensing.density), most, size),
     )
     well = np.full_like(failed_ns, ALL_WELL)
     outputs = [

@@ -6,7 +6,7 @@ import numpy as np
 
 from recorders.models.constant_velocity import noise_moments
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.estimators.networks.covariance_intersection import Memory, fuse_by, memory_for
+from replay.estimators.networks.covariance_intersection import FusionMemory, fuse_by, fusion_memory
 from replay.estimators.networks.estimates import Estimate, blend, determinant, inverted, one_of
 from replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
 
@@ -40,13 +40,13 @@ class Sensing(NamedTuple):
     density: Floats
 
 
-class Fusion(NamedTuple):
+class NodeFusion(NamedTuple):
     """The rule's number in `covariance_intersection.RULES`, and how exactly its weights are optimised.
 
     With `own_first` a node fuses its own x*, not its prediction. A message differs by `divergence` nats
     at least from what the last one says, which is `interval_ns` old at least; `gate` is the largest
     squared distance between a prediction and what is heard, infinity where everything is fused. The
-    index `liar` is -1 where there is none.
+    index `faulty_node` is -1 where there is none.
     """
 
     rule: int
@@ -55,9 +55,9 @@ class Fusion(NamedTuple):
     interval_ns: int
     divergence: float
     gate: float
-    liar: int
-    lie_m: float
-    lie_after_ns: int
+    faulty_node: int
+    fault_m: float
+    fault_after_ns: int
 
 
 class Nodes(NamedTuple):
@@ -66,30 +66,30 @@ class Nodes(NamedTuple):
     Attributes:
         time_ns: (nodes,), of their estimates.
         mean, covariance: (nodes, n), (nodes, n, n).
-        said_ns, said_mean, said_covariance: of each node's last message; -1 where there is none.
+        last_ns, last_mean, last_covariance: of each node's last message; -1 where there is none.
     """
 
     time_ns: Integers
     mean: Floats
     covariance: Floats
-    said_ns: Integers
-    said_mean: Floats
-    said_covariance: Floats
+    last_ns: Integers
+    last_mean: Floats
+    last_covariance: Floats
 
 
-class Work(NamedTuple):
+class NodeMemory(NamedTuple):
     """What one core works in: the nodes of a run, and what one of them fuses, with weights (most,)."""
 
     nodes: Nodes
     parts: Estimate
     weights: Floats
-    memory: Memory
+    memory: FusionMemory
 
 
-def work_for(nodes: int, most: int, states: int) -> Work:
+def node_memory(nodes: int, most: int, states: int) -> NodeMemory:
     """Memory for so many nodes, of which each fuses so many estimates at most."""
     square, many = (nodes, states, states), (most, states, states)
-    return Work(
+    return NodeMemory(
         Nodes(
             np.empty(nodes, np.int64),
             np.empty((nodes, states)),
@@ -100,11 +100,11 @@ def work_for(nodes: int, most: int, states: int) -> Work:
         ),
         Estimate(np.empty((most, states)), np.empty(many), np.empty(many)),
         np.empty(most),
-        memory_for(most, states),
+        fusion_memory(most, states),
     )
 
 
-class Results(NamedTuple):
+class NodeResults(NamedTuple):
     """What the kernel fills, a row per activity: estimates, x* as it is sent, and whether it is.
 
     `refused` (m,) says of every message that arrived whether the gate kept it out.
@@ -199,7 +199,7 @@ def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance:
     return 0.5 * (total + squared_distance(difference, of_covariance))
 
 
-def agrees(mean: Floats, covariance: Floats, heard: Estimate, gate: float) -> bool:
+def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) -> bool:
     """Whether an estimate may be of the same state, however both are correlated.
 
     The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
@@ -208,8 +208,8 @@ def agrees(mean: Floats, covariance: Floats, heard: Estimate, gate: float) -> bo
         return True
     difference, most = np.empty(len(mean)), np.empty_like(covariance)
     for row in range(len(mean)):
-        difference[row] = heard.mean[row] - mean[row]
-    blend(2.0, covariance, 2.0, heard.covariance, most)
+        difference[row] = received.mean[row] - mean[row]
+    blend(2.0, covariance, 2.0, received.covariance, most)
     return squared_distance(difference, most) <= gate
 
 
@@ -220,17 +220,17 @@ def follow(
     prior_mean: Floats,
     prior_covariance: Floats,
     prior_ns: Integers,
-    fusion: Fusion,
-    results: Results,
+    fusion: NodeFusion,
+    results: NodeResults,
     failed_ns: Integers,
-    work: Work,
+    work: NodeMemory,
 ) -> None:
     """Move the nodes of one run through their activities, until these end or a fusion fails.
 
     At every time all nodes send first, and then take in what they hear.
     """
     nodes, parts, weights, memory = work
-    nodes.time_ns[:], nodes.said_ns[:] = prior_ns[run], -1
+    nodes.time_ns[:], nodes.last_ns[:] = prior_ns[run], -1
     for node in range(len(nodes.mean)):
         copy_gaussian(prior_mean[run], prior_covariance[run], nodes.mean[node], nodes.covariance[node])
     begin, last = activities.offsets[run], activities.offsets[run + 1]
@@ -243,10 +243,10 @@ def follow(
         for activity in range(begin, end):
             node = activities.node[activity]
             mean, covariance = nodes.mean[node], nodes.covariance[node]
-            heard = hear(activity, activities, sensing, fusion, nodes, parts, results)
-            if heard > 1:
+            received = receive(activity, activities, sensing, fusion, nodes, parts, results)
+            if received > 1:
                 rule, tolerance = fusion.rule, fusion.tolerance
-                gap = fuse_by(rule, heard, parts, weights, mean, covariance, tolerance, memory)
+                gap = fuse_by(rule, received, parts, weights, mean, covariance, tolerance, memory)
                 if not gap < np.inf:
                     failed_ns[run] = now
                     return
@@ -261,9 +261,9 @@ def predict_and_send(
     start_ns: int,
     activities: Activities,
     sensing: Sensing,
-    fusion: Fusion,
+    fusion: NodeFusion,
     nodes: Nodes,
-    results: Results,
+    results: NodeResults,
 ) -> None:
     """Predict a node to now, update x* with its own measurements, and send that where it is due."""
     node, now = activities.node[activity], activities.time_ns[activity]
@@ -278,10 +278,10 @@ def predict_and_send(
     if not activities.may_send[activity]:
         return
     if is_due(node, now, mean, covariance, sensing, fusion, nodes):
-        results.sent[activity], nodes.said_ns[node] = True, now
-        copy_gaussian(mean, covariance, nodes.said_mean[node], nodes.said_covariance[node])
-    if node == fusion.liar and now - start_ns >= fusion.lie_after_ns:
-        mean[0] += fusion.lie_m
+        results.sent[activity], nodes.last_ns[node] = True, now
+        copy_gaussian(mean, covariance, nodes.last_mean[node], nodes.last_covariance[node])
+    if node == fusion.faulty_node and now - start_ns >= fusion.fault_after_ns:
+        mean[0] += fusion.fault_m
 
 
 def is_due(
@@ -290,30 +290,30 @@ def is_due(
     mean: Floats,
     covariance: Floats,
     sensing: Sensing,
-    fusion: Fusion,
+    fusion: NodeFusion,
     nodes: Nodes,
 ) -> bool:
     """Whether x* may be sent again, and differs enough from what the last message says of now."""
-    if nodes.said_ns[node] < 0:
+    if nodes.last_ns[node] < 0:
         return True
-    if now - nodes.said_ns[node] < fusion.interval_ns:
+    if now - nodes.last_ns[node] < fusion.interval_ns:
         return False
     if fusion.divergence == 0.0:
         return True
-    said_mean, said_covariance = nodes.said_mean[node].copy(), nodes.said_covariance[node].copy()
-    silent_s = (now - nodes.said_ns[node]) * 1e-9
-    move(said_mean, said_covariance, sensing.density[node], silent_s)
-    return fusion.divergence <= divergence(mean, covariance, said_mean, said_covariance)
+    last_mean, last_covariance = nodes.last_mean[node].copy(), nodes.last_covariance[node].copy()
+    silent_s = (now - nodes.last_ns[node]) * 1e-9
+    move(last_mean, last_covariance, sensing.density[node], silent_s)
+    return fusion.divergence <= divergence(mean, covariance, last_mean, last_covariance)
 
 
-def hear(
+def receive(
     activity: int,
     activities: Activities,
     sensing: Sensing,
-    fusion: Fusion,
+    fusion: NodeFusion,
     nodes: Nodes,
     parts: Estimate,
-    results: Results,
+    results: NodeResults,
 ) -> int:
     """Fill in what a node fuses, its own estimate first and all as of now; returns how many."""
     node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
@@ -337,8 +337,8 @@ def hear(
                 parts.independent[count, row, column] = new * own
         if late_s > 0.0:
             move(parts.mean[count], parts.covariance[count], sensing.density[node], late_s)
-        heard = one_of(parts, count)
-        if is_own or agrees(nodes.mean[node], nodes.covariance[node], heard, fusion.gate):
+        received = one_of(parts, count)
+        if is_own or agrees(nodes.mean[node], nodes.covariance[node], received, fusion.gate):
             count += 1
         else:
             results.refused[first + i] = True

@@ -75,7 +75,7 @@ class VqfParameters(AssumedParameters):
     heading_s: PositiveFloat = 9.0
 
 
-class Settings(NamedTuple):
+class ComplementarySettings(NamedTuple):
     """The gains, and the covariance (3, 3) that is assumed."""
 
     gain: float
@@ -83,7 +83,7 @@ class Settings(NamedTuple):
     covariance: Floats
 
 
-class State(NamedTuple):
+class ComplementaryState(NamedTuple):
     """What is carried, first axis runs: orientations (runs, 4), zero for none yet; biases; stamps."""
 
     orientation: Floats
@@ -91,17 +91,21 @@ class State(NamedTuple):
     time_ns: Integers
 
 
-def start(given: Given[Any]) -> tuple[Settings, State]:
+def start(given: Given[Any]) -> tuple[ComplementarySettings, ComplementaryState]:
     """Nothing known."""
     values = given.parameters
-    settings = Settings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
-    return settings, State(
+    settings = ComplementarySettings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
+    return settings, ComplementaryState(
         np.zeros((given.runs, 4)), np.zeros((given.runs, 3)), np.zeros(given.runs, int)
     )
 
 
 def follow_madgwick(
-    run: int, settings: Settings, messages: Messages, state: State, results: Results
+    run: int,
+    settings: ComplementarySettings,
+    messages: Messages,
+    state: ComplementaryState,
+    results: Results,
 ) -> None:
     """A step of the gyro, and one down the gradient of what force and field contradict."""
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
@@ -138,7 +142,11 @@ def follow_madgwick(
 
 
 def follow_mahony(
-    run: int, settings: Settings, messages: Messages, state: State, results: Results
+    run: int,
+    settings: ComplementarySettings,
+    messages: Messages,
+    state: ComplementaryState,
+    results: Results,
 ) -> None:
     """A step of the gyro less its bias, turned towards what force and field say, (48)."""
     bias = state.bias[run]
@@ -172,7 +180,7 @@ def unit_vectors(value: Floats) -> Any:
     return unit(value[:3]), (value[3], value[4], value[5]), unit(value[6:])
 
 
-def began(run: int, messages: Messages, row: int, state: State) -> Any:
+def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
     """The orientation so far; of the first sample that of its force and field."""
     q = state.orientation[run]
     if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
@@ -182,7 +190,13 @@ def began(run: int, messages: Messages, row: int, state: State) -> Any:
 
 
 def keep(
-    run: int, messages: Messages, row: int, q: Any, settings: Settings, state: State, results: Results
+    run: int,
+    messages: Messages,
+    row: int,
+    q: Any,
+    settings: ComplementarySettings,
+    state: ComplementaryState,
+    results: Results,
 ) -> None:
     """Normalise, carry and tell an orientation."""
     length = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])

@@ -105,7 +105,7 @@ class SetFilterParameters(SetParameters):
     most_edges: PositiveInt = 400
 
 
-class Step(NamedTuple):
+class SetStep(NamedTuple):
     """The estimate at one frame.
 
     Attributes:
@@ -164,7 +164,7 @@ def follow(
     odometry: Odometry,
     bounds: Bounds,
     parameters: SetFilterParameters,
-) -> list[Step]:
+) -> list[SetStep]:
     """The estimates of one run, from its first frame with a set on."""
     anchor: Anchor | None = None
     steps = []
@@ -188,21 +188,21 @@ def follow(
     return steps
 
 
-def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> Step:
+def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> SetStep:
     """What a frame says by itself."""
     headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
-    return Step(frame.time_ns, frame.time_ns, [cut], headings)
+    return SetStep(frame.time_ns, frame.time_ns, [cut], headings)
 
 
 def _advance(
     anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
-) -> Step:
+) -> SetStep:
     """The set of an anchor moved to a frame and cut by it; the anchor is cut by the frame as well."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
     motion = motion_between(stamps, np.array([anchor.pose, pose]), bounds)
     past = [moved(part, anchor.headings, motion) for part in anchor.parts]
     headings = turned(anchor.headings, motion)
-    step = Step(frame.time_ns, anchor.time_ns, past, headings)
+    step = SetStep(frame.time_ns, anchor.time_ns, past, headings)
     if cut.area == 0.0:
         blamed = to_blame(frame.pairs, frame.arena)
         first = int(blamed[0]) if len(blamed) else None
@@ -220,8 +220,8 @@ def _advance(
 
 
 def _cut(
-    anchor: Anchor, step: Step, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
-) -> Step | None:
+    anchor: Anchor, step: SetStep, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
+) -> SetStep | None:
     """The step and its anchor cut by a frame; None, and no change, where nothing would be left."""
     common = shapely.union_all(step.parts).intersection(cut)
     if common.area == 0.0:
@@ -291,11 +291,11 @@ def solve(
 
 
 def _streams(
-    prefix: str, metadata: Mapping[str, str], steps: Sequence[Step], frame_at: Mapping[int, Frame]
+    prefix: str, metadata: Mapping[str, str], steps: Sequence[SetStep], frame_at: Mapping[int, Frame]
 ) -> tuple[Stream, ...]:
     """Sets as `set_membership` gives them, what each rests on, and what was found wrong."""
     blamed = [(frame_at[step.time_ns], step.blamed) for step in steps if step.blamed is not None]
-    told = [step for step in steps if step.finding is not None]
+    with_finding = [step for step in steps if step.finding is not None]
     return (
         *set_streams(
             prefix, metadata, [(step.time_ns, to_rings(shapely.union_all(step.parts))) for step in steps]
@@ -314,8 +314,8 @@ def _streams(
         reason_stream(
             f"{prefix}/diagnosed",
             schemas.DIAGNOSED,
-            np.array([step.time_ns for step in told], np.int64),
-            np.array([step.finding for step in told], np.int64),
+            np.array([step.time_ns for step in with_finding], np.int64),
+            np.array([step.finding for step in with_finding], np.int64),
             FINDINGS,
         ),
     )

@@ -27,7 +27,15 @@ from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL, failures_of, state_stream
 from replay.engine.vectors.components import Components
-from replay.estimators.tracking.phd_recursion import STATES, Mixture, Scans, Sets, Settings, Work, follow
+from replay.estimators.tracking.phd_recursion import (
+    STATES,
+    Mixture,
+    PhdMemory,
+    PhdSettings,
+    Scans,
+    Sets,
+    follow,
+)
 from replay.estimators.tracking.scans import by_scan
 from replay.inference.kalman.steps import FAILURES
 from replay.inference.linear_algebra.gaussian import no_innovation
@@ -107,7 +115,7 @@ def no_components(runs: int, most: int) -> Mixture:
     )
 
 
-def filter_scans(before: Mixture, scans: Scans, settings: Settings) -> tuple[Mixture, Sets]:
+def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[Mixture, Sets]:
     """The mixtures after the scans, and the sets that each scan leads to."""
     columns: Any = before
     mixture = Mixture(*(column.copy() for column in columns))
@@ -118,9 +126,9 @@ def filter_scans(before: Mixture, scans: Scans, settings: Settings) -> tuple[Mix
     return mixture, sets
 
 
-def _work(most: int, detections: int) -> Work:
+def _work(most: int, detections: int) -> PhdMemory:
     rows = most * (1 + detections) + detections
-    return Work(
+    return PhdMemory(
         weight=np.empty(rows),
         mean=np.empty((rows, STATES)),
         covariance=np.empty((rows, STATES, STATES)),
@@ -136,7 +144,7 @@ def _work(most: int, detections: int) -> Work:
     )
 
 
-def _no_sets(scans: Scans, mixture: Mixture, settings: Settings) -> Sets:
+def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
     """Room for the elements: twice the weight that a scan can lead to at most."""
     count = len(scans.time_ns)
     bound = np.empty(count)
@@ -159,7 +167,7 @@ def _no_sets(scans: Scans, mixture: Mixture, settings: Settings) -> Sets:
 
 
 def run(
-    state: Mixture | None, block: Block, *, name: str, settings: Settings, most: int
+    state: Mixture | None, block: Block, *, name: str, settings: PhdSettings, most: int
 ) -> tuple[Mixture, list[Ragged]]:
     """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
     scans = scans_of(*block.streams.values())
@@ -182,11 +190,15 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
 
 def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture) -> list[Ragged]:
     """Per scan the set's size and the expected number, its elements, and the runs that failed."""
-    told = np.flatnonzero(sets.is_told)
-    offsets = np.searchsorted(told, scans.offsets)
-    time_ns, elements, expected = scans.time_ns[told], sets.elements[told], sets.expected[told]
+    reported = np.flatnonzero(sets.is_reported)
+    offsets = np.searchsorted(reported, scans.offsets)
+    time_ns, elements, expected = (
+        scans.time_ns[reported],
+        sets.elements[reported],
+        sets.expected[reported],
+    )
     ends = np.concatenate([[0], np.cumsum(elements)])
-    rows = np.repeat(sets.room[told] - ends[:-1], elements) + np.arange(ends[-1])
+    rows = np.repeat(sets.room[reported] - ends[:-1], elements) + np.arange(ends[-1])
     state = state_metadata(PLANE_MOTION)
     size = make_stream(f"{topic}/set", schemas.ESTIMATE_SIZE, time_ns, metadata=state, elements=elements)
     element = make_stream(
@@ -210,11 +222,11 @@ def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixtu
     ]
 
 
-def settings_of(parameters: PhdParameters, scan: Topic) -> Settings:
+def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
     """What the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
-    names = Settings._fields[:-1]
+    names = PhdSettings._fields[:-1]
     numbers = [given_or_stated(parameters, [scan], name) for name in names]
-    return Settings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])
+    return PhdSettings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> list[Bound]:

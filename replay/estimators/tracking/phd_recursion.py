@@ -26,7 +26,7 @@ PLACE = (0, 2)  # x and y; the velocity of each is next to it
 EXTRACTED = 0.5
 
 
-class Settings(NamedTuple):
+class PhdSettings(NamedTuple):
     """The parameters as the kernel has them; the gate is in squared sigmas."""
 
     variance_m2: float
@@ -73,7 +73,7 @@ class Sets(NamedTuple):
     Scan s has room for elements from `room[s]` on, and has filled `elements[s]` of them.
     """
 
-    is_told: Booleans
+    is_reported: Booleans
     expected: Floats
     elements: Integers
     room: Integers
@@ -83,7 +83,7 @@ class Sets(NamedTuple):
 
 
 @varying(1, step=0, shift=0)
-class Work(NamedTuple):
+class PhdMemory(NamedTuple):
     """Memory of one core.
 
     Attributes:
@@ -114,7 +114,7 @@ def put(weight: float, mean: Floats, covariance: Floats, mixture: Any, row: int)
     copy_gaussian(mean, covariance, mixture.mean[row], mixture.covariance[row])
 
 
-def prepare(mean: Floats, covariance: Floats, variance: float, work: Work, parent: int) -> bool:
+def prepare(mean: Floats, covariance: Floats, variance: float, work: PhdMemory, parent: int) -> bool:
     """Fill what all detections share in the update of a component; False where S is singular."""
     factor, gain = work.seen_factor[parent], work.seen_gain[parent]
     for i in range(2):
@@ -135,7 +135,13 @@ def prepare(mean: Floats, covariance: Floats, variance: float, work: Work, paren
 
 
 def add_detected(
-    run: int, parents: int, place: Floats, mixture: Mixture, settings: Settings, work: Work, end: int
+    run: int,
+    parents: int,
+    place: Floats,
+    mixture: Mixture,
+    settings: PhdSettings,
+    work: PhdMemory,
+    end: int,
 ) -> int:
     """Append what one detection makes of every component, and a birth; returns the new end."""
     first = end
@@ -174,7 +180,9 @@ def add_detected(
     return end
 
 
-def update(run: int, scan: int, scans: Scans, mixture: Mixture, settings: Settings, work: Work) -> int:
+def update(
+    run: int, scan: int, scans: Scans, mixture: Mixture, settings: PhdSettings, work: PhdMemory
+) -> int:
     """Fill `work` with the components after a scan, pruned; returns how many, -1 for a failure."""
     parents = mixture.used[run]
     missed = settings.survival_probability * (1.0 - settings.detection_probability)
@@ -194,7 +202,7 @@ def update(run: int, scan: int, scans: Scans, mixture: Mixture, settings: Settin
     return kept
 
 
-def squared_distance(work: Work, member: int, other: int) -> float:
+def squared_distance(work: PhdMemory, member: int, other: int) -> float:
     """The Mahalanobis distance, squared, of two means by the member's covariance."""
     squared = 0.0
     for row in range(STATES):
@@ -206,7 +214,7 @@ def squared_distance(work: Work, member: int, other: int) -> float:
     return squared
 
 
-def merge(count: int, settings: Settings, work: Work) -> int:
+def merge(count: int, settings: PhdSettings, work: PhdMemory) -> int:
     """Merge what is close to the heaviest component, and so on with the rest; returns how many are left.
 
     The merged ones lie in the places of the heaviest of each group, which `heaviest` lists.
@@ -231,7 +239,7 @@ def merge(count: int, settings: Settings, work: Work) -> int:
         groups += 1
 
 
-def merge_group(seed: int, count: int, settings: Settings, work: Work) -> None:
+def merge_group(seed: int, count: int, settings: PhdSettings, work: PhdMemory) -> None:
     """Replace a component by the one Gaussian with the moments of all that are close to it.
 
     Moments are taken about the seed's mean, which stays where it is until all are found.
@@ -267,7 +275,7 @@ def merge_group(seed: int, count: int, settings: Settings, work: Work) -> None:
             work.covariance[seed, row, column] = second[row, column] / total - moved
 
 
-def keep(run: int, groups: int, mixture: Mixture, work: Work) -> None:
+def keep(run: int, groups: int, mixture: Mixture, work: PhdMemory) -> None:
     """Carry on the heaviest of the merged components, in order of their weights."""
     kept = min(groups, mixture.weight.shape[1])
     for place in range(kept):
@@ -299,10 +307,12 @@ def extract(run: int, scan: int, mixture: Mixture, sets: Sets) -> None:
             put(weight, mean, covariance, sets, row)
             row += 1
     sets.elements[scan] = row - sets.room[scan]
-    sets.is_told[scan] = True
+    sets.is_reported[scan] = True
 
 
-def follow(run: int, scans: Scans, mixture: Mixture, settings: Settings, sets: Sets, work: Work) -> None:
+def follow(
+    run: int, scans: Scans, mixture: Mixture, settings: PhdSettings, sets: Sets, work: PhdMemory
+) -> None:
     """Take one run through its scans, until they end or it fails."""
     for scan in range(scans.offsets[run], scans.offsets[run + 1]):
         if mixture.failure[run] != ALL_WELL:

@@ -20,7 +20,7 @@ GATE = 60.0
 NO_TRACK = -1
 
 
-class Settings(NamedTuple):
+class ReportSettings(NamedTuple):
     """The parameters as the kernel has them; the levels' (LEVELS,)."""
 
     acceleration_density: Floats
@@ -80,7 +80,7 @@ class Reports(NamedTuple):
     speed_mps: Floats
 
 
-class Told(NamedTuple):
+class ReportResults(NamedTuple):
     """What is said of every report: its track's number, mean (n, 4) and spread (n, 3)."""
 
     number: Integers
@@ -89,7 +89,7 @@ class Told(NamedTuple):
 
 
 @varying(2)
-class Memory(NamedTuple):
+class ReportMemory(NamedTuple):
     """What the reports of one stamp are associated in: see `replay.inference.association.association`.
 
     Rows are reports, columns tracks; what is `missed` by all tracks begins a new one.
@@ -111,7 +111,7 @@ def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, f
 
 
 def reported(
-    spread: Floats, level: int, duration_s: float, velocity_variance: float, settings: Settings
+    spread: Floats, level: int, duration_s: float, velocity_variance: float, settings: ReportSettings
 ) -> tuple[float, float, float]:
     """The spread of one axis of what is reported after a while, at a level of noise."""
     a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
@@ -142,12 +142,12 @@ def differences(
     )
 
 
-def mixed(weight: float, settings: Settings) -> float:
+def mixed(weight: float, settings: ReportSettings) -> float:
     """The weight of a level before the next report."""
     return (1.0 - settings.forgetting) * weight + settings.forgetting / LEVELS
 
 
-def is_held(course_rad: float, before_rad: float, settings: Settings) -> bool:
+def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> bool:
     """Whether a course is the one before, or both are not available."""
     if np.isnan(course_rad) or np.isnan(before_rad):
         return np.isnan(course_rad) and np.isnan(before_rad)
@@ -155,12 +155,12 @@ def is_held(course_rad: float, before_rad: float, settings: Settings) -> bool:
     return turned < settings.course_width_rad
 
 
-def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: Settings) -> bool:
+def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: ReportSettings) -> bool:
     """Whether a track was, and a report is, so slow that the course says little of the motion."""
     return speed_mps < settings.slow_mps and tracks.speed_mps[run, place] < settings.slow_mps
 
 
-def birth_density(velocity: Floats, own_variance: float, settings: Settings) -> float:
+def birth_density(velocity: Floats, own_variance: float, settings: ReportSettings) -> float:
     """How densely vessels not met before report this, per m^2, s and (m/s)^2."""
     moving = 1.0 / (np.pi * settings.top_speed_mps**2)
     variance = settings.slow_mps**2 + own_variance
@@ -171,7 +171,7 @@ def birth_density(velocity: Floats, own_variance: float, settings: Settings) -> 
 
 
 def ratio_of(
-    run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: Settings
+    run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> float:
     """How much likelier a report is of a track than of a vessel not met before."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
@@ -204,7 +204,7 @@ def ratio_of(
     return density / born
 
 
-def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: Settings) -> int:
+def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings) -> int:
     """Begin a track with a report; returns its place."""
     place = tracks.used[run]
     tracks.used[run] = place + 1
@@ -225,7 +225,7 @@ def begin(run: int, event: int, reports: Reports, tracks: Tracks, settings: Sett
 
 
 def update(
-    run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: Settings
+    run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> None:
     """Take a report into a track."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
@@ -283,8 +283,8 @@ def take_in(
     place: int,
     reports: Reports,
     tracks: Tracks,
-    settings: Settings,
-    told: Told,
+    settings: ReportSettings,
+    results: ReportResults,
 ) -> None:
     """Give a report to a track, or to a new one, and tell what that then says."""
     if place == NO_TRACK:
@@ -294,14 +294,14 @@ def take_in(
     tracks.time_ns[run, place] = reports.time_ns[event]
     tracks.course_rad[run, place] = reports.course_rad[event]
     tracks.speed_mps[run, place] = reports.speed_mps[event]
-    told.number[event] = tracks.number[run, place]
+    results.number[event] = tracks.number[run, place]
     for component in range(4):
-        told.mean[event, component] = tracks.mean[run, place, component]
+        results.mean[event, component] = tracks.mean[run, place, component]
     for component in range(3):
-        told.spread[event, component] = tracks.spread[run, place, component]
+        results.spread[event, component] = tracks.spread[run, place, component]
 
 
-def forget(run: int, now_ns: int, tracks: Tracks, settings: Settings) -> None:
+def forget(run: int, now_ns: int, tracks: Tracks, settings: ReportSettings) -> None:
     """Drop the tracks that are silent for too long; the last takes the place of one that goes."""
     place = 0
     while place < tracks.used[run]:
@@ -323,9 +323,9 @@ def track(
     run: int,
     reports: Reports,
     tracks: Tracks,
-    settings: Settings,
-    told: Told,
-    memory: Memory,
+    settings: ReportSettings,
+    results: ReportResults,
+    memory: ReportMemory,
 ) -> None:
     """Take one run's reports in, stamp by stamp, the surest pair of report and track first."""
     weights, probability = memory.weights, memory.probability
@@ -347,5 +347,5 @@ def track(
             for place in range(used):
                 if probability[row, 1 + place] > 0.0:
                     chosen = place
-            take_in(run, first + row, chosen, reports, tracks, settings, told)
+            take_in(run, first + row, chosen, reports, tracks, settings, results)
         first += count

@@ -32,10 +32,10 @@ from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.estimators.tracking.report_association import (
     LEVELS,
-    Memory,
+    ReportMemory,
+    ReportResults,
     Reports,
-    Settings,
-    Told,
+    ReportSettings,
     Tracks,
     track,
 )
@@ -86,7 +86,7 @@ def start(_: Mapping[str, Ragged]) -> None:
 
 
 def run(
-    state: Tracks | None, block: Block, *, name: str, topic: str, settings: Settings
+    state: Tracks | None, block: Block, *, name: str, topic: str, settings: ReportSettings
 ) -> tuple[Tracks, list[Ragged]]:
     """Track a block; see `replay.engine.replaying.estimator.Recursive`."""
     reports = _reports(block, topic, settings)
@@ -94,20 +94,25 @@ def run(
     runs = len(reports.offsets) - 1
     tracks = _with_room(state or _no_tracks(runs), most)
     rows = len(reports.time_ns)
-    told = Told(np.empty(rows, np.int64), np.empty((rows, 4)), np.empty((rows, 3)))
+    results = ReportResults(np.empty(rows, np.int64), np.empty((rows, 4)), np.empty((rows, 3)))
     ends = np.flatnonzero(reports.is_last)
     together = int(np.diff(ends, prepend=-1).max(initial=1))
     _compiled()(
-        runs, reports, tracks, settings, told, scratch=partial(_memory, together, tracks.number.shape[1])
+        runs,
+        reports,
+        tracks,
+        settings,
+        results,
+        scratch=partial(_memory, together, tracks.number.shape[1]),
     )
     stream = make_stream(
         f"/estimates/{name}/track",
         schemas.TRACK_ESTIMATE,
         reports.time_ns,
         metadata={**state_metadata(PLANE_MOTION), "reports": topic},
-        track_id=told.number,
-        mean=told.mean,
-        covariance=covariances(told.spread).reshape(rows, 16),
+        track_id=results.number,
+        mean=results.mean,
+        covariance=covariances(results.spread).reshape(rows, 16),
     )
     return _trimmed(tracks), [Ragged(stream, reports.offsets)]
 
@@ -122,7 +127,7 @@ def covariances(spread: Floats) -> Floats:
     return found
 
 
-def _reports(block: Block, topic: str, settings: Settings) -> Reports:
+def _reports(block: Block, topic: str, settings: ReportSettings) -> Reports:
     offsets, time_ns, _, source, is_last = block.events
     given = block.streams[topic]
     course_rad, speed_mps = given["course_rad"][source], given["speed_mps"][source]
@@ -171,15 +176,15 @@ def _trimmed(tracks: Tracks) -> Tracks:
     return Tracks(*(each if each.ndim == 1 else each[:, :most].copy() for each in columns))
 
 
-def _memory(reports: int, places: int) -> Memory:
-    return Memory(
+def _memory(reports: int, places: int) -> ReportMemory:
+    return ReportMemory(
         Weights(np.empty((reports, places)), np.empty(reports)),
         np.empty((reports, 1 + places)),
         memory_for(reports, places),
     )
 
 
-def settings_of(parameters: ReportTrackerParameters) -> Settings:
+def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
     """The parameters as the kernel has them; births per m^2 and s.
 
     Raises BadInput where the last level is not the widest: gates are made with that.
@@ -188,7 +193,7 @@ def settings_of(parameters: ReportTrackerParameters) -> Settings:
         levels = getattr(parameters, name)
         if max(levels) > levels[-1]:
             raise BadInput(f"{name} = {levels}: the levels must increase; give the smallest first")
-    return Settings(
+    return ReportSettings(
         np.array(parameters.acceleration_density),
         np.square(parameters.sigma_position_m),
         np.square(parameters.sigma_velocity_mps),

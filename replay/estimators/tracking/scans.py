@@ -18,7 +18,7 @@ from replay.inference.association.scans import Scans, ScanSensor
 ORIGIN = "origin"
 
 
-class Found(NamedTuple):
+class SensorTopics(NamedTuple):
     """The sensors of a log: kind, scans, detections, and the topic of each one's own position or ""."""
 
     kinds: tuple[int, ...]
@@ -42,7 +42,7 @@ class Fix(NamedTuple):
 Fixes = dict[str, list[Fix | None]]
 
 
-def scans_of(block: Block, found: Found, kinds: Sequence[ScanSensor], fixes: Fixes) -> Scans:
+def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fixes: Fixes) -> Scans:
     """The scans of all runs and sensors in the order in which their messages are replayed.
 
     `fixes` are the last own positions of earlier blocks, by topic and run. Raises BadInput as `by_scan`
@@ -94,12 +94,12 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
     there = bounds[1] - bounds[0]
     wrong = np.flatnonzero(there != stated)
     if len(wrong) or len(keys) != stated.sum():
-        said = "detections of scans that are missing"
+        problem = "detections of scans that are missing"
         if len(wrong):
             row = wrong[0]
             number = scan["scan_id"][row]
-            said = f"scan {number} states {stated[row]} detections, and has {there[row]}"
-        raise BadInput(f"topic {topic}: {said}; record every scan with its count")
+            problem = f"scan {number} states {stated[row]} detections, and has {there[row]}"
+        raise BadInput(f"topic {topic}: {problem}; record every scan with its count")
     return order, bounds
 
 

@@ -11,7 +11,7 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.results import innovation_stream, named
 from replay.estimators.tracking.scan_sensors import KINDS
-from replay.estimators.tracking.scans import Found
+from replay.estimators.tracking.scans import SensorTopics
 from replay.inference.association.outputs import TrackOutputs
 from replay.inference.association.scans import Scans
 from replay.inference.association.tracks import NEVER
@@ -24,7 +24,13 @@ UNUSED = (
 
 
 def track_outputs(
-    name: str, found: Found, stage: Stage, scans: Scans, told: TrackOutputs, *, repeated: int = 0
+    name: str,
+    found: SensorTopics,
+    stage: Stage,
+    scans: Scans,
+    tracked: TrackOutputs,
+    *,
+    repeated: int = 0,
 ) -> list[Ragged]:
     """The streams of the tracker `name` for these scans.
 
@@ -32,11 +38,11 @@ def track_outputs(
     """
     topic = f"/estimates/{name}"
     return [
-        *_of_tracks(topic, stage, scans, told),
-        _associations(topic, found, scans, told),
-        *_of_scans(topic, scans, told, repeated),
-        *_modes(topic, stage, scans, told),
-        *_innovations(topic, found, scans, told),
+        *_of_tracks(topic, stage, scans, tracked),
+        _associations(topic, found, scans, tracked),
+        *_of_scans(topic, scans, tracked, repeated),
+        *_modes(topic, stage, scans, tracked),
+        *_innovations(topic, found, scans, tracked),
     ]
 
 
@@ -50,59 +56,59 @@ def _bounds(ends: Integers) -> Integers:
     return np.concatenate([[0], np.cumsum(ends)])
 
 
-def _track_stamps(scans: Scans, told: TrackOutputs) -> Integers:
+def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
     """The stamps of all tracks after all scans."""
-    used = told.confirmed != NEVER
-    return np.repeat(scans.time_ns[used], told.confirmed[used])
+    used = tracked.confirmed != NEVER
+    return np.repeat(scans.time_ns[used], tracked.confirmed[used])
 
 
-def _of_tracks(topic: str, stage: Stage, scans: Scans, told: TrackOutputs) -> Iterator[Ragged]:
+def _of_tracks(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
     """After every scan how many tracks there are, which, and how probably each exists."""
-    metadata, ends = named(stage.model.state), told.end[:, 0]
-    used = np.flatnonzero(told.confirmed != NEVER)
+    metadata, ends = named(stage.model.state), tracked.end[:, 0]
+    used = np.flatnonzero(tracked.confirmed != NEVER)
     size = make_stream(
         f"{topic}/set",
         schemas.ESTIMATE_SIZE,
         scans.time_ns[used],
         metadata=metadata,
-        elements=told.confirmed[used],
+        elements=tracked.confirmed[used],
     )
     yield Ragged(size, np.searchsorted(used, scans.offsets))
-    stamps_ns, covariance = _track_stamps(scans, told), _filled(told.covariance, ends)
+    stamps_ns, covariance = _track_stamps(scans, tracked), _filled(tracked.covariance, ends)
     track = make_stream(
         f"{topic}/track",
         schemas.TRACK_ESTIMATE,
         stamps_ns,
         metadata=metadata,
-        track_id=_filled(told.number, ends),
-        mean=_filled(told.mean, ends),
+        track_id=_filled(tracked.number, ends),
+        mean=_filled(tracked.mean, ends),
         covariance=covariance.reshape(len(covariance), stage.model.tangent**2),
     )
     yield Ragged(track, _bounds(ends))
-    existence = _filled(told.existence, ends)
+    existence = _filled(tracked.existence, ends)
     stream = make_stream(f"{topic}/existence", schemas.EXISTENCE, stamps_ns, existence=existence)
     yield Ragged(stream, _bounds(ends))
 
 
-def _modes(topic: str, stage: Stage, scans: Scans, told: TrackOutputs) -> Iterator[Ragged]:
+def _modes(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
     """How probable the modes of each track are, where there are several."""
     if not stage.modes:
         return
-    ends = told.end[:, 0]
+    ends = tracked.end[:, 0]
     stream = make_stream(
         f"{topic}/modes",
         schemas.MODE_PROBABILITIES,
-        _track_stamps(scans, told),
+        _track_stamps(scans, tracked),
         metadata=named(dict.fromkeys(stage.model.modes or (), "linear")),
-        probability=_filled(told.probability, ends),
+        probability=_filled(tracked.probability, ends),
     )
     yield Ragged(stream, _bounds(ends))
 
 
-def _associations(topic: str, found: Found, scans: Scans, told: TrackOutputs) -> Ragged:
+def _associations(topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs) -> Ragged:
     """Which detection of a scan is which track's, and how probably."""
-    ends = told.end[:, 1]
-    track, scan, detection = _filled(told.pair, ends).T
+    ends = tracked.end[:, 1]
+    track, scan, detection = _filled(tracked.pair, ends).T
     stream = make_stream(
         f"{topic}/association",
         schemas.ASSOCIATION,
@@ -112,21 +118,21 @@ def _associations(topic: str, found: Found, scans: Scans, told: TrackOutputs) ->
         sensor_id=scans.sensor[scan],
         scan_id=scans.number[scan],
         detection=detection,
-        probability=_filled(told.associated, ends),
+        probability=_filled(tracked.associated, ends),
     )
     return Ragged(stream, _bounds(ends))
 
 
-def _of_scans(topic: str, scans: Scans, told: TrackOutputs, repeated: int) -> Iterator[Ragged]:
+def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) -> Iterator[Ragged]:
     """What was approximated, what was not used, and how many scans were used again."""
-    approximated = np.flatnonzero(told.approximated)
-    tracks = told.approximated[approximated]
+    approximated = np.flatnonzero(tracked.approximated)
+    tracks = tracked.approximated[approximated]
     stream = make_stream(
         f"{topic}/approximation", schemas.APPROXIMATION, scans.time_ns[approximated], tracks=tracks
     )
     yield Ragged(stream, np.searchsorted(approximated, scans.offsets))
-    late = told.confirmed == NEVER
-    unused = np.repeat(np.arange(len(late)), told.turned_away + late)
+    late = tracked.confirmed == NEVER
+    unused = np.repeat(np.arange(len(late)), tracked.turned_away + late)
     reasons = np.where(late[unused], 1, 0)
     stream = reason_stream(f"{topic}/unused", schemas.SKIPPED, scans.time_ns[unused], reasons, UNUSED)
     yield Ragged(stream, np.searchsorted(unused, scans.offsets))
@@ -137,11 +143,13 @@ def _of_scans(topic: str, scans: Scans, told: TrackOutputs, repeated: int) -> It
     yield Ragged(stream, np.minimum(scans.offsets, repeated))
 
 
-def _innovations(topic: str, found: Found, scans: Scans, told: TrackOutputs) -> Iterator[Ragged]:
+def _innovations(
+    topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs
+) -> Iterator[Ragged]:
     """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
-    ends = told.end[:, 1]
-    pair, probability = _filled(told.pair, ends), _filled(told.associated, ends)
-    white, factor = _filled(told.white, ends), _filled(told.factor, ends)
+    ends = tracked.end[:, 1]
+    pair, probability = _filled(tracked.pair, ends), _filled(tracked.associated, ends)
+    white, factor = _filled(tracked.white, ends), _filled(tracked.factor, ends)
     order = np.lexsort((-probability, pair[:, 0], pair[:, 1]))
     track, scan = pair[order, 0], pair[order, 1]
     is_first = np.append(True, (np.diff(scan) != 0) | (np.diff(track) != 0))[: len(order)]

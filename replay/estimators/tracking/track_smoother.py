@@ -13,11 +13,11 @@ from replay.estimators.tracking.targets import Targets
 from replay.inference.association.track_smoothing import smooth_tracks
 
 
-class State(NamedTuple):
+class TrackSmootherState(NamedTuple):
     """The tracker's state, and by block what it said."""
 
     tracker: Any
-    said: tuple[list[Ragged], ...]
+    outputs: tuple[list[Ragged], ...]
 
 
 def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
@@ -31,15 +31,15 @@ def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
             "out smoothed, or take another model, or one of its modes"
         )
 
-    def start(static: Mapping[str, Ragged]) -> State:
-        return State(tracker.start(dict(static)), ())
+    def start(static: Mapping[str, Ragged]) -> TrackSmootherState:
+        return TrackSmootherState(tracker.start(dict(static)), ())
 
-    def run(state: State, block: Block) -> tuple[State, list[Ragged]]:
-        after, said = tracker.run(state.tracker, block)
-        return State(after, (*state.said, said)), []
+    def run(state: TrackSmootherState, block: Block) -> tuple[TrackSmootherState, list[Ragged]]:
+        after, outputs = tracker.run(state.tracker, block)
+        return TrackSmootherState(after, (*state.outputs, outputs)), []
 
-    def finish(state: State) -> list[Ragged]:
-        outputs = [join(parts) for parts in zip(*filter(None, state.said), strict=True)]
+    def finish(state: TrackSmootherState) -> list[Ragged]:
+        outputs = [join(parts) for parts in zip(*filter(None, state.outputs), strict=True)]
         return [
             _smoothed(each, targets) if each.stream.topic.endswith("/track") else each
             for each in outputs

@@ -31,11 +31,11 @@ from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.channels import stated
 from replay.estimators.tracking.scan_sensors import FOREIGN, KINDS, SEEN, UNSTATED
-from replay.estimators.tracking.scans import ORIGIN, Found
+from replay.estimators.tracking.scans import ORIGIN, SensorTopics
 from replay.estimators.tracking.sensor_errors import Errors, errors_of, with_errors
 from replay.estimators.tracking.targets import Targets, targets_of
 from replay.estimators.tracking.track_smoother import smoothing_tracks
-from replay.estimators.tracking.tracker_run import Setup, run, run_out_of_sequence, start
+from replay.estimators.tracking.tracker_run import TrackerSetup, run, run_out_of_sequence, start
 from replay.inference.association.scanning import measuring
 from replay.inference.association.tracker import Tracker
 from replay.inference.model.parameters import number_fields
@@ -219,7 +219,7 @@ class TrackerParameters(Parameters):
 # Sensors
 
 
-def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
+def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTopics:
     """The sensors with scans and places, bearings, or both range and bearing.
 
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
@@ -239,7 +239,7 @@ def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> Found:
     missing = set(wanted) - {row[1].rpartition("/")[0].strip("/") for row in rows}
     if missing:
         raise BadInput(f"no scans of sensor {min(missing)}; leave it out of sensors")
-    found = Found(*zip(*rows, strict=True)) if rows else Found((), (), (), ())
+    found = SensorTopics(*zip(*rows, strict=True)) if rows else SensorTopics((), (), (), ())
     for scan_name, origin in zip(found.scans, found.origins, strict=True):
         if origin and (
             origin not in topics or topics[origin].schema_name != schemas.POSITION_FIX.full_name
@@ -269,7 +269,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
             )
 
 
-class Settings(NamedTuple):
+class TrackerSettings(NamedTuple):
     """What the loop reads, a row for every sensor; and the errors that sensors have beside noise."""
 
     names: tuple[str, ...]
@@ -278,8 +278,8 @@ class Settings(NamedTuple):
 
 
 def settings_of(
-    topics: Mapping[str, Topic], found: Found, parameters: TrackerParameters, targets: Targets
-) -> Settings:
+    topics: Mapping[str, Topic], found: SensorTopics, parameters: TrackerParameters, targets: Targets
+) -> TrackerSettings:
     """What parameters and channels say of the sensors and targets."""
     names, own = number_fields(TrackerParameters), targets.parameters._asdict()
     kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
@@ -304,13 +304,15 @@ def settings_of(
     for values, places in zip(by_sensor, errors.places, strict=True):
         values |= {name: place if place < 0 else size + place for name, place in places.items()}
         values |= of_errors
-    return Settings(tuple(by_sensor[0]), np.array([list(each.values()) for each in by_sensor]), errors)
+    return TrackerSettings(
+        tuple(by_sensor[0]), np.array([list(each.values()) for each in by_sensor]), errors
+    )
 
 
 # The estimator
 
 
-def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Settings) -> Tracker:
+def tracker_of(parameters: TrackerParameters, targets: Targets, settings: TrackerSettings) -> Tracker:
     """The parts that the parameters ask for."""
     stage, shared = targets.stage, settings.errors.shared
     stage = stage_of(*stage, names=settings.names)
@@ -337,7 +339,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters)
     settings = settings_of(topics, found, parameters, targets)
     targets = with_errors(f"estimator {name}", targets, settings.errors)
     tracker = tracker_of(parameters, targets, settings)
-    setup = Setup(name, found, tracker, settings.numbers, targets.newborn, parameters.most_tracks)
+    setup = TrackerSetup(name, found, tracker, settings.numbers, targets.newborn, parameters.most_tracks)
     seen = (topic for pair in zip(found.scans, found.detections, strict=True) for topic in pair)
     read = tuple(dict.fromkeys([*seen, *filter(None, found.origins)]))
 

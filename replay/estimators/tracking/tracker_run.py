@@ -8,7 +8,7 @@ import numpy as np
 from replay.engine.arrays import Floats, Integers
 from replay.engine.streams.blocks import Block, Ragged, gather, join
 from replay.estimators.tracking.scan_sensors import KINDS
-from replay.estimators.tracking.scans import Fixes, Found, latest_fixes, scans_of
+from replay.estimators.tracking.scans import Fixes, SensorTopics, latest_fixes, scans_of
 from replay.estimators.tracking.track_outputs import track_outputs
 from replay.inference.association.outputs import TrackOutputs, of_last
 from replay.inference.association.scans import Scans, in_time, take_scans
@@ -17,11 +17,11 @@ from replay.inference.association.tracking import track_scans
 from replay.inference.association.tracks import Tracks, no_tracks
 
 
-class Setup(NamedTuple):
+class TrackerSetup(NamedTuple):
     """A tracker as it is bound to a log: its name, the sensors, their settings, room for tracks."""
 
     name: str
-    found: Found
+    found: SensorTopics
     tracker: Tracker
     settings: Floats
     newborn: Newborn
@@ -37,12 +37,14 @@ class Setup(NamedTuple):
         """The tracks after some scans, and what is said of them."""
         return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
-    def outputs(self, scans: Scans, told: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
+    def outputs(self, scans: Scans, tracked: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
         """The streams of what is said of these scans; see `track_outputs`."""
-        return track_outputs(self.name, self.found, self.tracker.stage, scans, told, repeated=repeated)
+        return track_outputs(
+            self.name, self.found, self.tracker.stage, scans, tracked, repeated=repeated
+        )
 
 
-class State(NamedTuple):
+class TrackerState(NamedTuple):
     """What is carried from block to block: the last own positions, and the tracks.
 
     Attributes:
@@ -58,25 +60,27 @@ def start(_: Mapping[str, Ragged]) -> None:
     """Nothing is known before the first scan, not even how many runs there are."""
 
 
-def run(state: State | None, block: Block, *, setup: Setup) -> tuple[State, list[Ragged]]:
+def run(
+    state: TrackerState | None, block: Block, *, setup: TrackerSetup
+) -> tuple[TrackerState, list[Ragged]]:
     """Track a block; see `replay.engine.replaying.estimator.Recursive`."""
     before = state or _begin(block, setup, setup.no_tracks(_runs(block)))
     scans, fixes = _scans(before, block, setup)
-    after, said = setup.track(before.tracks, scans)
-    outputs = [setup.outputs(batch, told) for batch, told in said]
-    return State(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
+    after, batches = setup.track(before.tracks, scans)
+    outputs = [setup.outputs(batch, tracked) for batch, tracked in batches]
+    return TrackerState(fixes, after), [join(parts) for parts in zip(*outputs, strict=True)]
 
 
 def _runs(block: Block) -> int:
     return next(iter(block.streams.values())).runs
 
 
-def _begin(block: Block, setup: Setup, tracks: Any) -> State:
+def _begin(block: Block, setup: TrackerSetup, tracks: Any) -> TrackerState:
     unknown: list[Any] = [None] * _runs(block)
-    return State({topic: unknown for topic in setup.found.origins if topic}, tracks)
+    return TrackerState({topic: unknown for topic in setup.found.origins if topic}, tracks)
 
 
-def _scans(state: State, block: Block, setup: Setup) -> tuple[Scans, Fixes]:
+def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scans, Fixes]:
     """A block's scans, and the last own positions after it."""
     scans = scans_of(block, setup.found, KINDS, state.fixes)
     fixes = state.fixes.items()
@@ -98,8 +102,8 @@ class OutOfSequenceState(NamedTuple):
 
 
 def run_out_of_sequence(
-    state: State | None, block: Block, *, setup: Setup, back_ns: int
-) -> tuple[State, list[Ragged]]:
+    state: TrackerState | None, block: Block, *, setup: TrackerSetup, back_ns: int
+) -> tuple[TrackerState, list[Ragged]]:
     """Track a block in the order of arrival, and go back for scans that are late by up to `back_ns`.
 
     A late scan is put in its place and those after it are used again; what was said stays, and is said
@@ -111,16 +115,16 @@ def run_out_of_sequence(
     runs = [OutOfSequenceState(nothing, none, nothing)] * _runs(block) if state is None else state.tracks
     after, outputs = [], []
     for number, before in enumerate(runs):
-        out_of_sequence, said = before, list[list[Ragged]]()
+        out_of_sequence, batches = before, list[list[Ragged]]()
         for rows in _stretches(before, scans, *scans.offsets[number : number + 2]):
-            out_of_sequence, told = _take(out_of_sequence, take_scans(scans, rows), setup, back_ns)
-            said += told
+            out_of_sequence, tracked = _take(out_of_sequence, take_scans(scans, rows), setup, back_ns)
+            batches += tracked
         after.append(out_of_sequence)
-        outputs.append([join(parts) for parts in zip(*said, strict=True)])
+        outputs.append([join(parts) for parts in zip(*batches, strict=True)])
     filled = next((each for each in outputs if each), [])
     empty = [Ragged(each.stream.take(slice(0, 0)), np.zeros(2, np.int64)) for each in filled]
     by_topic = zip(*(each or empty for each in outputs), strict=True)
-    return State(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
+    return TrackerState(fixes, after), [gather([each.stream for each in parts]) for parts in by_topic]
 
 
 def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
@@ -133,18 +137,18 @@ def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -
 
 
 def _take(
-    out_of_sequence: OutOfSequenceState, arrived: Scans, setup: Setup, back_ns: int
+    out_of_sequence: OutOfSequenceState, arrived: Scans, setup: TrackerSetup, back_ns: int
 ) -> tuple[OutOfSequenceState, list[list[Ragged]]]:
     """One run after scans that go on in time, or after one that is late; and what is said then."""
     base, pending, head = out_of_sequence
     repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
     pending = in_time(pending, arrived)
     if repeated:
-        head, said = setup.track(base, pending)
-        outputs = [setup.outputs(*of_last(*said[-1]), repeated=repeated)]
+        head, batches = setup.track(base, pending)
+        outputs = [setup.outputs(*of_last(*batches[-1]), repeated=repeated)]
     else:
-        head, said = setup.track(head, arrived)
-        outputs = [setup.outputs(batch, told) for batch, told in said]
+        head, batches = setup.track(head, arrived)
+        outputs = [setup.outputs(batch, tracked) for batch, tracked in batches]
     rows = np.arange(len(pending.time_ns))
     settled = pending.time_ns < pending.time_ns[-1] - back_ns
     if settled.any():

@@ -30,8 +30,8 @@ from replay.estimators.vehicles.association import (
     log_permanents,
 )
 from replay.estimators.vehicles.streams import (
-    Carried,
     Frames,
+    VehiclesState,
     bind_vehicles,
     frames_of,
     no_results,
@@ -84,7 +84,7 @@ class Cloud(NamedTuple):
     fixes are there.
     """
 
-    carried: Carried
+    carried: VehiclesState
     joint: Joint
     log_weight: Floats
     generators: list[np.random.Generator | None]

@@ -62,7 +62,7 @@ class VehiclesParameters(Parameters):
     sigma_fix_m: PositiveFloat | None = None
 
 
-class Carried(NamedTuple):
+class VehiclesState(NamedTuple):
     """What is carried from block to block; first axis = run.
 
     `scans` counts the infrastructure sensor's; `registered` says that its pose was found.
@@ -96,7 +96,7 @@ class Frames(NamedTuple):
     skipped: Booleans
 
 
-class Results(NamedTuple):
+class VehiclesResults(NamedTuple):
     """Means (runs, frames, n) and covariances after every frame, and maps where single ones are used.
 
     `associated` has arrays (runs, frames, vehicles, ...); NaN innovations where nothing was associated.
@@ -107,10 +107,10 @@ class Results(NamedTuple):
     associated: Associated
 
 
-def no_results(setup: Setup, runs: int, frames: int) -> Results:
+def no_results(setup: Setup, runs: int, frames: int) -> VehiclesResults:
     """Results that say nothing."""
     states, vehicles = setup.states, setup.motion.vehicles
-    return Results(
+    return VehiclesResults(
         np.full((runs, frames, states), np.nan),
         np.full((runs, frames, states, states), np.nan),
         Associated(
@@ -183,7 +183,7 @@ def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
     return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))
 
 
-def start(setup: Setup, static: Mapping[str, Ragged]) -> Carried:
+def start(setup: Setup, static: Mapping[str, Ragged]) -> VehiclesState:
     """Every run's priors."""
     runs = next(iter(static.values())).runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
@@ -191,10 +191,10 @@ def start(setup: Setup, static: Mapping[str, Ragged]) -> Carried:
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
         time_ns, mean[:, own], covariance[:, own, own] = gaussians(prior)
     registered, failed = np.zeros((2, runs), bool)
-    return Carried(mean, covariance, time_ns, np.zeros(runs, np.int64), registered, failed)
+    return VehiclesState(mean, covariance, time_ns, np.zeros(runs, np.int64), registered, failed)
 
 
-def run(setup: Setup, carried: Carried, block: Block) -> tuple[Carried, list[Ragged]]:
+def run(setup: Setup, carried: VehiclesState, block: Block) -> tuple[VehiclesState, list[Ragged]]:
     """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
@@ -260,7 +260,12 @@ def frames_of(setup: Setup, block: Block) -> Frames:
 
 
 def _advance(
-    setup: Setup, carried: Carried, frames: Frames, number: int, rows: Integers, results: Results
+    setup: Setup,
+    carried: VehiclesState,
+    frames: Frames,
+    number: int,
+    rows: Integers,
+    results: VehiclesResults,
 ) -> None:
     """Take some runs through one frame: changes their rows of what is carried, and fills the results."""
     time_ns = frames.time_ns[rows, number]
@@ -307,52 +312,57 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
     return joint
 
 
-def outputs_of(setup: Setup, frames: Frames, results: Results, failing: Booleans) -> Iterator[Ragged]:
+def outputs_of(
+    setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
+) -> Iterator[Ragged]:
     """Every vehicle's estimates, the pose's where it is estimated, and who failed."""
     runs, count = frames.time_ns.shape
-    said = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
+    is_estimated = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
 
-    def gaussians(case: str, names: Sequence[str], own: slice, told: Booleans) -> Ragged:
+    def gaussians(case: str, names: Sequence[str], own: slice, rows: Booleans) -> Ragged:
         stream = state_stream(
             f"/estimates/{setup.name}/{case}/state",
-            frames.time_ns[told],
+            frames.time_ns[rows],
             components_of(names),
             f"/{case}/truth",
-            results.mean[told][:, own],
-            results.covariance[told][:, own, own],
+            results.mean[rows][:, own],
+            results.covariance[rows][:, own, own],
         )
-        return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
+        return Ragged(stream, np.concatenate([[0], np.cumsum(rows.sum(axis=1))]))
 
     def innovations(vehicle: int) -> Ragged:
         """What was associated with a vehicle; the target is the detection's number in its scan."""
         detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
-        told = detection != MISSED
+        is_associated = detection != MISSED
         squared = np.einsum(
-            "ni,nij,nj->n", innovation[told], np.linalg.inv(spread[told]), innovation[told]
+            "ni,nij,nj->n",
+            innovation[is_associated],
+            np.linalg.inv(spread[is_associated]),
+            innovation[is_associated],
         )
         stream = innovation_stream(
             f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation",
-            frames.time_ns[told],
+            frames.time_ns[is_associated],
             PLANE,
             "",
-            target_id=detection[told] + 1,
-            accepted=np.ones(told.sum(), np.int64),
-            innovation=innovation[told],
-            covariance=spread[told],
+            target_id=detection[is_associated] + 1,
+            accepted=np.ones(is_associated.sum(), np.int64),
+            innovation=innovation[is_associated],
+            covariance=spread[is_associated],
             squared=squared,
         )
-        return Ragged(stream, np.concatenate([[0], np.cumsum(told.sum(axis=1))]))
+        return Ragged(stream, np.concatenate([[0], np.cumsum(is_associated.sum(axis=1))]))
 
     vehicles = setup.motion.vehicles
     for vehicle in range(vehicles):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        yield gaussians(f"vehicle{setup.numbers[vehicle]}", PLANE_MOTION, own, said)
+        yield gaussians(f"vehicle{setup.numbers[vehicle]}", PLANE_MOTION, own, is_estimated)
         if setup.fixes == "hungarian":
             yield innovations(vehicle)
     if setup.has_pose:
         is_found = results.covariance[:, :, -1, -1] > 0.0
-        yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), said & is_found)
-    last = np.maximum(said.sum(axis=1), 1) - 1
+        yield gaussians("infrastructure", POSE_COMPONENTS, slice(-POSE, None), is_estimated & is_found)
+    last = np.maximum(is_estimated.sum(axis=1), 1) - 1
     failures = {
         run: Failure(int(frames.time_ns[run, last[run]]), FAILED)
         for run in np.flatnonzero(failing).tolist()

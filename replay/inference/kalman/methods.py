@@ -16,38 +16,25 @@ from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build
 from replay.engine.arrays import Floats, Function
-from replay.engine.streams.results import ALL_WELL
 from replay.inference.kalman.forms import extended, sampled
+from replay.inference.kalman.iterated_update import iterated_update
 from replay.inference.kalman.predict import linear_motion, motion_noise
 from replay.inference.kalman.square_root import FACTORED
 from replay.inference.kalman.steps import (
-    NOT_POSITIVE_DEFINITE,
-    NOTHING_MEASURED,
-    InnovationRecord,
     Steps,
     Workspace,
     gaussian_filter,
 )
 from replay.inference.kalman.update import (
     kalman_update,
-    linear_innovation,
     linear_sensor,
     reading,
     sensor_derivative,
-    write_numbers,
-    writing_innovation,
 )
 from replay.inference.linear_algebra.gaussian import (
-    downdate,
-    drop_missing,
-    inflate,
-    inflation,
-    kalman_step,
-    whiten,
     wrap,
 )
 from replay.inference.linear_algebra.tuples import tuple_of
-from replay.inference.model.corrections import correcting, relinearising, sloping
 from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import trial_parameters
@@ -55,9 +42,6 @@ from replay.inference.model.stage import Stage, traced_sensor
 from replay.inference.model.validation import trial_state
 from replay.sampling import parse_sampling
 from replay.sampling.names import Sampling, Unscented
-
-ITERATIONS = 50
-SETTLED = 1e-12  # of the iterated update: the largest component of the last step
 
 
 class MethodParameters(Parameters):
@@ -106,7 +90,11 @@ class RegressionParameters(MethodParameters):
 
 
 class SquareRootParameters(UnscentedParameters):
-    """`filter` is the one whose covariances are carried as factors, ekf or ukf."""
+    """Chooses the filter that carries factors of its covariances.
+
+    Attributes:
+        filter: the filter whose covariances are carried as factors.
+    """
 
     filter: Literal["ekf", "ukf"] = "ekf"
 
@@ -142,86 +130,6 @@ class Method:
 def _iterated(stage: Stage) -> Steps:
     updates = (iterated_update(stage, number) for number in range(len(stage.sensors)))
     return gaussian_filter(stage, linear_motion(stage), tuple(updates))
-
-
-def iterated_update(stage: Stage, number: int) -> Function:
-    """Make the update that linearises at every iterate until it settles: Gauss-Newton on the posterior.
-
-    Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
-    gate is tested at the prediction, and so is how much the measurement counts; innovation and
-    likelihood are those of the last iterate.
-
-    Args:
-        stage: the model with the sensors at hand.
-        number: the sensor's, among these.
-    """
-    model, sensor = stage.model, stage.sensors[number]
-    n, t, m = model.size, model.tangent, len(sensor.measured)
-    read_state, read_reference = tuple_of(n), reading(sensor).reference
-    linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
-    write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
-    find_slope = sloping(model.kinds, model.correct)
-    step_to, chain = relinearising(model)
-
-    def relinearise(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
-    ) -> None:
-        """Form the innovation by the Jacobian at mean (+) step, as one about the mean."""
-        innovation, step, rows = work.innovations[number], work.step, work.rows
-        step_to(mean, work)
-        linearise(read_state(work.state), read_reference(data), parameters, work)
-        chain(rows[:m], work)
-        compare(covariance, data, parameters, work)
-        for i in range(m):
-            for k in range(t):
-                innovation.difference[i] += rows[i, k] * step[k]
-
-    def update(
-        mean: Floats,
-        covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
-        work: Workspace,
-        record: InnovationRecord,
-    ) -> int:
-        present = 0
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
-            return NOTHING_MEASURED
-        innovation, step, factor = work.innovations[number], work.step, 1.0
-        find_slope(mean, covariance, work.slope)
-        for row in range(t):
-            step[row] = 0.0
-        for iteration in range(ITERATIONS):
-            relinearise(mean, covariance, data, parameters, work)
-            write_innovation(innovation, record)
-            size = drop_missing(innovation)
-            squared, determinant = whiten(innovation, size)
-            if np.isnan(squared):
-                return NOT_POSITIVE_DEFINITE
-            if iteration == 0:
-                factor = inflation(squared, size, parameters)
-            if size == 0 or (iteration == 0 and not squared <= gate[size]):
-                write_numbers(record, squared, determinant, size, False, 1.0)
-                return ALL_WELL
-            inflate(innovation, size, factor)
-            for row in range(t):
-                work.turned[row] = step[row]
-            kalman_step(innovation, size, step)
-            change = 0.0
-            for row in range(t):
-                change = max(change, abs(step[row] - work.turned[row]))
-            if change < SETTLED:
-                break
-        downdate(covariance, innovation.cross_covariance, size)
-        correct(mean, covariance, work)
-        write_numbers(record, squared, determinant, size, True, factor)
-        return ALL_WELL
-
-    return update
 
 
 def _analytic(stage: Stage) -> Steps:

@@ -157,11 +157,10 @@ class Sensor:
         reference: what the message is about: a point of a map, or one of each of several maps.
         fields: numbers that a message states beside what it measures, such as the pose of a sensor that
             moves: fields of the schema, and how many components each has. `reference` has them behind
-                the
-            points and the control.
+            the points and the control.
         is_numbered: whether `reference` ends with the numbers of these points.
-        control: the model's, which has to be interpolated, where what is measured depends on it:
-            `reference` then ends with its numbers at the stamp.
+        control: the model's, where what is measured depends on it: `reference` then has its numbers at
+            the stamp, behind the points. It has to be `interpolated`: one that is held is refused.
         read: stream -> (n, measured), NaN where a component is missing, for what is computed of a
             message: a pseudo-measurement.
         delay: the parameter that says how long before its stamp, in s, a message was measured.

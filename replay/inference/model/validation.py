@@ -7,7 +7,7 @@ import numpy as np
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.vectors.tangent import are_kinds
-from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
 from replay.tracing.functions import place_of
 
 
@@ -115,6 +115,8 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     unknown = sorted(set(sensor.measured.values()) - {"linear", "angle"})
     if unknown:
         raise BadInput(f"{where}: measures a component of kind {unknown[0]}; give linear or angle")
+    if sensor.control is not None:
+        _check_interpolated(where, model, sensor.control)
     state, reference = trial_state(model.kinds), (1.0,) * sensor.reference_size
     entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
     _check(where, sensor.measure, (state, *entering, reference, parameters), (size,))
@@ -131,6 +133,24 @@ def check_sensor(where: str, model: Model, sensor: Sensor, parameters: Any) -> N
     if sensor.noise is not None and not sensor.covariance:
         wanted = (sensor.noises,) if sensor.noises else (size, size * (size + 1) // 2)
         _check(where, sensor.noise, (parameters,), wanted)
+
+
+def _check_interpolated(where: str, model: Model, control: Control) -> None:
+    """Refuse a sensor's control that has no value between two messages: all it measures would be NaN."""
+    driving = model.control
+    if driving is None or driving.components != control.components:
+        asked, given = (
+            "none" if each is None else f"{each.topic} ({', '.join(each.components)})"
+            for each in (control, driving)
+        )
+        raise BadInput(
+            f"{where}: reads the control {asked}, the model's is {given}; give both the same `control`"
+        )
+    if not driving.interpolated:
+        raise BadInput(
+            f"{where}: reads the control {control.topic} at its stamp, and that is held from message to "
+            "message; give the model's Control interpolated=True, or the sensor no `control`"
+        )
 
 
 def trial_state(kinds: tuple[str, ...]) -> tuple[float, ...]:

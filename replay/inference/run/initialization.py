@@ -14,6 +14,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic, make_stream, schemas
+from recorders.parameters import meanings
 from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Initialization, Initialized
 from replay.engine.streams.blocks import Block, Ragged, merge_events
@@ -205,7 +206,7 @@ class Initializer:
 
     def _assumption(self, name: str, number: float) -> str:
         """Write the sentence for a parameter that is assumed, with its meaning if the model gives it."""
-        meaning = " ".join((self.stage.model.parameters.model_fields[name].description or "").split())
+        meaning = meanings(self.stage.model.parameters).get(name, "")
         said = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
         return f"{said} ({meaning.rstrip('.')})" if meaning else said
 

@@ -47,8 +47,8 @@ class FilterEvents(NamedTuple):
             interpolated.
         wants_estimate: (n,) whether the estimate after the event is wanted.
         target_id: (n,) what the message is about, 0 for nothing.
-        came: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the order
-            of the stamps.
+        arrival: (n, 2) when the event was taken, and its place in the file; (n, 0) where that is the
+            order of the stamps.
     """
 
     offsets: Integers

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 # What a metric should be: small, large, near a value; None where neither is better.
-Aim = Literal["low", "high"] | float | None
+Target = Literal["low", "high"] | float | None
 Verdict = Literal["better", "worse", "higher", "lower", "no difference", "unclear"]
 RESAMPLES = 2000
 # So many numbers of resamples are in memory at once.
@@ -27,7 +27,7 @@ BATCH_NUMBERS = 1 << 22
 FEWEST_RUNS = 5
 # The zero of a log-likelihood is nowhere: a margin of 0.02 is one of 2 nats.
 NATS = 100.0
-AIMS: dict[str, Aim] = {
+TARGETS: dict[str, Target] = {
     "*rmse*": "low",
     "ape_*": "low",
     "rpe_*": "low",
@@ -75,26 +75,26 @@ class Difference(NamedTuple):
     runs: int
 
 
-def aim_of(quantity: str) -> Aim:
+def target_of(quantity: str) -> Target:
     """What a registered metric should be; None for one of which this is not known."""
-    return next((aim for pattern, aim in AIMS.items() if fnmatch(quantity, pattern)), None)
+    return next((target for pattern, target in TARGETS.items() if fnmatch(quantity, pattern)), None)
 
 
 def paired_difference(
-    first: Floats, second: Floats, aim: Aim, margin: float, scale: float | None = None
+    first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
     """The second's difference to the first.
 
     Args:
         first: (n,) the metric in every run.
         second: (n,) in the same runs.
-        aim: what the metric should be.
+        target: what the metric should be.
         margin: which share of the first's mean, or of the aim's value, does not matter.
         scale: of what it is a share instead.
     """
     means = float(first.mean()), float(second.mean())
     if scale is None:
-        scale = aim if isinstance(aim, float) else abs(means[0])
+        scale = target if isinstance(target, float) else abs(means[0])
     difference, runs, allowed = means[1] - means[0], len(first), margin * scale
     low, high, sure = math.nan, math.nan, math.nan
     verdict: Verdict = "unclear"
@@ -106,7 +106,7 @@ def paired_difference(
         if -allowed <= low and high <= allowed:
             verdict = "no difference"
         elif low > allowed or high < -allowed:
-            verdict = _direction(first, second, aim, difference)
+            verdict = _direction(first, second, target, difference)
     return Difference(*means, difference, low, high, allowed, verdict, sure, runs)
 
 
@@ -137,14 +137,14 @@ def _interval(
     return *map(float, done.confidence_interval), done.bootstrap_distribution
 
 
-def _direction(first: Floats, second: Floats, aim: Aim, difference: float) -> Verdict:
+def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Verdict:
     """What a difference means; of two on either side of their aim, maybe only which is higher."""
-    if aim in ("low", "high"):
-        return "worse" if (difference > 0) == (aim == "low") else "better"
-    if isinstance(aim, float):
+    if target in ("low", "high"):
+        return "worse" if (difference > 0) == (target == "low") else "better"
+    if isinstance(target, float):
 
         def farther(first: Floats, second: Floats, axis: int = -1) -> Floats:
-            distance: Floats = np.abs(second.mean(axis) - aim) - np.abs(first.mean(axis) - aim)
+            distance: Floats = np.abs(second.mean(axis) - target) - np.abs(first.mean(axis) - target)
             return distance
 
         low, high, _ = _interval(first, second, farther)

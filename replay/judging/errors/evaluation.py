@@ -64,7 +64,8 @@ class Errors:
         nees: (n,) normalised estimation error squared; NaN where the covariance is not positive
             definite.
         without_truth: how many estimates had no truth within the gap limit.
-        unjudged: the estimate's components that the truth lacks, of which nothing is known here.
+        components_without_truth: the estimate's components that the truth lacks, of which nothing is
+            known here.
         is_bound: whether these are no estimates, but what is known at the truth itself: the covariances
             are then what the squares of errors are at least.
     """
@@ -81,7 +82,7 @@ class Errors:
     covariance: Floats
     nees: Floats
     without_truth: int
-    unjudged: tuple[str, ...] = ()
+    components_without_truth: tuple[str, ...] = ()
     is_bound: bool = False
 
     @property
@@ -188,7 +189,7 @@ def errors_of(
     """Errors of a Gaussian estimate stream of an ensemble, in the components that all truths have.
 
     An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, or the
-    truths have nothing in common with the estimates (see `unjudged`).
+    truths have nothing in common with the estimates (see `components_without_truth`).
 
     Args:
         estimates: the stream, or a block of it.
@@ -204,7 +205,7 @@ def errors_of(
     stream = estimates.stream
     components = _components(stream)
     truth_topic = stream.metadata.get("truth", "")
-    lacking = unjudged(estimates, sources)
+    lacking = components_without_truth(estimates, sources)
     judged = {name: kind for name, kind in components.items() if name not in lacking}
     if not judged or not all(truth_topic in source.topics for source in sources):
         return None
@@ -248,7 +249,7 @@ def errors_of(
     )
 
 
-def unjudged(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
+def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
     """The components of a Gaussian estimate stream that the truth of some run lacks.
 
     All of an axis or a quaternion where it lacks one of theirs; none where a run has no truth topic at

@@ -28,7 +28,7 @@ DROPPED, INSERTED, WAITED = "dropped", "inserted", "waited for"
 LATE = (DROPPED, INSERTED, WAITED)
 
 
-class Told(NamedTuple):
+class OutputDiagnostics(NamedTuple):
     """What one output tells.
 
     Attributes:
@@ -42,24 +42,26 @@ class Told(NamedTuple):
     values: Floats
 
 
-def told_by(output: Output) -> Told | None:
+def diagnostics_of(output: Output) -> OutputDiagnostics | None:
     """What an output tells that has a mean over time; None where it is of another kind."""
     stream = output.rows.stream
     schema = stream.schema.full_name
     if schema == schemas.MODE_PROBABILITIES.full_name:
         what = SMOOTHED_MODES if output.leaf == SMOOTHED_MODES else MODES
-        return Told(what, tuple(stream.components), stream["probability"])
+        return OutputDiagnostics(what, tuple(stream.components), stream["probability"])
     if schema == schemas.EFFECTIVE_PARTICLES.full_name:
-        return Told(EFFECTIVE, (EFFECTIVE,), (stream["effective"] / stream["particles"])[:, None])
+        return OutputDiagnostics(
+            EFFECTIVE, (EFFECTIVE,), (stream["effective"] / stream["particles"])[:, None]
+        )
     if schema == schemas.SKIPPED.full_name:
         is_older = np.array([OLDER in reason for reason in sentences_of(stream)], bool)
         late_s = np.where(is_older, _late_s(stream), np.nan)
-        return Told(DROPPED, ("late_s",), late_s[:, None])
+        return OutputDiagnostics(DROPPED, ("late_s",), late_s[:, None])
     if schema == schemas.REWOUND.full_name:
         values = np.column_stack([_late_s(stream), stream["repeated"]])
-        return Told(INSERTED, ("late_s", "repeated"), values)
+        return OutputDiagnostics(INSERTED, ("late_s", "repeated"), values)
     if schema == schemas.WAITED.full_name:
-        return Told(WAITED, ("late_s",), _late_s(stream)[:, None])
+        return OutputDiagnostics(WAITED, ("late_s",), _late_s(stream)[:, None])
     return None
 
 
@@ -74,7 +76,7 @@ class Means:
 
     Attributes:
         estimator, case: whose it is.
-        what, names: see `Told`.
+        what, names: see `OutputDiagnostics`.
         sums: by time since the epoch, of that time in seconds and of every value.
     """
 
@@ -114,10 +116,10 @@ class MeansOfAll:
 
     def add(self, output: Output) -> None:
         """Take in a block of a stream, if it tells anything of the kind."""
-        told = told_by(output)
-        if told is None or not len(told.values):
+        diagnostics = diagnostics_of(output)
+        if diagnostics is None or not len(diagnostics.values):
             return
-        topic, (what, names, values) = output.rows.stream.topic, told
+        topic, (what, names, values) = output.rows.stream.topic, diagnostics
         if topic not in self._of:
             sums = BinnedSums(1 + len(names), width=SPAN_NS, limit=SPANS)
             self._of[topic] = Means(output.estimator, output.case, what, names, sums)

@@ -19,7 +19,7 @@ def squares(errors: Errors) -> Sums:
     """Sums of squared errors by the name of their RMSE: of the position, and of other components."""
     found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
     found |= squares_by_name(errors.squared, errors.components, errors.kinds)
-    return found | {rmse_of(name): np.nan for name in errors.unjudged}
+    return found | {rmse_of(name): np.nan for name in errors.components_without_truth}
 
 
 def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:

@@ -36,7 +36,7 @@ class JudgedFilter:
         guaranteed: whether the set must hold the truth: an earlier set held it, and since then all
             bounds have held.
         growth: how many times larger sets with L = 8 are.
-        finding: numbers in `set_filter.FINDINGS`, -1 where nothing was wrong.
+        finding: numbers in `frames.FINDINGS`, -1 where nothing was wrong.
     """
 
     sets: JudgedSets

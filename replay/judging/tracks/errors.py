@@ -23,7 +23,7 @@ from replay.judging.sets.distances import gospa, gospa_pairs
 CUTOFF_M = 20.0
 UNREFERENCED_M = 50.0
 # The first instant, when tracks have had time to begin, and how far apart the others are.
-SETTLE_S = 10.0
+BURN_IN_S = 10.0
 PERIOD_S = 0.5
 NONE = -1
 
@@ -65,7 +65,7 @@ class Judged(NamedTuple):
     truths: Floats
 
 
-def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PERIOD_S) -> Judged:
+def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
     """Instants from a while after the epoch to the end of the scans or of the first truth that ends.
 
     Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
@@ -83,11 +83,11 @@ def instants_of(source: Source, settle_s: float = SETTLE_S, period_s: float = PE
         )
     last_ns = [int(stream.publish_time_ns.max(initial=0)) for stream in truths.values()]
     last_ns.append(max(int(stream.publish_time_ns.max(initial=0)) for stream in scans.values()))
-    first_ns = source.epoch_ns + round(settle_s * 1e9)
+    first_ns = source.epoch_ns + round(burn_in_s * 1e9)
     at_ns = np.arange(first_ns, min(last_ns) + 1, round(period_s * 1e9))
     if not len(at_ns):
         raise BadInput(
-            f"{source.name}: ends within {settle_s:g} s, and tracks are judged after these; give a "
+            f"{source.name}: ends within {burn_in_s:g} s, and tracks are judged after these; give a "
             "longer log"
         )
     places = [
@@ -185,7 +185,7 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
 
 
 def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:
-    """The tracks at k instants as (tracks, k, 2), NaN where one is absent; see `track_distances`."""
+    """The tracks at k instants as (tracks, k, 2), NaN where one is absent; see `tracks.distances`."""
     numbers = np.unique(np.concatenate([at.number for at in tracks] or [np.empty(0, np.int64)]))
     found = np.full((len(numbers), len(tracks), 2), np.nan)
     for instant, at in enumerate(tracks):

@@ -25,7 +25,7 @@ MANY_REPORTS = 50
 KEPT_SHARE = 0.95
 
 
-class Kept(NamedTuple):
+class KeptTracks(NamedTuple):
     """How many targets are judged, what share of them kept a track, and their mean share in it."""
 
     targets: int
@@ -70,12 +70,12 @@ def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
     return table.sort_values("reports", ascending=False, kind="stable", ignore_index=True)
 
 
-def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> Kept:
+def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> KeptTracks:
     """How the targets with more than so many reports kept their tracks."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
-        return Kept(0, np.nan, np.nan)
-    return Kept(len(shares), float((shares >= KEPT_SHARE).mean()), float(shares.mean()))
+        return KeptTracks(0, np.nan, np.nan)
+    return KeptTracks(len(shares), float((shares >= KEPT_SHARE).mean()), float(shares.mean()))
 
 
 def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[Integers, Integers]:

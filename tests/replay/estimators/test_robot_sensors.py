@@ -109,7 +109,7 @@ def test_a_heading_that_fixes_do_not_tell_is_said() -> None:
     """By what is assumed of the odometry; that is said with what it means."""
     told = sentences_of(outputs(ROBOT, "ekf", [log(odometry(), fix())])["started"].stream)
     assert any(each.startswith("heading_rad: unknown at the start") for each in told)
-    assert "(Noise of the forward speed, in m/s/sqrt(Hz): " in "".join(told)
+    assert "(noise of the forward speed, in m/s/sqrt(Hz): " in "".join(told)
     known = outputs(ROBOT, "ekf", [log(odometry(), seen())])["started"].stream
     assert not any("unknown" in each for each in sentences_of(known))
 

@@ -289,7 +289,7 @@ def test_tables_and_metrics_show_the_bound_beside_estimators() -> None:
     assert_allclose(metrics["bound.pressure_rmse_a"], np.sqrt(squares))
     along = [np.mean(each["covariance"][:, 0]) for each in alone(sources)]
     assert metrics["bound.pressure_rmse_a"] < np.sqrt(np.mean(along))  # Jensen's inequality
-    assert judge.losses == []
+    assert judge.notes_of_coverage == []
     [chart] = error_charts(judge).values()
     assert [len(panel.series) for panel in chart.panels] == [2, 1]
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from recorders.parameters import build
 from recorders.recording import Recording, record_run
 from replay.engine.replaying.estimator import bind
@@ -17,7 +17,7 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.inference import estimators
 from replay.inference.all_methods import METHODS
-from replay.inference.model.model import Model, Motion, Sensor
+from replay.inference.model.model import Control, Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.stage import Stage, stage_of
 from tests.replay.inference import vehicle_a
@@ -49,6 +49,8 @@ class Unstated(ModelParameters):
 def with_sensor(sensor: Sensor, **changes: Any) -> Model:
     return replace(VEHICLE_A, sensors=(replace(sensor, **changes),))
 
+
+HELD = Control("speed", schemas.VECTOR_MEASUREMENT, ("forward_mps",), read=SPEED.read)
 
 # What a model says, and words that the sentence must have.
 WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
@@ -95,6 +97,14 @@ WRONG: dict[str, tuple[Model, tuple[str, ...]]] = {
     "one component, two kinds": (
         replace(VEHICLE_A, sensors=(RANGE_BEARING, replace(SPEED, measured={"bearing_rad": "linear"}))),
         ("bearing_rad is linear here and angle elsewhere",),
+    ),
+    "a control of a sensor alone": (
+        with_sensor(SPEED, control=HELD),
+        ("sensor speed", "reads the control speed (forward_mps)", "model's is none"),
+    ),
+    "a sensor that reads a control that is held": (
+        replace(with_sensor(SPEED, control=HELD), control=HELD),
+        ("sensor speed", "held from message to message", "interpolated=True"),
     ),
     "what it reads": (
         with_sensor(SPEED, read=lambda stream: np.zeros((len(stream), 2))),

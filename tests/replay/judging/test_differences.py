@@ -4,22 +4,22 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.comparing.sides import Side, of_replay
-from replay.judging.errors.differences import aim_of, paired_difference
+from pipeline.comparing.candidates import Candidate, of_replay
+from replay.judging.errors.differences import paired_difference, target_of
 
 PAIRS, RUNS = 200, 50
 CALLED = ("better", "worse", "higher", "lower")
 
 
 @pytest.fixture(scope="module")
-def alike() -> Side:
+def alike() -> Candidate:
     """An EKF over 300 runs: any 50 of them are as good as any others."""
     logs = [fl.record("landmarks", seed=11, run=run, duration_s=5.0) for run in range(300)]
-    return of_replay("alike", fl.replay(logs, ["ekf"]), 0.2).side("ekf", "ekf")
+    return of_replay("alike", fl.replay(logs, ["ekf"]), 0.2).candidate("ekf", "ekf")
 
 
 @pytest.mark.paper
-def test_of_pairs_without_a_difference_five_in_a_hundred_are_called(alike: Side) -> None:
+def test_of_pairs_without_a_difference_five_in_a_hundred_are_called(alike: Candidate) -> None:
     """A against A with margin 0, 200 times: 2 to 9 % for each metric that varies."""
     table = alike.rows.pivot(index="run", columns="quantity", values="value")
     table = table.loc[:, table.nunique() > 10]
@@ -29,8 +29,8 @@ def test_of_pairs_without_a_difference_five_in_a_hundred_are_called(alike: Side)
     shares = {}
     for quantity in table:
         values = table[quantity].to_numpy()
-        aim = alike.sizes.get((str(quantity), "robot1"), aim_of(str(quantity)))
-        verdicts = [paired_difference(*values[split], aim, 0.0).verdict for split in splits]
+        target = alike.sizes.get((str(quantity), "robot1"), target_of(str(quantity)))
+        verdicts = [paired_difference(*values[split], target, 0.0).verdict for split in splits]
         shares[quantity] = np.mean(np.isin(verdicts, CALLED))
     assert all(0.02 <= share <= 0.09 for share in shares.values()), shares
 

@@ -27,7 +27,12 @@ from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.covariances import normalized_error_squared
 from replay.engine.vectors.tangent import truth_at
-from replay.judging.errors.evaluation import chi_square_interval, errors_of, innovations_of, unjudged
+from replay.judging.errors.evaluation import (
+    chi_square_interval,
+    components_without_truth,
+    errors_of,
+    innovations_of,
+)
 from replay.judging.errors.truths import Truths
 from replay.judging.judge import Judge
 from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY, INNOVATION, LIKELIHOOD
@@ -168,7 +173,7 @@ def test_without_truth_or_with_that_of_something_else_nothing_is_judged():
     assert errors_of(stream, [*map(Truths, [elsewhere])]) is None
     nothing = truth([1], [[0, 0, 0]], components="a,b,heading_deg")
     assert errors_of(stream, [*map(Truths, [source(nothing)])]) is None
-    assert unjudged(stream, [source(nothing)]) == ("x_m", "y_m", "heading_rad")
+    assert components_without_truth(stream, [source(nothing)]) == ("x_m", "y_m", "heading_rad")
     turned = truth([1], [[0, 0, 0]], kinds="linear,angle,angle")
     with pytest.raises(BadInput, match="component y_m is stated as angle; it must be linear"):
         errors_of(stream, [*map(Truths, [source(turned)])])
@@ -198,7 +203,11 @@ def test_a_component_without_truth_is_left_out_of_errors_and_nees():
     errors = errors_of(stream, [*map(Truths, [source(place)])])
     assert errors is not None
     assert errors.components == ("x_m", "y_m")
-    assert errors.unjudged == unjudged(stream, [source(place)]) == ("heading_rad",)
+    assert (
+        errors.components_without_truth
+        == components_without_truth(stream, [source(place)])
+        == ("heading_rad",)
+    )
     assert_array_equal(errors.error, [[1, 2]])
     assert_array_equal(errors.covariance, [covariance[:2, :2]])
     expected = np.array([1, 2]) @ np.linalg.inv(covariance[:2, :2]) @ [1, 2]
@@ -229,7 +238,7 @@ def test_an_orientation_is_judged_whole_or_not_at_all():
     )
     errors = errors_of(stream, [*map(Truths, [source(partial)])])
     assert errors is not None
-    assert errors.unjudged == ("q_w", "q_x", "q_y", "q_z")
+    assert errors.components_without_truth == ("q_w", "q_x", "q_y", "q_z")
     assert_array_equal(errors.covariance, [[[4]]])
     assert_array_equal(errors.nees, [1])
 

@@ -70,7 +70,11 @@ def assert_alike(one: Judge, other: Judge) -> None:
     for topic, steps in one.steps.items():
         pd.testing.assert_frame_equal(steps, other.steps[topic], rtol=1e-12)
     assert one.bounds == other.bounds
-    assert (one.failures, one.losses, one.unjudged) == (other.failures, other.losses, other.unjudged)
+    assert (one.failures, one.notes_of_coverage, one.components_without_truth) == (
+        other.failures,
+        other.notes_of_coverage,
+        other.components_without_truth,
+    )
 
 
 @pytest.mark.parametrize("at_s", [0.01, 1.0, 4.03, 7.99])

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from pipeline.runs.checkpoints import Kept, kept_cells
-from pipeline.runs.executors import Here, Team
+from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
+from pipeline.runs.executors import InlineExecutor, WorkerPool
 from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 from tests.pipeline.conftest import Said
@@ -40,7 +40,7 @@ def contents(place: Path) -> dict[str, bytes]:
 def left_unfinished(place: Path, seed: int = 3) -> Path:
     """The folder of a campaign that is stopped when all of its cells are done."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Kept, "hand_over", lambda *_: 1 / 0)
+        patch.setattr(Checkpoints, "hand_over", lambda *_: 1 / 0)
         with pytest.raises(BadInput, match="division by zero"):
             run(place, seed)
     return place.with_name(f"{place.name}.unfinished")
@@ -144,20 +144,20 @@ def test_a_cell_that_is_changed_while_others_are_worked_off_is_worked_off_again(
     place = prepared["place"]
     unfinished = place.with_name(f"{place.name}.unfinished")
     shutil.copytree(prepared["kept"], unfinished)
-    begin = Kept.read
+    begin = Checkpoints.read
     asked = []
 
-    def damaging(kept: Kept, key: str) -> Any:
+    def damaging(kept: Checkpoints, key: str) -> Any:
         if not asked:
             (kept.folder / f"{key}.bin").write_bytes(b"")
         asked.append(key)
         return begin(kept, key)
 
     try:
-        monkeypatch.setattr(Kept, "read", damaging)
+        monkeypatch.setattr(Checkpoints, "read", damaging)
         assert run(place) == contents(prepared["whole"])
         shutil.rmtree(place)
-        monkeypatch.setattr(Kept, "read", lambda *_: None)
+        monkeypatch.setattr(Checkpoints, "read", lambda *_: None)
         with pytest.raises(BadInput, match="what is kept there is changed by others, or by the disk"):
             run(place)
     finally:
@@ -198,21 +198,21 @@ def test_a_campaign_runs_wherever_its_folder_is_the_users_own(
 def test_what_another_user_wrote_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder that was ours when it was looked at may be another one when it is read."""
     key = "0" * 64
-    with kept_cells(tmp_path / "result") as kept:
-        kept.begin()
-        kept.write(key, b"left")
-        assert kept.has(key)
+    with checkpoints_of(tmp_path / "result") as checkpoints:
+        checkpoints.begin()
+        checkpoints.write(key, b"left")
+        assert checkpoints.has(key)
         user = os.getuid()
         with monkeypatch.context() as another:
             another.setattr(os, "getuid", lambda: user + 1)
-            assert not kept.has(key)
-        (kept.folder / f"{key}.bin").chmod(0o620)
-        assert not kept.has(key)
+            assert not checkpoints.has(key)
+        (checkpoints.folder / f"{key}.bin").chmod(0o620)
+        assert not checkpoints.has(key)
 
 
 def test_folders_made_for_a_campaign_that_fails_go_again(tmp_path: Path) -> None:
-    with suppress(InterruptedError), kept_cells(tmp_path / "new" / "result") as kept:
-        kept.begin()
+    with suppress(InterruptedError), checkpoints_of(tmp_path / "new" / "result") as checkpoints:
+        checkpoints.begin()
         raise InterruptedError
     assert not list(tmp_path.iterdir())
 
@@ -220,7 +220,7 @@ def test_folders_made_for_a_campaign_that_fails_go_again(tmp_path: Path) -> None
 def test_a_scheduler_that_ends_is_told(tmp_path: Path) -> None:
     """Its futures are cancelled, which is no error of the study that waits for them."""
 
-    class Ended(Here):
+    class Ended(InlineExecutor):
         def submit(self, *_: Any, **__: Any) -> Future[Any]:
             future: Future[Any] = Future()
             future.cancel()
@@ -231,5 +231,7 @@ def test_a_scheduler_that_ends_is_told(tmp_path: Path) -> None:
     with pytest.raises(
         BadInput, match=r"runs 0 to 127: the process .* died 3 times \(the scheduler has"
     ):
-        run_experiment(name, experiment, tmp_path / "result", crew=lambda: nullcontext(Team(Ended(), 1)))
+        run_experiment(
+            name, experiment, tmp_path / "result", open_pool=lambda: nullcontext(WorkerPool(Ended(), 1))
+        )
     assert not list(tmp_path.iterdir())

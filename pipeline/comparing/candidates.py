@@ -1,6 +1,6 @@
-"""The sides of a comparison: what an estimator gave of every run, wherever that comes from.
+"""The candidates of a comparison: what an estimator gave of every run, wherever that comes from.
 
-A side's estimates are in logs, as `fuselog replay` writes them, or are made by a replay from what a
+A candidate's estimates are in logs, as `fuselog replay` writes them, or are made by a replay from what a
 result says of itself. What comes of a trajectory file is an estimate stream like any other.
 """
 
@@ -16,7 +16,7 @@ import pandas as pd
 
 from pipeline.api.replays import Replay, replay
 from pipeline.comparing.renamed import Renamed
-from pipeline.output.coverage import recounted, rows_of_side, stored_rows
+from pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
 from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
 from pipeline.runs.ensemble import Progress, judge_logs, parts_of
 from pipeline.runs.estimates import log_of_estimates, stated_estimators
@@ -48,7 +48,7 @@ Pairs = Mapping[str, tuple[Source, Source]]
 
 
 @dataclass(frozen=True, eq=False)
-class Side:
+class Candidate:
     """What an estimator gave, judged run by run.
 
     Attributes:
@@ -80,7 +80,7 @@ class Side:
     coverage: Sequence[Row] = ()
 
     def estimates(self, run: str) -> Renamed:
-        """The estimates of a run that can be drawn, under this side's name."""
+        """The estimates of a run that can be drawn, under this candidate's name."""
         return Renamed(self.pairs[run][1], self.label, self.name)
 
 
@@ -91,19 +91,19 @@ class Given:
     Attributes:
         name: what to call it.
         labels: its estimators.
-        side: the side that one of them is, under a name.
+        candidate: the candidate that one of them is, under a name.
         sources: its runs, where they are logs.
     """
 
     name: str
     labels: Sequence[str]
-    side: Callable[[str, str], Side]
+    candidate: Callable[[str, str], Candidate]
     sources: Mapping[str, Source] = field(default_factory=dict)
 
 
 def measured(
     name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any]
-) -> Side:
+) -> Candidate:
     """Judge the estimates of a label, each run by itself: of every pair of a log and its estimates."""
     metrics = find_metrics()
     rows: list[tuple[object, ...]] = []
@@ -124,7 +124,7 @@ def measured(
         doubts = judge.doubts | doubts
         truths[run] = _hash_of_truth(source, own)
     values = pd.DataFrame(rows, columns=["run", "case", "quantity", "value"])
-    return Side(name, label, values, joined(times), sizes, settings, truths, pairs, doubts=doubts)
+    return Candidate(name, label, values, joined(times), sizes, settings, truths, pairs, doubts=doubts)
 
 
 def _hash_of_truth(source: Source, estimates: Source) -> str:
@@ -190,12 +190,12 @@ def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
     pairs = dict(zip(runs, zip(done.logs, done.estimates, strict=True), strict=True))
     stated = done.done.parameters
 
-    def side(label: str, name: str) -> Side:
+    def candidate(label: str, name: str) -> Candidate:
         settings = settings_of(done.logs[0], label, stated.get(label, {}))
         found = measured(name, label, pairs, gap_limit_s, settings)
-        return replace(found, replay=done, coverage=rows_of_side(done.done.coverage, label, name))
+        return replace(found, replay=done, coverage=rows_of_candidate(done.done.coverage, label, name))
 
-    return Given(name, list(done.settings), side, {run: log for run, (log, _) in pairs.items()})
+    return Given(name, list(done.settings), candidate, {run: log for run, (log, _) in pairs.items()})
 
 
 def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
@@ -225,15 +225,17 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
     log_of_first, first = next(iter(pairs.values()))
     stated = stated_estimators(first)
 
-    def side(label: str, name: str) -> Side:
+    def candidate(label: str, name: str) -> Candidate:
         own = {run: pair for run, pair in pairs.items() if label in labels_of(pair[1])}
         settings = settings_of(log_of_first, label, stated.get(label, {}))
         found = measured(name, label, own, gap_limit_s, settings)
         logs, estimates = zip(*own.values(), strict=True)
         counted = recounted(estimates, logs, {label: stated.get(label, {})}, found.doubts)
-        return replace(found, coverage=rows_of_side(counted, label, name))
+        return replace(found, coverage=rows_of_candidate(counted, label, name))
 
-    return Given(name_of(path), labels_of(first), side, {run: log for run, (log, _) in pairs.items()})
+    return Given(
+        name_of(path), labels_of(first), candidate, {run: log for run, (log, _) in pairs.items()}
+    )
 
 
 def labels_of(estimates: Source) -> list[str]:
@@ -261,9 +263,9 @@ def of_result(folder: Path, progress: Progress) -> Given:
     runs = {number: _run_of_result(result, number) for number in numbers}
     rows, times = (table.assign(run=table["run"].map(runs)) for table in (rows, times))
 
-    def side(label: str, name: str) -> Side:
+    def candidate(label: str, name: str) -> Candidate:
         kept = _stored(rows, times, label, name, _settings_of_result(result, label, stated))
-        kept = replace(kept, coverage=rows_of_side(stored_rows(folder), label, name))
+        kept = replace(kept, coverage=rows_of_candidate(stored_rows(folder), label, name))
         try:
             again = _replayed(folder, result, progress, kept)
         except BadInput as error:
@@ -273,7 +275,7 @@ def of_result(folder: Path, progress: Progress) -> Given:
         return replace(kept, notes=(_without_replay(folder, difference),)) if difference else again
 
     labels = list(dict.fromkeys(rows["estimator"]))
-    return Given(name_of(folder), labels, side)
+    return Given(name_of(folder), labels, candidate)
 
 
 def _run_of_result(result: Result, number: int) -> str:
@@ -298,8 +300,8 @@ def _settings_of_result(result: Result, label: str, stated: Mapping[str, Any]) -
 
 def _stored(
     rows: pd.DataFrame, times: pd.DataFrame, label: str, name: str, settings: Mapping[str, Any]
-) -> Side:
-    """The side of a result's own tables."""
+) -> Candidate:
+    """The candidate of a result's own tables."""
     own = rows[rows["estimator"] == label].drop(columns=["estimator", "estimates"])
     components = [column for column in map(str, own) if column.startswith("rmse_")]
     sizes = {
@@ -314,10 +316,10 @@ def _stored(
         .melt(["case", "run"], var_name="quantity")
         .dropna()
     )
-    return Side(name, label, values, times[times["estimator"] == label], sizes, settings)
+    return Candidate(name, label, values, times[times["estimator"] == label], sizes, settings)
 
 
-def _replayed(folder: Path, result: Result, progress: Progress, kept: Side) -> Side:
+def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate) -> Candidate:
     """What was kept of a result made again, a part of the runs at a time."""
     label = kept.label
     if label not in result.settings.get("estimators", {}) or "study" not in result.settings:
@@ -333,7 +335,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Side) -> S
     if experiment.import_ and setting.data is None:
         raise BadInput("its settings do not say where its data are")
     runner = Runner(experiment, setting)
-    parts: list[Side] = []
+    parts: list[Candidate] = []
     chosen = {label: experiment.estimators[label]}
     for now in progress(list(parts_of(experiment.runs)), f"replaying {label} of {folder}", None):
         done = replay(
@@ -356,7 +358,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Side) -> S
     )
 
 
-def _row_that_differs(kept: Side, again: Side) -> str:
+def _row_that_differs(kept: Candidate, again: Candidate) -> str:
     """A sentence where a replay does not give what a result has."""
     both = kept.rows.merge(again.rows, on=["run", "case", "quantity"], suffixes=("", "_again"))
     apart = ~np.isclose(both["value"], both["value_again"], rtol=SAME, atol=0.0)
@@ -382,8 +384,8 @@ def of_trajectory(path: Path, source: Source, truth_topic: str, gap_limit_s: flo
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     pairs: Pairs = {key_of(source): (source, MemorySource({topic: stream}, run, str(path)))}
 
-    def side(label: str, name: str) -> Side:
+    def candidate(label: str, name: str) -> Candidate:
         found = measured(name, label, pairs, gap_limit_s, {})
         return replace(found, notes=trajectory.notes)
 
-    return Given(name, [name], side)
+    return Given(name, [name], candidate)

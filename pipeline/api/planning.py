@@ -1,0 +1,186 @@
+"""What is to be replayed: logs, estimators, spans, starts, order. Python and the commands plan alike.
+
+Nothing that takes long to import is needed for it: `fuselog replay` begins at once.
+"""
+
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.runs.ensemble import Pass, Progress, Settings, cut_in_parts, no_progress, replay_parts
+from pipeline.runs.initial_states import Origin, order_of, origins_of, span_of
+from recorders.errors import BadInput
+from recorders.log import Clock, Companions, RunMetadata, open_log
+from recorders.recording import Recording
+from replay.engine.replaying.estimator import Estimator
+from replay.engine.replaying.late import Late
+from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.inference.model.model import Model
+from replay.judging.metrics.measuring import find_metrics
+
+Log = str | Path | LogSource | MemorySource | Recording
+Kind = str | Estimator[Any] | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A replay that can begin.
+
+    Attributes:
+        sources: the spans of the runs.
+        estimators: settings by label.
+        origins: what each run starts from, or none; see `origins_of`.
+        order: the clock that orders the messages.
+        late: what is done about messages that come late.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        metrics: their names; none stands for all.
+    """
+
+    sources: Sequence[LogSource | MemorySource]
+    estimators: Settings
+    origins: Sequence[Origin]
+    order: Clock
+    late: Late | None
+    gap_limit_s: float
+    metrics: Sequence[str]
+
+    def replay(
+        self,
+        estimates: Sequence[tuple[Path, Path]],
+        *,
+        save: Path | None = None,
+        connect: str | None = None,
+        companions: Companions | None = None,
+        progress: Progress = no_progress,
+    ) -> Pass:
+        """Replay into estimates logs, judged where there is truth.
+
+        Args:
+            estimates: for each run where its estimates go, and the log that they are of.
+            save: the file that the first run's timeline goes to.
+            connect: the Rerun viewer that it is streamed to.
+            companions: makes what is written beside the estimates for viewers.
+            progress: is told of every block.
+
+        Raises BadInput where no run can be replayed by one of the estimators.
+        """
+        return replay_parts(
+            cut_in_parts(self.sources, estimates, self.origins),
+            self.estimators,
+            gap_limit_s=self.gap_limit_s,
+            metrics=self.metrics,
+            order=self.order,
+            late=self.late,
+            save=save,
+            connect=connect,
+            companions=companions,
+            progress=progress,
+        ).check()
+
+
+def plan_replay(
+    logs: Log | Iterable[Log],
+    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+    *,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    start_from: str | Path | Sequence[str | Path] = (),
+    start_sigma: Mapping[str, float] | None = None,
+    gap_limit_s: float = 0.2,
+    arrival_order: bool = False,
+    late: str | None = None,
+    metrics: str | Sequence[str] = (),
+) -> Plan:
+    """Check what a replay is asked for, and open its logs; see `pipeline.api.replays.replay`.
+
+    Raises BadInput where a setting makes no sense, a log cannot be read or has nothing in the span.
+    """
+    for name, value in (("start_s", start_s), ("end_s", end_s), ("gap_limit_s", gap_limit_s)):
+        if value is not None and not (abs(value) <= 1e9 and (value >= 0 or name != "gap_limit_s")):
+            raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
+    from_ = [start_from] if isinstance(start_from, str | Path) else start_from
+    order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
+    settings = settings_of(estimators)
+    wanted = [metrics] if isinstance(metrics, str) else list(metrics)
+    find_metrics(wanted)
+    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
+    origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
+    return Plan(sources, settings, origins, order, policy, gap_limit_s, wanted)
+
+
+def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
+    """Open a log: a mapping of its topics to their streams, each read when it is asked for.
+
+    Args:
+        path: an MCAP file.
+        recover: read what is whole of a log that was cut off or damaged; a warning says what is missing.
+
+    Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
+
+    >>> from pipeline.api.api import record, write
+    >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
+    >>> log = open("run.mcap")
+    >>> log.run.scenario, len(log)
+    ('landmarks', 5)
+    >>> log["/robot1/odometry"]["forward_mps"].shape
+    (40,)
+    """
+    log = open_log(path, recover=recover)
+    if log.loss_statement:
+        warnings.warn(log.loss_statement, stacklevel=2)
+    return LogSource(log)
+
+
+def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
+    """One log or several as sources; raises BadInput where there is none, or one is no log."""
+    found = [logs] if isinstance(logs, Log) else list(logs)
+    if not found:
+        raise BadInput("there are no logs to replay; give at least one")
+    return [_source(log) for log in found]
+
+
+def _source(log: Log) -> LogSource | MemorySource:
+    if isinstance(log, LogSource | MemorySource):
+        return log
+    if isinstance(log, Recording):
+        return memory_source(log, RunMetadata("recording", epoch_ns=log.epoch_ns, notes=dict(log.notes)))
+    if isinstance(log, str | Path):
+        return open(log)
+    raise BadInput(f"a log to replay is {type(log).__name__}; give a path, a log or a recording")
+
+
+def settings_of(
+    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+) -> dict[str, dict[str, Any]]:
+    """The settings of each estimator by its label; raises BadInput where they are none."""
+    listed = [estimators] if isinstance(estimators, str | Mapping) else list(estimators)
+    chosen: dict[str, dict[str, Any]] = {}
+    for each in listed:
+        if not isinstance(each, str | Mapping):
+            raise BadInput(
+                f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
+            )
+        if isinstance(each, Mapping) and "kind" in each:
+            raise BadInput(
+                f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
+                '{"mine": {...}}'
+            )
+        for label, what in ({each: {}} if isinstance(each, str) else each).items():
+            if label in chosen:
+                raise BadInput(f"estimator {label} is given twice; give the second another label")
+            chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}
+            kind = chosen[label].get("kind", "")
+            if isinstance(kind, Model):
+                raise BadInput(
+                    f'estimator {label} is a model without a method; give modelled(model, "ekf")'
+                )
+            if not isinstance(kind, str | Estimator):
+                raise BadInput(
+                    f"estimator {label} is {type(kind).__name__}; make an estimator of it with "
+                    "recursive, batch or modelled"
+                )
+    if not chosen:
+        raise BadInput("there are no estimators to replay; give at least one")
+    return chosen

@@ -1,0 +1,255 @@
+"""Expressions over the metrics of a result: what claims are decided by, and numbers in their sentences.
+
+    nees[ekf, robot1]          the metric `ekf.nees.robot1`
+    nees[ekf]                  the metric `ekf.nees`
+    nees[ekf | ukf, *]         a list: of both estimators in all cases, in this order
+    gain[ekf, wind][0]         an entry of a list
+    rmse_m[ekf] < 2 * limit    a comparison: true, false, or open where an interval holds both
+
+What `*` and `|` stand for gives numbers their names. The functions are `numbers.FUNCTIONS`.
+"""
+
+import ast
+import re
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
+from functools import cache
+from string import Formatter
+from typing import Any, NamedTuple
+
+from pipeline.output.numbers import (
+    COMPARISONS,
+    FUNCTIONS,
+    OPERATIONS,
+    Number,
+    Truth,
+    Value,
+    all_hold,
+    any_holds,
+    by_entry,
+    combined,
+    exactly,
+    negated,
+    negative,
+)
+from recorders.errors import BadInput, choices
+
+
+class NoMetric(Exception):
+    """A metric that an expression names is not in the result."""
+
+
+class Values(NamedTuple):
+    """What an expression may name.
+
+    Attributes:
+        metrics: by their keys, `estimator.quantity[.case]`.
+        intervals: where metrics lie with 95 %, of those that have such an interval.
+        names: of other numbers.
+    """
+
+    metrics: Mapping[str, Any]
+    intervals: Mapping[str, Sequence[float | None]]
+    names: Mapping[str, Value]
+
+
+def evaluate(expression: str, values: Values) -> Value:
+    """The value of an expression.
+
+    Raises BadInput where it is none, and `NoMetric` where the result lacks one of its metrics.
+    """
+    try:
+        return _value(parse(expression), values)
+    except (TypeError, AttributeError, ValueError, OverflowError):
+        raise BadInput(
+            f"'{expression}' has a number, a list or a comparison where another of these belongs"
+        ) from None
+
+
+def truth(expression: str, values: Values) -> Truth:
+    """Whether an expression holds, a list in all entries; raises as `evaluate` does."""
+    found = evaluate(expression, values)
+    if isinstance(found, Number):
+        raise BadInput(f"'{expression}' is a number, no comparison; compare it with a limit")
+    return all_hold(found if isinstance(found, list) else [found])
+
+
+def formatted(template: str, values: Values) -> str:
+    """A sentence with the values of the expressions in it: `{EXPRESSION:FORMAT}`, lists with commas.
+
+    A number that has an interval stands before it; `{EXPRESSION!n:FORMAT}` says the names of numbers
+    too. Raises as `evaluate` does.
+    """
+    said = []
+    for text, expression, form, conversion in Formatter().parse(template):
+        said.append(text)
+        if expression is not None:
+            found = evaluate(expression, values)
+            try:
+                said.append(_said(found, form or ".3g", named=conversion == "n"))
+            except ValueError:
+                raise BadInput(f"'{form}' is no format of numbers; write as {{value:.2f}}") from None
+    return "".join(said)
+
+
+def expressions_in(template: str) -> list[str]:
+    """The expressions of a template; raises BadInput where its braces do not match."""
+    try:
+        return [each for _, each, _, _ in Formatter().parse(template) if each is not None]
+    except ValueError as error:
+        raise BadInput(f"'{template}': {error}; write braces as {{{{ and }}}}") from None
+
+
+def _said(value: Value, form: str, *, named: bool) -> str:
+    if isinstance(value, list):
+        return ", ".join(_said(each, form, named=named) for each in value)
+    if not isinstance(value, Number):
+        return value if isinstance(value, str) else {True: "yes", False: "no", None: "open"}[value]
+    text = format(value.value, form)
+    if value.low != value.high and value.is_known:
+        text += f" ({format(value.low, form)} to {format(value.high, form)})"
+    return f"{value.name} {text}" if named else text
+
+
+@cache
+def parse(expression: str) -> ast.expr:
+    """The tree of an expression; raises BadInput where it has more in it than expressions may."""
+    quoted = re.sub(r"(\w)\[(?!-?\d+\])([^\[\]]*)\]", lambda each: f"{each[1]}[{each[2]!r}]", expression)
+    try:
+        tree = ast.parse(quoted.strip(), mode="eval").body
+    except (SyntaxError, ValueError):
+        raise BadInput(f"'{expression}' cannot be read; write as nees[ekf, body] < 2") from None
+    for node in ast.walk(tree):
+        if type(node) not in _KNOWN:
+            raise BadInput(
+                f"'{expression}': has more than numbers, names, metrics, + - * / **, comparisons, and, "
+                "or, not and functions; leave it out"
+            )
+        if isinstance(node, ast.Call):
+            called = getattr(node.func, "id", "")
+            if called not in FUNCTIONS or node.keywords:
+                raise BadInput(f"'{expression}': no function '{called}'; {choices(called, FUNCTIONS)}")
+    return tree
+
+
+def names_in(expression: str) -> set[str]:
+    """The names of numbers in an expression; raises BadInput where it is none."""
+    tree = parse(expression)
+    nodes = list(ast.walk(tree))
+    called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
+    of_metrics = {
+        id(node.value)
+        for node in nodes
+        if isinstance(node, ast.Subscript)
+        and isinstance(node.slice, ast.Constant)
+        and isinstance(node.slice.value, str)
+    }
+    named = [node for node in nodes if isinstance(node, ast.Name)]
+    return {node.id for node in named if id(node) not in called | of_metrics}
+
+
+def _value(node: ast.expr, values: Values) -> Value:
+    match node:
+        case ast.Constant(value=bool()):
+            raise BadInput("true and false are no numbers; compare numbers")
+        case ast.Constant(value=int() | float() as number):
+            return exactly(number)
+        case ast.Name(id=name):
+            if name not in values.names:
+                raise BadInput(f"no name '{name}'; {choices(name, values.names)}")
+            return values.names[name]
+        case ast.Subscript(value=ast.Name(id=quantity), slice=ast.Constant(value=str() as of)):
+            return metric(quantity, of, values)
+        case ast.Subscript(value=of_list, slice=index):
+            entries, place = _value(of_list, values), _value(index, values)
+            if not isinstance(entries, list) or not isinstance(place, Number):
+                raise BadInput(f"'{ast.unparse(node)}': only a list has entries")
+            if not -len(entries) <= place.value < len(entries):
+                raise NoMetric(ast.unparse(node))
+            return entries[int(place.value)]
+        case ast.List(elts=entries):
+            return [_value(each, values) for each in entries]
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            return by_entry(negative, _value(operand, values))
+        case ast.UnaryOp(op=ast.Not(), operand=operand):
+            return by_entry(negated, _value(operand, values))
+        case ast.BinOp(left=left, op=op, right=right):
+            combine = combined(OPERATIONS[type(op)])
+            return by_entry(combine, _value(left, values), _value(right, values))
+        case ast.BoolOp(op=op, values=parts):
+            together = all_hold if isinstance(op, ast.And) else any_holds
+            return by_entry(lambda *each: together(each), *(_value(part, values) for part in parts))
+        case ast.Compare(left=left, ops=ops, comparators=others):
+            sides = [_value(each, values) for each in (left, *others)]
+            pairs = zip(ops, sides, sides[1:], strict=False)
+            found = [by_entry(COMPARISONS[type(op)], one, other) for op, one, other in pairs]
+            return found[0] if len(found) == 1 else by_entry(lambda *each: all_hold(list(each)), *found)
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return FUNCTIONS[name](*(_value(each, values) for each in arguments))
+    raise BadInput(f"'{ast.unparse(node)}' is no expression of metrics")
+
+
+def metric(quantity: str, of: str, values: Values) -> Value:
+    """The metric of `estimator, case`, or a list where these have `*` or `|`.
+
+    Raises `NoMetric` where there is none.
+    """
+    keys = keys_of(quantity, of, values.metrics)
+    if not keys:
+        raise NoMetric(f"{quantity}[{of}]")
+    found = [_of_key(key, name, values) for key, name in keys.items()]
+    return found if _is_many(of) else found[0]
+
+
+def keys_of(quantity: str, of: str, metrics: Mapping[str, Any]) -> dict[str, str]:
+    """The keys of the metrics of `estimator, case`, and what `*` and `|` stand for in each.
+
+    Raises `NoMetric` where there is not what is named without a `*`.
+    """
+    estimator, _, case = (part.strip() for part in of.partition(","))
+    found = {}
+    for label in estimator.split("|"):
+        for one in case.split("|"):
+            pattern = ".".join(filter(None, (label.strip(), quantity, one.strip())))
+            if "*" not in pattern and pattern not in metrics:
+                raise NoMetric(f"{quantity}[{', '.join(filter(None, (label.strip(), one.strip())))}]")
+            matches = (
+                [key for key in metrics if fnmatchcase(key, pattern)] if "*" in pattern else [pattern]
+            )
+            for key in matches:
+                found[key] = _name(key, quantity, label.strip(), one.strip(), estimator, case)
+    return found
+
+
+def _name(key: str, quantity: str, label: str, one: str, estimator: str, case: str) -> str:
+    own, _, rest = key.partition(f".{quantity}")
+    parts = [(own, label, estimator), (rest.removeprefix("."), one, case)]
+    return " ".join(
+        part[len(some.partition("*")[0]) : len(part) - len(some.rpartition("*")[2]) or None]
+        if "*" in some
+        else part
+        for part, some, all_ in parts
+        if _is_many(all_)
+    )
+
+
+def _is_many(of: str) -> bool:
+    return "*" in of or "|" in of
+
+
+def _of_key(key: str, name: str, values: Values) -> Value:
+    value = values.metrics[key]
+    if isinstance(value, list):
+        return [exactly(each, name) for each in value]
+    if key in values.intervals:
+        low, high = (exactly(end).value for end in values.intervals[key])
+        return Number(exactly(value).value, low, high, name)
+    return exactly(value, name)
+
+
+_KNOWN: set[type[ast.AST]] = {
+    *(ast.Constant, ast.Name, ast.Load, ast.Subscript, ast.List, ast.UnaryOp, ast.USub, ast.Not),
+    *(ast.BinOp, ast.BoolOp, ast.And, ast.Or, ast.Compare, ast.Call),
+    *OPERATIONS,
+    *COMPARISONS,
+}

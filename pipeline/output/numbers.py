@@ -1,0 +1,261 @@
+"""Numbers with their 95 % intervals, and what expressions do with them.
+
+What an interval leaves open is neither true nor false. Operations and comparisons on lists are entry by
+entry.
+"""
+
+import ast
+import math
+import operator
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+from recorders.errors import BadInput
+
+
+class Number(NamedTuple):
+    """A number and where it lies with 95 %; the ends are the number itself where it has no interval."""
+
+    value: float
+    low: float
+    high: float
+    name: str = ""
+    """What `*` and `|` stood for in it."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether neither it nor an end is NaN."""
+        return not any(map(math.isnan, self[:3]))
+
+
+# True, false, None where an interval leaves it open, or "missing" where a number is NaN.
+Truth = bool | Literal["missing"] | None
+Value = Number | Truth | list[Any]
+
+
+def exactly(value: float | None, name: str = "") -> Number:
+    """A number without an interval; NaN for None."""
+    value = math.nan if value is None else float(value)
+    return Number(value, value, value, name)
+
+
+def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
+    """The function of numbers, or of the entries of lists, which are of one length."""
+    lengths = {len(each) for each in arguments if isinstance(each, list)}
+    if not lengths:
+        return function(*arguments)
+    if len(lengths) > 1:
+        raise BadInput(f"lists of {' and '.join(map(str, sorted(lengths)))} entries do not go together")
+    [length] = lengths
+    columns = (each if isinstance(each, list) else [each] * length for each in arguments)
+    return [by_entry(function, *each) for each in zip(*columns, strict=True)]
+
+
+def combined(operation: Callable[[float, float], float]) -> Callable[[Number, Number], Number]:
+    """An operation on numbers with intervals: its ends are among those of its arguments' ends."""
+
+    def of(one: float, other: float) -> float:
+        try:
+            return operation(one, other)
+        except ZeroDivisionError:
+            return math.copysign(math.inf, one) if one else math.nan
+
+    def combine(one: Number, other: Number) -> Number:
+        ends = [of(first, second) for first in one[1:3] for second in other[1:3]]
+        name = one.name or other.name
+        if any(map(math.isnan, ends)):
+            return Number(of(one.value, other.value), math.nan, math.nan, name)
+        return Number(of(one.value, other.value), min(ends), max(ends), name)
+
+    return combine
+
+
+def _of_known(compare: Callable[[Number, Number], Truth]) -> Callable[[Number, Number], Truth]:
+    """A comparison that is missing where one of its numbers is."""
+
+    def found(one: Number, other: Number) -> Truth:
+        if not (isinstance(one, Number) and isinstance(other, Number)):
+            raise BadInput("a comparison is of numbers; join comparisons by and, or")
+        return compare(one, other) if one.is_known and other.is_known else "missing"
+
+    return found
+
+
+def _ordered(holds: Callable[[float, float], bool]) -> Callable[[Number, Number], Truth]:
+    """Whether a number is on one side of another, with all of both intervals."""
+
+    def compare(one: Number, other: Number) -> Truth:
+        if one.low == one.high and other.low == other.high:
+            return holds(one.value, other.value)
+        rising = holds(0.0, 1.0)
+        near, far = (one.high, other.low) if rising else (one.low, other.high)
+        if holds(near, far):
+            return True
+        near, far = (one.low, other.high) if rising else (one.high, other.low)
+        return None if holds(near, far) else False
+
+    return _of_known(compare)
+
+
+def _within(one: Number, other: Number) -> Truth:
+    """Whether a number, with all of its interval, lies within another's interval."""
+    if other.low <= one.low and one.high <= other.high:
+        return True
+    return False if one.high < other.low or one.low > other.high else None
+
+
+def _equal(one: Number, other: Number) -> Truth:
+    if one.low == one.high and other.low == other.high:
+        return one.value == other.value
+    return False if one.high < other.low or one.low > other.high else None
+
+
+def negated(of: Truth) -> Truth:
+    """What is open or missing stays so."""
+    return not of if isinstance(of, bool) else of
+
+
+def all_hold(truths: Sequence[Any]) -> Truth:
+    """Whether all of truths, and of lists of them, are true; open where one is, and none is false.
+
+    Where one is missing, so is this.
+    """
+    flat = _flat(truths)
+    if "missing" in flat:
+        return "missing"
+    return False if False in flat else None if None in flat else True
+
+
+def any_holds(truths: Sequence[Any]) -> Truth:
+    """Whether one of truths, and of lists of them, is true; open or missing as in `all_hold`."""
+    return negated(all_hold([negated(each) for each in _flat(truths)]))
+
+
+def _flat(values: Sequence[Any]) -> list[Any]:
+    return [one for each in values for one in (_flat(each) if isinstance(each, list) else [each])]
+
+
+def _of_all(function: Callable[[Sequence[float]], float]) -> Callable[..., Number]:
+    """A function of some numbers or lists of them, such as the least one, end by end."""
+
+    def found(*arguments: Value) -> Number:
+        numbers = _flat(arguments)
+        if not numbers or not all(each.is_known for each in numbers):
+            return exactly(None)
+        value, low, high = (function([each[place] for each in numbers]) for place in range(3))
+        return Number(value, low, high, next((each.name for each in numbers if each.value == value), ""))
+
+    return found
+
+
+def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
+    """A function that rises, of a number or the entries of a list."""
+
+    def of(number: float) -> float:
+        try:
+            return function(number)
+        except (ValueError, OverflowError):
+            return math.nan
+
+    return lambda values: by_entry(
+        lambda each: Number(of(each.value), of(each.low), of(each.high), each.name), values
+    )
+
+
+def negative(number: Number) -> Number:
+    """The number with its sign changed."""
+    return Number(-number.value, -number.high, -number.low, number.name)
+
+
+def _absolute(number: Number) -> Number:
+    ends = abs(number.low), abs(number.high)
+    least = 0.0 if number.low <= 0.0 <= number.high else min(ends)
+    return Number(abs(number.value), least, max(ends), number.name)
+
+
+def _mean(numbers: Sequence[float]) -> float:
+    return sum(numbers) / len(numbers)
+
+
+def _median(numbers: Sequence[float]) -> float:
+    ordered = sorted(numbers)
+    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+
+
+def _deviation(numbers: Sequence[float]) -> float:
+    """The standard deviation of a sample."""
+    mean = _mean(numbers)
+    squares = sum((each - mean) ** 2 for each in numbers)
+    return math.sqrt(squares / (len(numbers) - 1)) if len(numbers) > 1 else math.nan
+
+
+def _plus_minus(number: Number, spread: Number) -> Number:
+    """A number that is no surer than a spread."""
+    return Number(number.value, number.value - spread.value, number.value + spread.value, number.name)
+
+
+def _chi_square(share: Number, size: Number) -> Number:
+    """Below which a share of chi-square numbers of so many degrees lies; NaN without any degree."""
+    from replay.distributions import chi2
+
+    return exactly(float(chi2.ppf(share.value, size.value)) if size.value > 0.0 else None)
+
+
+def _count(values: list[Any]) -> Number:
+    """How many comparisons are true."""
+    return exactly(sum(each is True for each in _flat(values)))
+
+
+def _falls(values: list[Number]) -> Truth:
+    """Whether each entry is below the one before it."""
+    return all_hold([COMPARISONS[ast.Lt](later, one) for one, later in pairwise(values)])
+
+
+def _consistent(size: Number, count: Number) -> Number:
+    """The interval of a mean NEES of so many components, over so many independent estimates."""
+    from replay.judging.errors.evaluation import chi_square_interval
+
+    low, high = chi_square_interval(int(size.value), int(count.value))
+    return Number(size.value, float(low), float(high))
+
+
+OPERATIONS: dict[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
+COMPARISONS: dict[type[ast.cmpop], Callable[[Number, Number], Truth]] = {
+    ast.Lt: _ordered(operator.lt),
+    ast.LtE: _ordered(operator.le),
+    ast.Gt: _ordered(operator.gt),
+    ast.GtE: _ordered(operator.ge),
+    ast.Eq: _of_known(_equal),
+    ast.In: _of_known(_within),
+}
+FUNCTIONS: dict[str, Callable[..., Value]] = {
+    "abs": lambda values: by_entry(_absolute, values),
+    "all": lambda values: all_hold([values]),
+    "any": lambda values: any_holds([values]),
+    "chi_square": _chi_square,
+    "consistent": _consistent,
+    "count": _count,
+    "deviation": _of_all(_deviation),
+    "degrees": _rising(math.degrees),
+    "exp": _rising(math.exp),
+    "falls": _falls,
+    "high": lambda values: by_entry(lambda each: exactly(each.high, each.name), values),
+    "len": lambda values: exactly(len(values)),
+    "log": _rising(math.log),
+    "low": lambda values: by_entry(lambda each: exactly(each.low, each.name), values),
+    "max": _of_all(max),
+    "mean": _of_all(_mean),
+    "median": _of_all(_median),
+    "min": _of_all(min),
+    "plus_minus": _plus_minus,
+    "sqrt": _rising(math.sqrt),
+    "sum": _of_all(sum),
+    "value": lambda values: by_entry(lambda each: exactly(each.value, each.name), values),
+}

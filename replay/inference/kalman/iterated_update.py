@@ -1,0 +1,115 @@
+"""Updates a Gaussian by a sensor that is linearised again at every iterate, until it settles."""
+
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.engine.streams.results import ALL_WELL
+from replay.inference.kalman.steps import (
+    NOT_POSITIVE_DEFINITE,
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Workspace,
+)
+from replay.inference.kalman.update import (
+    linear_innovation,
+    reading,
+    sensor_derivative,
+    write_numbers,
+    writing_innovation,
+)
+from replay.inference.linear_algebra.gaussian import (
+    downdate,
+    drop_missing,
+    inflate,
+    inflation,
+    kalman_step,
+    whiten,
+)
+from replay.inference.linear_algebra.tuples import tuple_of
+from replay.inference.model.corrections import correcting, relinearising, sloping
+from replay.inference.model.stage import Stage
+
+ITERATIONS = 50
+SETTLED = 1e-12  # the largest component of the last step
+
+
+def iterated_update(stage: Stage, number: int) -> Function:
+    """Make the update that linearises at every iterate until it settles: Gauss-Newton on the posterior.
+
+    Bell and Cathey, IEEE TAC 38(2), 1993; on manifolds H at x (+) d times the right Jacobian at d. The
+    gate is tested at the prediction, and so is how much the measurement counts; innovation and
+    likelihood are those of the last iterate.
+
+    Args:
+        stage: the model with the sensors at hand.
+        number: the sensor's, among these.
+    """
+    model, sensor = stage.model, stage.sensors[number]
+    n, t, m = model.size, model.tangent, len(sensor.measured)
+    read_state, read_reference = tuple_of(n), reading(sensor).reference
+    linearise, compare = sensor_derivative(model, sensor), linear_innovation(sensor, number)
+    write_innovation, correct = writing_innovation(stage, number), correcting(model.kinds, model.correct)
+    find_slope = sloping(model.kinds, model.correct)
+    step_to, chain = relinearising(model)
+
+    def relinearise(
+        mean: Floats, covariance: Floats, data: Floats, parameters: Any, work: Workspace
+    ) -> None:
+        """Form the innovation by the Jacobian at mean (+) step, as one about the mean."""
+        innovation, step, rows = work.innovations[number], work.step, work.rows
+        step_to(mean, work)
+        linearise(read_state(work.state), read_reference(data), parameters, work)
+        chain(rows[:m], work)
+        compare(covariance, data, parameters, work)
+        for i in range(m):
+            for k in range(t):
+                innovation.difference[i] += rows[i, k] * step[k]
+
+    def update(
+        mean: Floats,
+        covariance: Floats,
+        data: Floats,
+        parameters: Any,
+        gate: Floats,
+        sample_index: int,
+        work: Workspace,
+        record: InnovationRecord,
+    ) -> int:
+        present = 0
+        for i in range(m):
+            present += not np.isnan(data[i])
+        if present == 0:
+            return NOTHING_MEASURED
+        innovation, step, factor = work.innovations[number], work.step, 1.0
+        find_slope(mean, covariance, work.slope)
+        for row in range(t):
+            step[row] = 0.0
+        for iteration in range(ITERATIONS):
+            relinearise(mean, covariance, data, parameters, work)
+            write_innovation(innovation, record)
+            size = drop_missing(innovation)
+            squared, determinant = whiten(innovation, size)
+            if np.isnan(squared):
+                return NOT_POSITIVE_DEFINITE
+            if iteration == 0:
+                factor = inflation(squared, size, parameters)
+            if size == 0 or (iteration == 0 and not squared <= gate[size]):
+                write_numbers(record, squared, determinant, size, False, 1.0)
+                return ALL_WELL
+            inflate(innovation, size, factor)
+            for row in range(t):
+                work.turned[row] = step[row]
+            kalman_step(innovation, size, step)
+            change = 0.0
+            for row in range(t):
+                change = max(change, abs(step[row] - work.turned[row]))
+            if change < SETTLED:
+                break
+        downdate(covariance, innovation.cross_covariance, size)
+        correct(mean, covariance, work)
+        write_numbers(record, squared, determinant, size, True, factor)
+        return ALL_WELL
+
+    return update

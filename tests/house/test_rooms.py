@@ -1,0 +1,102 @@
+"""How large rooms, files and lists of parameters may become, and what every package opens with.
+
+What is larger stands here by name, and has to be: the lists can only shrink.
+"""
+
+import ast
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+FILES = {
+    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
+    for room in ("fuselog", "pipeline", "recorders", "replay")
+    for path in sorted((ROOT / room).rglob("*.py"))
+}
+MODULES, LEAVES, LINES, PARAMETERS = 12, 20, 400, 8
+
+# Rooms of leaves, which one enters by a family's name.
+OF_LEAVES = {"recorders/models", "recorders/simulators", "replay/timeline/families"}
+
+# Files of more lines; the schemas are data.
+LARGER = {
+    "pipeline/diagnosing/hypotheses.py",
+    "recorders/log/schemas.py",
+}
+
+# Functions of more parameters: what the door offers by keyword, commands and what they call, and others.
+WIDER = {
+    "pipeline/api/api.py": {"run", "sweep"},
+    "pipeline/api/replays.py": {"replay"},
+    "pipeline/api/trajectories.py": {"evaluate"},
+    "pipeline/checking/command.py": {"check_path"},
+    "pipeline/command_line/commands.py": {
+        "evaluate_logs",
+        "evaluate_trajectory",
+        "replay_logs",
+        "view_path",
+    },
+    "pipeline/command_line/experiment_commands.py": {"run_named", "sweep_named"},
+    "pipeline/comparing/command.py": {"compare_sides"},
+    "pipeline/diagnosing/command.py": {"diagnose_log"},
+    "pipeline/runs/ensemble.py": {"replay_parts"},
+    "pipeline/tuning/command.py": {"tune_logs"},
+    "pipeline/tuning/tuning.py": {"tune"},
+    "recorders/arrivals.py": {"difference_stream"},
+    "replay/engine/api/functions.py": {"batch", "recursive"},
+    "replay/engine/streams/results.py": {"innovation_stream"},
+}
+
+
+def parameters_of(function: ast.FunctionDef) -> int:
+    """How many parameters a function has, beside `self`."""
+    given = function.args
+    named = [each.arg for each in [*given.posonlyargs, *given.args, *given.kwonlyargs]]
+    return len([each for each in named if each not in ("self", "cls")])
+
+
+def functions_of(tree: ast.Module) -> list[ast.FunctionDef]:
+    """Functions and methods; kernels are made inside functions, and commands get their options."""
+    classes = [each for each in tree.body if isinstance(each, ast.ClassDef)]
+    bodies = [tree.body, *(each.body for each in classes)]
+    return [each for body in bodies for each in body if isinstance(each, ast.FunctionDef)]
+
+
+def is_command(function: ast.FunctionDef) -> bool:
+    return any(ast.unparse(each).startswith("command(") for each in function.decorator_list)
+
+
+def is_kernel(name: str, function: ast.FunctionDef) -> bool:
+    """Whether its file compiles it, or one that imports from it."""
+    imported = f"from {name.removesuffix('.py').replace('/', '.')} import"
+    return any(
+        f"compile_over_runs({function.name}" in text and (imported in text or other == name)
+        for other, text in FILES.items()
+    )
+
+
+def test_rooms_hold_a_dozen_modules() -> None:
+    count = Counter(str(Path(name).parent) for name in FILES if not name.endswith("__init__.py"))
+    for room, modules in count.items():
+        assert modules <= (LEAVES if room in OF_LEAVES else MODULES), f"{room}: {modules} modules"
+    assert {room for room in count if count[room] > MODULES} == OF_LEAVES
+
+
+def test_files_fit_in_a_head() -> None:
+    assert {name for name, text in FILES.items() if len(text.splitlines()) > LINES} == LARGER
+
+
+def test_functions_have_few_parameters() -> None:
+    wide: dict[str, set[str]] = {}
+    for name, text in FILES.items():
+        for each in functions_of(ast.parse(text)):
+            if parameters_of(each) > PARAMETERS and not is_command(each) and not is_kernel(name, each):
+                wide.setdefault(name, set()).add(each.name)
+    assert wide == WIDER
+
+
+def test_packages_open_with_what_belongs_there() -> None:
+    for name, text in FILES.items():
+        if name.endswith("__init__.py"):
+            opening = ast.get_docstring(ast.parse(text)) or ""
+            assert opening.partition("\n")[0].endswith((".", ",", ":")), name

@@ -1,0 +1,193 @@
+"""Claims as data: what expressions say of metrics and intervals, which verdicts follow."""
+
+import math
+
+import pytest
+
+from pipeline.output.claims import StatedClaim, decide, judged, known, require_names
+from pipeline.output.expressions import Values, evaluate, formatted, truth
+from pipeline.output.numbers import Number, exactly
+from pipeline.runs.experiment import Experiment
+from recorders.errors import BadInput
+from recorders.parameters import build
+
+METRICS = {
+    "ekf.nees.robot1": 2.0,
+    "ekf.nees.robot2": 3.0,
+    "smoother:ekf.nees.robot1": 2.5,
+    "ekf.rmse_m": 0.5,
+    "ekf.gain.ukf": 0.3,
+    "ekf.by_noise.1": [1.0, 2.0, 4.0],
+    "lost.rmse_m": None,
+}
+INTERVALS = {"ekf.gain.ukf": (0.1, 0.5), "ekf.nees.robot1": (1.5, 2.5)}
+VALUES = Values(METRICS, INTERVALS, {"runs": exactly(100)})
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("nees[ekf, robot1] - 2 * rmse_m[ekf]", (1.0, 0.5, 1.5)),
+        ("1 / gain[ekf, ukf]", (1 / 0.3, 2.0, 10.0)),
+        ("nees[smoother:ekf, robot1]", (2.5, 2.5, 2.5)),
+        ("max(nees[*, robot1], 1)", (2.5, 2.5, 2.5)),
+        ("by_noise[ekf, 1][-1] / 2", (2.0, 2.0, 2.0)),
+        ("count(by_noise[ekf, 1] > [0, 2, 3])", (2.0, 2.0, 2.0)),
+        ("abs(gain[ekf, ukf] - 0.2)", (0.1, 0.0, 0.3)),
+        ("deviation(by_noise[ekf, 1])", (math.sqrt(7 / 3),) * 3),
+    ],
+)
+def test_expressions_carry_intervals(expression: str, value: tuple[float, ...]) -> None:
+    found = evaluate(expression, VALUES)
+    assert isinstance(found, Number)
+    assert found[:3] == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("comparison", "holds"),
+    [
+        ("gain[ekf, ukf] > 0", True),
+        ("gain[ekf, ukf] > 0.5", False),  # not even the upper end is
+        ("gain[ekf, ukf] >= 0.5", None),
+        ("gain[ekf, ukf] > 0.2", None),
+        ("0 < gain[ekf, ukf] < 0.4", None),
+        ("gain[ekf, ukf] > 0.2 and rmse_m[ekf] > 1", False),
+        ("gain[ekf, ukf] > 0.2 or rmse_m[ekf] < 1", True),
+        ("not gain[ekf, ukf] > 0.2", None),
+        ("2 in nees[ekf, robot1]", True),
+        ("3 in nees[ekf, robot1]", False),
+        ("nees[ekf, robot1] in consistent(2, runs)", None),
+        ("nees[ekf, *] > 1", True),  # a list holds in all entries
+        ("by_noise[ekf, 1] < 4", False),
+        ("falls(by_noise[ekf, 1])", False),
+    ],
+)
+def test_an_interval_that_holds_both_leaves_a_comparison_open(
+    comparison: str, holds: bool | None
+) -> None:
+    assert truth(comparison, VALUES) is holds
+
+
+def test_sentences_say_numbers_their_intervals_and_names() -> None:
+    template = "{gain[ekf, ukf]:+.2f} m, {nees[ekf, *]!n:.1f}; {100 * rmse_m[ekf]:.0f} %"
+    assert (
+        formatted(template, VALUES)
+        == "+0.30 (+0.10 to +0.50) m, robot1 2.0 (1.5 to 2.5), robot2 3.0; 50 %"
+    )
+
+
+def claim(**values: object) -> StatedClaim:
+    stated = {"sentence": "s", "paper": "p", **values}
+    experiment = build(Experiment, {"title": "t", "claims": [stated]}, "experiment mine.toml")
+    return experiment.claims[0]
+
+
+@pytest.mark.parametrize(
+    ("value", "verdict"),
+    [
+        ("gain[ekf, ukf]", "confirmed"),
+        ("gain[ekf, ukf] - 0.3", "not shown"),
+        ("gain[ekf, ukf] - 1", "refuted"),
+        ("rmse_m[lost]", "not reproducible"),
+        ("rmse_m[ekf | nobody][0]", "not reproducible"),
+        ("rmse_m[nobody]", "not reproducible"),
+    ],
+)
+def test_what_chance_may_have_made_is_not_shown(value: str, verdict: str) -> None:
+    [found] = decide([claim(value=value, holds="value > 0")], METRICS, INTERVALS, {})
+    assert found.verdict == verdict
+    left = decide([claim(value=value, holds="value > 0", optional=True)], METRICS, INTERVALS, {})
+    assert len(left) == ("nobody" not in value)
+
+
+def test_a_comparison_with_a_number_that_is_missing_decides_nothing() -> None:
+    stated = claim(
+        given={"wins": "[rmse_m[ekf], rmse_m[lost]] < 1"},
+        holds="count(wins) > 1 or any(wins)",
+        ours="{count(wins):g} of {len(wins):g}",
+    )
+    [found] = decide([stated], METRICS, {}, {})
+    assert (found.verdict, found.ours) == ("not reproducible", "1 of 2")
+    assert found.why == "estimates are missing"
+
+
+def test_a_claim_is_made_of_each_and_its_limit_stands_once() -> None:
+    """Combinations in order; a table gives several names, a `*` what there is."""
+    stated = claim(
+        sentence="$robot: $words, at most {limit:g}",
+        each={"robot": "nees[ekf, *]", "of": [{"words": "a", "least": 1}, {"words": "b", "least": 3}]},
+        given={"limit": 2.5},
+        value="nees[ekf, $robot]",
+        holds="$least <= value <= limit",
+        why="always",
+        unless="except here",
+    )
+    found = decide([stated], METRICS, {}, {})
+    assert [(each.claim, each.verdict, each.why) for each in found] == [
+        ("robot1: a, at most 2.5", "confirmed", "always"),
+        ("robot1: b, at most 2.5", "refuted", "always; except here"),
+        ("robot2: a, at most 2.5", "refuted", "always; except here"),
+        ("robot2: b, at most 2.5", "refuted", "always; except here"),
+    ]
+    assert found[0].ours == "2"
+    [bare] = decide([claim(ours="-")], METRICS, {}, {})
+    assert bare.verdict == "not reproducible"
+    unmet = claim(value="rmse_m[ekf]", holds="value < 1", reproducible="value > 1")
+    assert decide([unmet], METRICS, {}, {})[0].verdict == "not reproducible"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (
+            {"holds": "rmse_m[ekf] <"},
+            r"experiment mine.toml: .*claim 's': 'rmse_m\[ekf\] <' cannot be read",
+        ),
+        ({"holds": "open('x') < 1"}, "no function 'open'"),
+        ({"holds": "runs.__class__ < 1"}, "has more than numbers, names"),
+        ({"ours": "{rmse_m[ekf]"}, "braces"),
+        ({"hold": "1 < 2"}, "no parameter 'claims.0.hold'; did you mean 'holds'"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_before_the_run(values: dict[str, str], message: str) -> None:
+    with pytest.raises(BadInput, match=message):
+        claim(**values)
+
+
+def test_nothing_is_confirmed_beside_a_number_that_is_missing() -> None:
+    """Code that judges its own claims compares with NaN, which is false: no refutation."""
+    found = known(judged("s", "p", "nan against 2", holds=False))
+    assert (found.verdict, found.why) == ("not reproducible", "estimates are missing")
+    assert known(judged("s", "p", "nancy 1", holds=False)).verdict == "refuted"
+
+
+def test_an_estimator_is_like_another_but_for_what_it_says() -> None:
+    stated = {
+        "plain": {"kind": "ekf", "rate": {"a": 1, "b": 2}},
+        "ekf": {"like": "plain", "gate": 1},
+        "ukf": {"like": "ekf", "kind": "ukf", "rate": {"b": 3}},
+    }
+    found = build(Experiment, {"title": "t", "estimators": stated}, "mine.toml").estimators
+    assert found["ekf"] == {"rate": {"a": 1, "b": 2}, "gate": 1}
+    assert found["ukf"] == {"rate": {"a": 1, "b": 3}, "gate": 1}
+    for other in ("ekf", "nobody"):
+        circle = {"title": "t", "estimators": {"plain": {"like": other}, "ekf": {"like": "plain"}}}
+        with pytest.raises(BadInput, match=f"mine.toml: .* is like '{other}|is like 'plain'"):
+            build(Experiment, circle, "mine.toml")
+
+
+def test_a_name_that_is_nowhere_and_what_is_no_comparison_name_the_claim() -> None:
+    with pytest.raises(
+        BadInput, match="experiment mine: claim 's': no number 'limt'; did you mean 'limit'"
+    ):
+        require_names([claim(holds="1 < limt")], ["limit"], "experiment mine")
+    wrong = (
+        "rmse_m[ekf]",
+        "by_noise[ekf, 1] < [1, 2]",
+        "count(rmse_m[ekf]) > 0",
+        "max(1 < 2) > 0",
+        "1 < 2 < (1 < 2)",
+    )
+    for holds in wrong:
+        with pytest.raises(BadInput, match="claim 's': "):
+            decide([claim(holds=holds)], METRICS, {}, {})
