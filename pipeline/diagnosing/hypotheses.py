@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.diagnosing import alterations as alter
 from pipeline.diagnosing.likelihood import Trial
+from pipeline.diagnosing.numbers import number
 from pipeline.tuning.objective import with_values
 from recorders.log import Stream, Topic
 from recorders.parameters import Parameters
@@ -40,6 +41,7 @@ Kind = Literal[
     "covariance floor",
     "divergence",
     "unseen error",
+    "unnamed",
 ]
 NOISE = re.compile(r"(^|_)(sigma|density)(_|$)")
 BEGINNING = re.compile(
@@ -81,6 +83,11 @@ class Hypothesis:
     without: Callable[[Trial, float], Trial]
     words: Callable[[float, float, float], str]
     mend: Callable[[float], str]
+
+    @property
+    def has_end(self) -> bool:
+        """Whether what lies beyond the limit is not searched; an angle is, where it comes round."""
+        return len(self.tried) > 1 and self.limit not in (np.pi, np.inf)
 
 
 def hypotheses(
@@ -160,17 +167,14 @@ def _noise_of(parameters: Parameters, name: str, read: Sequence[Topic]) -> float
 
 def _times(at: float, low: float, high: float) -> str:
     least, most = (
-        _number(np.exp(abs(end)) if at * end > 0 else 1.0) for end in sorted((low, high), key=abs)
+        number(np.exp(abs(end)) if at * end > 0 else 1.0) for end in sorted((low, high), key=abs)
     )
-    return f"the standard deviation is {np.exp(abs(at)):.3g} times ({least} to {most}) too {_size(at)}"
+    factor = number(np.exp(abs(at)))
+    return f"the standard deviation is {factor} times ({least} to {most}) too {_size(at)}"
 
 
 def _size(at: float) -> str:
     return "small" if at > 0.0 else "large"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def _spreads(stream: Stream) -> Iterator[Hypothesis]:
@@ -223,7 +227,7 @@ def _bias(
     is_angle = field == "bearing_rad"
 
     def words(at: float, low: float, high: float) -> str:
-        size = f"{stream.topic}: {name} is too large by {at:.3g} ({low:.3g} to {high:.3g})"
+        size = f"{stream.topic}: {name} is too large by {number(at)} ({number(low)} to {number(high)})"
         if not is_angle:
             return size
         return f"{size}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
@@ -274,7 +278,8 @@ def _clocks(
 
     def late(at: float, low: float, high: float) -> str:
         return (
-            f"{topic}: comes {1e3 * at:.3g} ms late ({1e3 * low:.3g} to {1e3 * high:.3g}) by its stamps"
+            f"{topic}: comes {number(1e3 * at)} ms late ({number(1e3 * low)} to {number(1e3 * high)}) "
+            "by its stamps"
         )
 
     def mend_late(at: float) -> str:
@@ -347,6 +352,7 @@ def _outliers(parameters: Parameters | None) -> Iterator[Hypothesis]:
         settings = {**trial.settings, "gate_probability": GATE, **_reopens(parameters)}
         return trial._replace(settings=settings)
 
+    is_closed = getattr(parameters, "gate_probability", 1.0) <= GATE
     yield Hypothesis(
         "outliers",
         "gate_probability",
@@ -355,7 +361,7 @@ def _outliers(parameters: Parameters | None) -> Iterator[Hypothesis]:
         1.0,
         without,
         lambda *_: "some measurements are outliers: of something else, or false",
-        lambda _: f"--set gate_probability={GATE:g}",
+        lambda _: "" if is_closed else f"--set gate_probability={GATE:g}",
     )
 
 
