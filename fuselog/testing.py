@@ -1,4 +1,4 @@
-"""For tests of estimators: a replay against a golden, as `fuselog check` does it.
+"""Tests estimators: a replay against a golden, as `fuselog check` does it.
 
 >>> def test_my_estimator():
 ...     assert_golden("drive.mcap", "tests/mine.golden.xz", {"mine": MINE})

@@ -53,7 +53,7 @@ def difference_stream(
 
 
 def microphone_stream(time_ns: int, places_m: Floats) -> Stream:
-    """Where microphones are (n, 3), numbered from 1 on."""
+    """Make the stream of where microphones are (n, 3), numbered from 1 on."""
     return make_stream(
         "/microphones",
         schemas.LANDMARK,

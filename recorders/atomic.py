@@ -111,7 +111,7 @@ def _working_folder(place: Path) -> Iterator[Path]:
 
 
 def is_being_written(file: Path) -> bool:
-    """Whether a file is in a working folder: half an output, or its lock."""
+    """Tell whether a file is in a working folder: half an output, or its lock."""
     return any(
         each.name.startswith(".") and each.suffix == ".part" and (each / _LOCK).exists()
         for each in file.parents

@@ -119,7 +119,7 @@ def unit_of(name: str) -> str:
 
 @cache
 def meanings(kind: type[BaseModel]) -> dict[str, str]:
-    """What the parameters of a type mean, by name: its `Attributes:`, over those of its bases.
+    """Return what the parameters of a type mean, by name: its `Attributes:`, over those of its bases.
 
     An entry is `name: meaning`, or `name, name: meaning` where several mean alike. Raises BadInput where
     one names no parameter.
@@ -150,7 +150,7 @@ def _prose(kind: type[BaseModel]) -> str:
 
 
 class Described(NamedTuple):
-    """One parameter as a person reads it: full name, default, unit, what it accepts, what it means.
+    """Describes one parameter to a person: full name, default, unit, what it accepts, what it means.
 
     Unit and meaning are empty where the type does not say them.
     """
@@ -172,7 +172,7 @@ def describe(kind: type[BaseModel], values: Mapping[str, Any] | None = None) -> 
 
 
 def explain(kind: type[BaseModel]) -> dict[str, str]:
-    """What a type and those of its nested tables say as a whole, by where these are.
+    """Return what a type and those of its nested tables say as a whole, by where these are.
 
     A place is how the names in a table begin, such as `range_bearing.`, empty for the type itself;
     several tables that say the same stand together. What a type inherits comes first.

@@ -1,4 +1,4 @@
-"""What a recorder is: something that turns parameters, or a folder of real data, into streams."""
+"""Defines a recorder: something that turns parameters, or a folder of real data, into streams."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -96,7 +96,7 @@ class Blocks:
 
 @dataclass(frozen=True)
 class Recorder(Generic[ParametersType]):
-    """What recorders have in common: what they are in one line, and their parameters."""
+    """Holds what recorders have in common: what they are in one line, and their parameters."""
 
     summary: str
     parameters: type[ParametersType]

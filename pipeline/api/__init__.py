@@ -1,1 +1,1 @@
-"""What `import fuselog` offers, on which the commands rest; begin with `api`."""
+"""Offers what `import fuselog` gives, on which the commands rest; begin with `api`."""

@@ -1,10 +1,10 @@
-"""What `import fuselog` offers in place of the commands: logs, recordings, experiments, lists.
+"""Offers in Python what the commands do: logs, recordings, experiments, lists.
 
 Everything raises BadInput as the commands do, with the same sentences. docs/python.md shows how to use
 it; `pipeline.api.replays` has the replay.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,15 +19,17 @@ from pipeline.api.catalog import Entry
 from pipeline.output.outputs import LOG, check_files, check_folder
 from pipeline.output.results import Result, read_table
 from pipeline.output.summary import summary_table
-from pipeline.runs.executors import pool_for, pool_of
+from pipeline.runs.ensemble import Progress, no_progress
+from pipeline.runs.executors import PoolFactory, pool_for
 from pipeline.runs.experiment import (
-    load_experiment,
+    Experiment,
+    Stated,
     load_scenario,
     read_experiment,
     require_campaign,
     run_experiment,
 )
-from pipeline.runs.sweeps import nested, over_of, points_of, run_sweep
+from pipeline.runs.sweeps import Over, Sampling, nested, over_of, points_of, run_sweep
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, write_log
 from recorders.parameters import merge
@@ -103,7 +105,7 @@ class ResultFolder:
 
 
 def run(
-    experiment: str | Path,
+    experiment: str | Path | Stated,
     /,
     *,
     runs: int | None = None,
@@ -112,15 +114,16 @@ def run(
     out: str | Path | None = None,
     logs: int = 20,
     errors: bool = False,
-    workers: int = 1,
+    workers: int | None = 1,
     scheduler: str | None = None,
     executor: Executor | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
+    progress: Progress = no_progress,
 ) -> ResultFolder:
     """Run an experiment into a result folder.
 
     Args:
-        experiment: a name (`experiments` has them), or a TOML file.
+        experiment: a name (`experiments` has them), or a TOML file; or as it was read.
         runs: how many, if not as many as the experiment says.
         seed: another than the experiment's.
         data: the real data, where the experiment imports any.
@@ -128,73 +131,114 @@ def run(
         logs: of how many runs the logs are kept.
         errors: whether every single error is kept.
         workers: processes that share the runs; a script that asks for more than one guards its own
-            work with `if __name__ == "__main__":`, as they import it.
+            work with `if __name__ == "__main__":`, as they import it. None stands for all cores where
+            that pays.
         scheduler: a Dask scheduler whose workers share them, or `local:N`.
         executor: anything else that works on them, whose workers see this machine's files.
         set: entries of the experiment, parameters of its scenario, or of its estimators by label:
             `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
+        progress: is told how it goes.
 
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """
-    over = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
-    name, found = load_experiment(str(experiment), set or {}, over)
-    if workers > 1 or scheduler is not None or executor is not None:
+    stated = _stated(experiment)
+    found = stated.with_settings(set or {}, _given(runs=runs, seed=seed))
+    if workers not in (None, 1) or scheduler is not None or executor is not None:
         require_campaign(found, "leave out workers, scheduler and executor")
-    folder = Path("out", name) if out is None else Path(out)
+    folder = Path("out", stated.name) if out is None else Path(out)
     place = None if data is None else Path(data)
-    files = [Path(experiment)] if str(experiment).endswith(".toml") else []
-    check_folder(folder, {"input": files if place is None else [*files, place]})
-    open_pool = pool_for(workers, scheduler, found.runs) if executor is None else pool_of(executor)
-    return ResultFolder(
+    check_folder(folder, {"input": [*_inputs(stated, found), *filter(None, [place])]})
+    open_pool = _pool(workers, scheduler, executor, [found])
+    result = run_experiment(
+        stated.name,
+        found,
         folder,
-        run_experiment(name, found, folder, data=place, logs=logs, errors=errors, open_pool=open_pool),
+        data=place,
+        logs=logs,
+        errors=errors,
+        open_pool=open_pool,
+        progress=progress,
     )
+    return ResultFolder(folder, result)
 
 
 def sweep(
-    experiment: str | Path,
-    over: Mapping[str, Iterable[Any]],
+    experiment: str | Path | Stated,
+    over: Mapping[str, Iterable[Any]] | Sequence[Over],
     /,
     *,
     runs: int | None = None,
     seed: int | None = None,
+    samples: int | None = None,
+    sampling: Sampling = "sobol",
     out: str | Path | None = None,
-    workers: int = 1,
+    workers: int | None = 1,
     scheduler: str | None = None,
     executor: Executor | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
+    progress: Progress = no_progress,
 ) -> ResultFolder:
     """Run an experiment at all points of a grid into a result folder, whose table `sweep` has them.
 
     Args:
-        experiment: a name (`experiments` has them), or a TOML file.
-        over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`.
+        experiment: a name (`experiments` has them), or a TOML file; or as it was read.
+        over: values by key: `{"ekf.sigma_range_m": np.geomspace(0.05, 0.8, 9), "robots": [1, 2]}`; or
+            as `parse_over` has them.
         runs: how many at each point, if not as many as the experiment says.
         seed: another than the experiment's.
+        samples: so many points are drawn instead of taking the whole grid.
+        sampling: how they are drawn, "sobol" or "random".
         out: the folder, by default out/ and the experiment's name with -sweep.
         workers: as for `run`.
         scheduler: as for `run`.
         executor: as for `run`.
         set: as for `run`.
+        progress: as for `run`.
 
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """
-    given = {name: value for name, value in {"runs": runs, "seed": seed}.items() if value is not None}
-    overs = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
-    points = points_of(overs)
-    stated = read_experiment(str(experiment))
+    stated, given = _stated(experiment), _given(runs=runs, seed=seed)
+    if isinstance(over, Mapping):
+        over = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
+    points = points_of(over, samples, sampling, stated.with_settings(set or {}, given).seed)
     found = [stated.with_settings(merge(set or {}, nested(point)), given) for point in points]
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
-    check_folder(folder, {"input": [Path(experiment)] if str(experiment).endswith(".toml") else []})
-    runs_in_all = sum(each.runs for each in found)
-    open_pool = pool_for(workers, scheduler, runs_in_all) if executor is None else pool_of(executor)
-    return ResultFolder(
-        folder, run_sweep(stated.name, overs, points, found, folder, open_pool=open_pool)
-    )
+    check_folder(folder, {"input": _inputs(stated, found[0])})
+    open_pool = _pool(workers, scheduler, executor, found)
+    result = run_sweep(stated.name, over, points, found, folder, open_pool=open_pool, progress=progress)
+    return ResultFolder(folder, result)
+
+
+def _stated(experiment: str | Path | Stated) -> Stated:
+    return experiment if isinstance(experiment, Stated) else read_experiment(str(experiment))
+
+
+def _given(**entries: int | None) -> dict[str, int]:
+    return {name: value for name, value in entries.items() if value is not None}
+
+
+def _inputs(stated: Stated, experiment: Experiment) -> list[Path]:
+    """The files that an experiment is read from: its logs, itself, its scenario."""
+    scenario = "" if experiment.record is None else experiment.record.scenario
+    tables = [Path(scenario)] if scenario.endswith(".toml") else []
+    return [*experiment.files, *stated.files, *tables]
+
+
+def _pool(
+    workers: int | None,
+    scheduler: str | None,
+    executor: Executor | None,
+    experiments: Sequence[Experiment],
+) -> PoolFactory:
+    """Who works on experiments; a scheduler has its own workers, so that one beside it is none."""
+    if scheduler is not None and workers == 1:
+        workers = None
+    runs = sum(len(each.files) or each.runs for each in experiments)
+    return pool_for(workers, scheduler, runs, executor)
 
 
 class Catalog(Mapping[str, Entry]):
-    """What there is of a kind, by name; raises `UnknownName` for another, with the one that is near."""
+    """Holds what there is of a kind, by name; for another name raises `UnknownName` with a near one."""
 
     def __init__(self, kind: str, list_entries: Callable[[], list[Entry]]) -> None:
         self._kind, self._list = kind, list_entries

@@ -1,4 +1,4 @@
-"""What `--set NAME=?` answers: what a parameter means, its unit, what it accepts, and its default.
+"""Answers `--set NAME=?`: what a parameter means, its unit, what it accepts, and its default.
 
 Every command names what takes its settings, by a key of `TAKERS`.
 """

@@ -1,4 +1,4 @@
-"""What there is to choose from: scenarios, estimators, metrics, experiments; lists and details."""
+"""Lists what there is to choose from: scenarios, estimators, metrics, experiments; with details."""
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -28,7 +28,7 @@ from replay.judging.metrics.measuring import Metric
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing to choose: what it is in a line, more facts, its parameters, and values it sets.
+    """Describes one thing to choose: a line on it, more facts, its parameters, and values it sets.
 
     `stated` are the parameters that a log's channels state where they are not given; the names of all
     begin with `prefix` where they are set.
@@ -221,7 +221,7 @@ def _print_details(entry: Entry) -> None:
 
 
 def rows_of(entry: Entry) -> list[list[object]]:
-    """Of every parameter its name, its default, its unit, what it accepts and what it means."""
+    """Return each parameter's name, default, unit, what it accepts and what it means."""
     if entry.parameters is None:
         return []
     return [

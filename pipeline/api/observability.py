@@ -32,7 +32,7 @@ def observability(
     end_s: float | None = None,
     **parameters: Any,
 ) -> pd.DataFrame:
-    """What the measurements of a log tell of a model's state, in units of what the prior tells.
+    """Measure what the measurements of a log tell of a model's state, in units of what the prior tells.
 
     Args:
         logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.

@@ -28,7 +28,7 @@ Pair = tuple[str, str]
 
 
 class Precompiled(NamedTuple):
-    """One model by one method: the scenario whose log was replayed, how long that took, or why not."""
+    """Describes one model by one method: the replayed scenario, how long that took, or why not."""
 
     model: str
     method: str

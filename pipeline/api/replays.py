@@ -107,7 +107,7 @@ def replay(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Replay:
-    """What estimators made of logs.
+    """Holds what estimators made of logs.
 
     Attributes:
         logs: the runs.
@@ -128,7 +128,7 @@ class Replay:
 
     @property
     def judge(self) -> Judge:
-        """What the estimators are worth."""
+        """Judge what the estimators are worth."""
         return self.done.judge
 
     def __repr__(self) -> str:
@@ -198,7 +198,7 @@ class Replay:
 
     @property
     def coverage(self) -> pd.DataFrame:
-        """What became of the logs' topics: messages, used, gated, skipped and why, by estimator."""
+        """Return what became of the logs' topics by estimator: messages, used, gated, skipped, why."""
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":

@@ -60,7 +60,7 @@ class Evaluation:
 
     @property
     def alignment(self) -> dict[str, Any]:
-        """What brings the estimate to the truth: rotation (w, x, y, z), translation, scale."""
+        """Return what brings the estimate to the truth: rotation (w, x, y, z), translation, scale."""
         rotation, translation_m, scale = self.compared.alignment
         quaternion = Rotation.from_matrix(rotation).as_quat(canonical=True, scalar_first=True)
         return {
@@ -211,7 +211,7 @@ class ComparedLogs:
 
     @property
     def figures(self) -> dict[str, "Chart | Figure"]:
-        """Those of the first run, by case."""
+        """Return the figures of the first run, by case."""
         cases: dict[str, dict[str, Compared]] = {}
         for (estimator, case), runs in self.compared.items():
             cases.setdefault(case, {})[estimator] = runs[0]

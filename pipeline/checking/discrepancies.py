@@ -68,7 +68,7 @@ class Discrepancy(NamedTuple):
 
 
 def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
-    """Everything in which a replay is not the golden, run by run.
+    """Find everything in which a replay is not the golden, run by run.
 
     Raises BadInput where the runs, or what was put in, are others.
     """
@@ -206,7 +206,7 @@ def _relative(difference: Floats, size: ArrayLike) -> Floats:
 
 
 def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -> list[str]:
-    """What is said of the first discrepancy in time: itself, where it begins, the innovation there."""
+    """Say of the first discrepancy in time: itself, where it begins, the innovation there."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
     said = [first.sentence]

@@ -47,7 +47,7 @@ Tolerances = Mapping[str, Tolerance]
 
 
 class Replayed(NamedTuple):
-    """What is checked: a golden of now, and the output streams of each run that it is made of."""
+    """Holds what is checked: a golden of now, and the output streams of each run that it is made of."""
 
     golden: Golden
     outputs: Mapping[str, Outputs]
@@ -156,7 +156,7 @@ def _stream(stream: Stream, rows: int, columns: Sequence[str]) -> dict[str, Any]
 
 
 def kept_rows(count: int, most: int) -> NDArray[np.int64]:
-    """So many of a stream's rows, evenly."""
+    """Choose so many of a stream's rows, evenly."""
     return np.linspace(0, count - 1, min(most, count)).round().astype(np.int64)
 
 

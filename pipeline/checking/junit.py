@@ -1,4 +1,4 @@
-"""What a check found as JUnit's XML, which continuous integration reads: a test case for each topic."""
+"""Writes what a check found as JUnit's XML, for continuous integration: a test case for each topic."""
 
 from pathlib import Path
 from xml.etree import ElementTree

@@ -1,24 +1,20 @@
-"""What the commands do: the work between the command line and the library.
+"""Does the commands' work, between the command line and the library.
 
 Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabulates or aligns does it.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.api.planning import plan_replay
-from pipeline.output.coverage import recounted, sentences
-from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files, check_folder
+from pipeline.output.coverage import sentences
+from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files
 from pipeline.output.results import (
-    ErrorTables,
     in_order,
     plain,
-    result_folder,
     split_metric,
-    write_outcome,
 )
 from pipeline.output.terminal import (
     print_json,
@@ -31,16 +27,15 @@ from pipeline.output.terminal import (
     warn,
 )
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import hash_files, log_of_estimates, stated_estimators
-from pipeline.runs.initial_states import check_same_run, span_of
+from pipeline.runs.estimates import log_of_estimates
+from pipeline.runs.initial_states import span_of
 from pipeline.runs.settings import settings_of_estimators, sigmas_of
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
-from recorders.log import Companions, Log, NotMcap, open_log
+from recorders.log import Companions, Log, open_log
 from replay.engine.streams.sources import LogSource
 from replay.judging.errors.differences import FEWEST_RUNS
 from replay.judging.judge import Judge
-from replay.judging.metrics.measuring import find_metrics
 
 
 def replay_logs(
@@ -108,7 +103,7 @@ def replay_logs(
 
 
 def companions_if(foxglove: bool) -> Companions | None:
-    """What makes the messages for Foxglove, where they are asked for; it takes long to import."""
+    """Make the messages for Foxglove, where they are asked for; it takes long to import."""
     if not foxglove:
         return None
     from pipeline.logs.foxglove import companions
@@ -155,90 +150,28 @@ def evaluate_logs(
     gap_limit_s: float,
     as_json: bool,
 ) -> None:
-    """Judge estimates logs; the truth is in the logs given, else in those they were replayed from.
+    """Judge estimates logs as `judge_estimates` does, and print the metrics."""
+    from pipeline.api.estimates import judge_estimates
 
-    Where there are entries of a `Comparison`, positions are compared as trajectories too, and estimates
-    are judged in their alignment with the truth.
-    """
-    from pipeline.api.trajectories import ComparedLogs, compare_logs
-    from pipeline.output.summary import summarise, summary_table
-    from replay.judging.errors.trajectories import Comparison
-
-    if errors and out is None:
-        raise BadInput("--errors: errors are written into a result folder; give one with --out")
-    if logs and len(logs) != len(estimates):
-        raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
-    try:
-        opened = [open_log(path, recover=recover) for path in estimates]
-    except NotMcap as error:
-        raise BadInput(
-            f"{error}, or give with --truth the file that a trajectory is judged by"
-        ) from error
-    for each in opened:
-        if not any(topic.startswith("/estimates/") for topic in each.topics):
-            raise BadInput(f"{each.path}: has no estimates; give a log that fuselog replay wrote")
-    places = logs or [log_of_estimates(each) for each in opened]
-    if out is not None:
-        check_folder(out, {"input": [*estimates, *places]})
-    sources = [LogSource(open_log(path, recover=recover)) for path in places]
-    for each, source in zip(opened, sources, strict=True):
-        check_same_run(LogSource(each), source)
-    wanted = find_metrics(metrics)
-    estimators = stated_estimators(opened[0])
-    compared = ComparedLogs([LogSource(each) for each in opened], {})
-    if comparison:
-        if "time_offset_s" in comparison:
-            raise BadInput(
-                "--time-offset: is for trajectory files, since all streams of a log have one clock; "
-                "leave it out"
-            )
-        how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
-        compared = compare_logs([LogSource(each) for each in opened], sources, how)
-        if not compared.compared:
-            raise BadInput(
-                f"{estimates[0]}: has no estimated positions with truth that could be aligned; leave "
-                "out --align"
-            )
-    with result_folder(out) if out is not None else nullcontext() as folder:
-        with ErrorTables(folder) if folder and errors else nullcontext() as kept:
-            judge = judge_logs(
-                compared.estimates,
-                sources,
-                wanted,
-                gap_limit_s=gap_limit_s,
-                on_errors=kept.add if kept else None,
-            )
-        if not judge.has_numbers:
-            raise BadInput(
-                f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
-                "give its log with --log"
-            )
-        coverage = recounted([LogSource(each) for each in opened], sources, estimators, judge.doubts)
-        if folder is not None:
-            settings = {
-                "title": f"estimates of {sources[0].name}",
-                "estimates": [str(path) for path in estimates],
-                "logs": [source.name for source in sources],
-                "estimators": estimators,
-                "gap_limit_s": gap_limit_s,
-                "metrics": list(metrics),
-                **comparison,
-            }
-            outcome = summarise(judge, coverage)
-            outcome.metrics.update(compared.metrics)
-            outcome.tables["summary"] = summary_table(outcome.metrics)
-            outcome.figures.update(compared.figures)
-            outcome.input_sha256 = hash_files([*estimates, *places])
-            write_outcome(folder, "evaluate", settings, outcome)
-    _state_losses([*opened, *(source.log for source in sources)])
+    found = judge_estimates(
+        estimates,
+        logs,
+        comparison=comparison,
+        out=out,
+        metrics=metrics,
+        errors=errors,
+        recover=recover,
+        gap_limit_s=gap_limit_s,
+    )
+    _state_losses(source.log for source in found.sources)
     _print_outcome(
-        judge,
-        estimators,
+        found.judge,
+        found.estimators,
         as_json=as_json,
         written=[out] if out else [],
-        told={"coverage": [row._asdict() for row in coverage]},
-        more=compared.metrics,
-        unused=sentences(coverage),
+        told={"coverage": [row._asdict() for row in found.coverage]},
+        more=found.compared.metrics,
+        unused=sentences(found.coverage),
     )
 
 

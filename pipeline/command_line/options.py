@@ -10,7 +10,7 @@ import click
 
 
 class Output(click.Path):
-    """What a command writes, by which the audit of outputs in tests finds it.
+    """Declares what a command writes, by which the audit of outputs in tests finds it.
 
     Attributes:
         suffix: of the file; empty for what is only ever a folder.

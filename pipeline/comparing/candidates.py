@@ -49,7 +49,7 @@ Pairs = Mapping[str, tuple[Source, Source]]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """What an estimator gave, judged run by run.
+    """Holds what an estimator gave, judged run by run.
 
     Attributes:
         name: what to call it.
@@ -141,7 +141,7 @@ def _hash_of_truth(source: Source, estimates: Source) -> str:
 
 
 def key_of(source: Source) -> str:
-    """What tells a run from others: scenario, seed and number, or the log's name of a recorded one."""
+    """Return what tells a run from others: scenario, seed and number, or a recorded log's name."""
     run = source.run
     if run is not None and run.seed is not None:
         return f"{run.scenario}, seed {run.seed}, run {run.run}"
@@ -149,7 +149,7 @@ def key_of(source: Source) -> str:
 
 
 def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """What decided about the estimates of a label, by dotted name."""
+    """Return what decided about the estimates of a label, by dotted name."""
     run = source.run or RunMetadata("unknown")
     return flat(
         {"scenario": run.scenario, "parameters": run.parameters, "estimator": parameters(label, stated)}

@@ -193,7 +193,7 @@ class Differences:
 
     @cached_property
     def coverage(self) -> list[Row]:
-        """What became of every topic, by candidate."""
+        """Return what became of every topic, by candidate."""
         return [
             row for candidates in self.groups for candidate in candidates for row in candidate.coverage
         ]

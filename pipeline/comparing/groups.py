@@ -41,7 +41,7 @@ def inputs_of(
     gap_limit_s: float,
     recover: bool,
 ) -> list[Given]:
-    """What every path stands for; logs without estimates are replayed together."""
+    """Read what every path stands for; logs without estimates are replayed together."""
     kinds = [_kind_of(path, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
     if logs and len(logs) < len(paths):

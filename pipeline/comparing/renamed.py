@@ -18,12 +18,12 @@ class Renamed:
 
     @property
     def name(self) -> str:
-        """What the estimates are called."""
+        """Return the name of the estimates."""
         return self.estimates.name
 
     @property
     def run(self) -> RunMetadata:
-        """What the run was."""
+        """Return the run's description."""
         return self.estimates.run or RunMetadata("unknown", epoch_ns=self.epoch_ns)
 
     @property
@@ -33,7 +33,7 @@ class Renamed:
 
     @property
     def start_ns(self) -> int | None:
-        """Where the span begins."""
+        """Return the begin of the span."""
         return self.estimates.start_ns
 
     @cached_property

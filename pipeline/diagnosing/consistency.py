@@ -17,7 +17,7 @@ CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is w
 
 
 def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
-    """Errors that innovations do not see."""
+    """Find errors that innovations do not see."""
     metrics = done.judge.metrics
     for key, (_, high) in done.judge.bounds.items():
         _, quantity, case = split_metric(key)
@@ -34,7 +34,7 @@ def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
 
 
 def unnamed(done: Replay, innovations: Mapping[str, Stream], tried: int) -> Iterator[Finding]:
-    """NIS and NEES outside of where a consistent filter has them in CONSISTENT of all logs.
+    """Find NIS and NEES outside of where a consistent filter has them in CONSISTENT of all logs.
 
     NIS is of all innovations, those that a gate keeps out too. Errors hang together over a run, so that
     the mean of NEES has the interval of a single step.
@@ -68,7 +68,7 @@ def unnamed(done: Replay, innovations: Mapping[str, Stream], tried: int) -> Iter
 
 
 def comparable(metrics: Mapping[str, MetricValue], log_likelihood: float) -> dict[str, MetricValue]:
-    """Metrics, with that of all measurements in place of likelihoods of those that a gate let in.
+    """Return metrics, with that of all measurements in place of likelihoods of those that a gate let in.
 
     What a gate keeps out costs nothing, so that the likelihood of the rest is larger the more that is.
     """

@@ -2,7 +2,7 @@
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number in so many digits, without an exponent where it is read without.
+    """Write a number in so many digits, without an exponent where it is read without.
 
     >>> number(1912.3), number(-0.25), number(2.4e12)
     ('1,910', '-0.25', '2.4e+12')

@@ -1,4 +1,4 @@
-"""What the samples of an inertial unit say of its body: that it stands, that its wheels do not slip.
+"""Derives constraints from an inertial unit's samples: the body stands, its wheels do not slip.
 
 It becomes topics of their own, which the model `inertial` takes beside those of sensors.
 """

@@ -13,7 +13,7 @@ from recorders.log import Log, Stream, schemas
 from replay.engine.streams.sources import LogSource
 
 
-def said_once(log: Log, topics: Sequence[str]) -> list[str]:
+def static_topics(log: Log, topics: Sequence[str]) -> list[str]:
     """Maps, priors, and topics all of whose messages have the first stamp of the log."""
     first_ns, _ = LogSource(log).extent("publish_time")
     early: Counter[str] = Counter()
@@ -32,7 +32,7 @@ def said_once(log: Log, topics: Sequence[str]) -> list[str]:
 
 
 def is_prior(log: Log, topic: str) -> bool:
-    """Whether a topic is a prior: a Gaussian estimate that no replay has written."""
+    """Tell whether a topic is a prior: a Gaussian estimate that no replay has written."""
     schema = log.topics[topic].schema_name
     return schema == schemas.GAUSSIAN_ESTIMATE.full_name and not topic.startswith("/estimates/")
 
@@ -51,7 +51,7 @@ class Thinner:
     last: int | None = None
 
     def thin(self, stream: Stream) -> Stream:
-        """What stays of the next block of the topic, which is not empty."""
+        """Return what stays of the next block of the topic, which is not empty."""
         times_ns, row = np.unique(stream.publish_time_ns, return_inverse=True)
         if self.every:
             interval = (self.stamps + np.arange(len(times_ns))) // self.every
@@ -64,7 +64,7 @@ class Thinner:
 
 
 def thinner(topic: str, rate: int | str, zero_ns: int) -> Thinner:
-    """What thins a topic as `rate` says: 10 for every tenth stamp, "5Hz" for five a second."""
+    """Make what thins a topic as `rate` says: 10 for every tenth stamp, "5Hz" for five a second."""
     text = str(rate)
     try:
         if text.lower().endswith("hz"):

@@ -11,7 +11,7 @@ from itertools import chain
 from pathlib import Path
 
 from pipeline.logs.constraints import ConstraintParameters, constraints_of
-from pipeline.logs.cutting import Thinner, is_prior, said_once, thinner
+from pipeline.logs.cutting import Thinner, is_prior, static_topics, thinner
 from pipeline.logs.rewriting import (
     Blocks,
     Changed,
@@ -78,7 +78,7 @@ def cut(
     for pattern, rate in (decimate or {}).items():
         for topic in matching_topics(log, [pattern]):
             thinners[topic] = thinner(pattern, rate, zero_ns)
-    once = [] if source.start_ns is source.end_ns is None else said_once(log, chosen)
+    once = [] if source.start_ns is source.end_ns is None else static_topics(log, chosen)
     if once:
         notes.append(f"kept whole, whatever the span: {', '.join(once)}")
     if start_s is not None and any(is_prior(log, topic) for topic in once):

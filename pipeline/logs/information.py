@@ -1,4 +1,4 @@
-"""What a log holds, and what the cache holds, for a person and for machines."""
+"""Describes what a log and what the cache holds, for a person and for machines."""
 
 import json
 import shlex
@@ -64,7 +64,7 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 
 
 class Fitting(NamedTuple):
-    """Whether a model fits a log: the topics that it would use, the methods, or what is missing."""
+    """States whether a model fits a log: topics that it would use, methods, or what is missing."""
 
     topics: list[str]
     methods: list[str]
@@ -72,7 +72,7 @@ class Fitting(NamedTuple):
 
 
 def fitting_of(topics: Mapping[str, Topic]) -> dict[str, Fitting]:
-    """How every registered model fits a log, by name."""
+    """Return how every registered model fits a log, by name."""
     return {name: _fitting(model, topics) for name, model in registered_models().items()}
 
 

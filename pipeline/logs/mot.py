@@ -26,7 +26,7 @@ PERIOD_NS = round(PERIOD_S * 1e9)
 
 
 def mot_files(log: Log, topics: Sequence[str]) -> dict[str, tuple[list[str], list[str]]]:
-    """By the name of a file its topics and its lines: one of each tracker's tracks, one of all truths.
+    """Return by file name the topics and lines: a file of each tracker's tracks, one of all truths.
 
     `topics` are those wanted, or none for all. Raises BadInput where one is not there or holds neither
     tracks nor truths in the plane, or there are none at all.

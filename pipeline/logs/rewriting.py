@@ -73,7 +73,7 @@ def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
 
 
 def losses_of(log: Log) -> list[str]:
-    """What is missing from a log, or is in it beside its topics and is not carried over."""
+    """Find what is missing from a log, or is in it beside its topics and is not carried over."""
     foreign = [name for name in log.container.metadata if not name.startswith(OWN_NAMES)]
     losses = [log.loss_statement] if log.loss_statement else []
     if log.companions:
@@ -137,7 +137,7 @@ def run_of(log: Log, target: Path) -> RunMetadata:
 
 
 def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) -> RunMetadata:
-    """What the logs say of their run if they are of one, else only their notes, all of them."""
+    """Join what the logs say of their run if they are of one, else only their notes, all of them."""
     runs = [run_of(log, target) for log in logs]
     notes: dict[str, str] = {}
     for log, run in zip(logs, runs, strict=True):

@@ -1,4 +1,4 @@
-"""What commands leave behind: files, result folders, tables, charts, reports.
+"""Writes what commands leave: files, result folders, tables, charts, reports.
 
 Begin with `results`.
 """

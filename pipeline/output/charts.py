@@ -34,7 +34,7 @@ Style = Literal["line", "dashed", "markers", "dots", "line+markers"]
 
 
 class Axis(Parameters):
-    """What an axis measures, with its unit; `ticks` are texts by place, where it has its own."""
+    """Describes an axis, with its unit; `ticks` are texts by place, where it has its own."""
 
     label: str = ""
     log: bool = False
@@ -43,7 +43,7 @@ class Axis(Parameters):
 
 
 class Drawn(Parameters):
-    """What is drawn over x, numbers or names.
+    """Holds what is drawn over x, numbers or names.
 
     What has one label has one colour in all panels, and is hidden together. A reference is what the
     others are seen against, such as the truth.
@@ -140,7 +140,7 @@ def level(label: str, x: ArrayLike, y: float) -> Series:
 
 
 def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
-    """One range that others are seen against, from end to end."""
+    """Draw one range that others are seen against, from end to end."""
     ends = np.asarray(x)[[0, -1]]
     return band(label, ends, [low, low], [high, high], reference=True)
 

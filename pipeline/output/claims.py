@@ -103,7 +103,7 @@ class StatedClaim(Parameters):
 
     @property
     def names(self) -> set[str]:
-        """What its expressions name that the claim does not say; raises BadInput where one is none."""
+        """Return the names in its expressions that the claim lacks; raises BadInput for what is none."""
         found: set[str] = set()
         for meant in _combinations(self.each):
             claim = _named(self, meant)

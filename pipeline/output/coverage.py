@@ -231,7 +231,7 @@ def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
 
 
 def sentences(rows: Sequence[Row]) -> list[str]:
-    """On what was not used; that an estimator takes no measurements at all is its nature."""
+    """Say what was not used; that an estimator takes no measurements at all is its nature."""
     measuring = {row.estimator for row in rows if row.used is not None and row.why != UNTAKEN}
     told = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
     return list(dict.fromkeys(row.sentence for row in told if row.sentence))

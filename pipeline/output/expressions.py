@@ -40,7 +40,7 @@ class NoMetric(Exception):
 
 
 class Values(NamedTuple):
-    """What an expression may name.
+    """Holds what an expression may name.
 
     Attributes:
         metrics: by their keys, `estimator.quantity[.case]`.
@@ -67,7 +67,7 @@ def evaluate(expression: str, values: Values) -> Value:
 
 
 def truth(expression: str, values: Values) -> Truth:
-    """Whether an expression holds, a list in all entries; raises as `evaluate` does."""
+    """Tell whether an expression holds, a list in all entries; raises as `evaluate` does."""
     found = evaluate(expression, values)
     if isinstance(found, Number):
         raise BadInput(f"'{expression}' is a number, no comparison; compare it with a limit")

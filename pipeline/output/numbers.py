@@ -25,7 +25,7 @@ class Number(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether neither it nor an end is NaN."""
+        """Tell whether neither it nor an end is NaN."""
         return not any(map(math.isnan, self[:3]))
 
 
@@ -112,12 +112,12 @@ def _equal(one: Number, other: Number) -> Truth:
 
 
 def negated(of: Truth) -> Truth:
-    """What is open or missing stays so."""
+    """Negate a truth; what is open or missing stays so."""
     return not of if isinstance(of, bool) else of
 
 
 def all_hold(truths: Sequence[Any]) -> Truth:
-    """Whether all of truths, and of lists of them, are true; open where one is, and none is false.
+    """Tell whether all of truths, and of lists of them, are true; open where one is, and none is false.
 
     Where one is missing, so is this.
     """
@@ -128,7 +128,7 @@ def all_hold(truths: Sequence[Any]) -> Truth:
 
 
 def any_holds(truths: Sequence[Any]) -> Truth:
-    """Whether one of truths, and of lists of them, is true; open or missing as in `all_hold`."""
+    """Tell whether one of truths, and of lists of them, is true; open or missing as in `all_hold`."""
     return negated(all_hold([negated(each) for each in _flat(truths)]))
 
 

@@ -1,4 +1,4 @@
-"""What a command may write over. No command changes or deletes a file that fuselog did not write for it.
+"""Guards what is there: no command changes or deletes a file that fuselog did not write for it.
 
 A file that exists is replaced only where it is what the same command writes there, and says so itself.
 An output is never an input, another output or a symbolic link, by whatever names they are given; what is

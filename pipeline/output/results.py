@@ -1,4 +1,4 @@
-"""What an experiment yields, and its folder: tables, figures, claims, result.json.
+"""Holds what an experiment yields, and its folder: tables, figures, claims, result.json.
 
 A result folder is built beside its place and moved there when it is whole. result.json lists what is in
 it, so that nothing else is ever replaced with it.
@@ -43,7 +43,7 @@ MetricValue = float | list[float] | list[float | None] | None
 
 @dataclass
 class Outcome:
-    """What a study found. Metric keys are `estimator.quantity_unit[.case]`.
+    """Holds what a study found. Metric keys are `estimator.quantity_unit[.case]`.
 
     `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one lies with
     95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
@@ -65,7 +65,7 @@ class Outcome:
 
 
 class Result(Parameters):
-    """What result.json says.
+    """Holds what result.json says.
 
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
     without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
@@ -116,7 +116,7 @@ class Measured(NamedTuple):
 
     @property
     def place(self) -> Literal["below", "within", "above", ""]:
-        """Where the value lies; nowhere where there is none, or no bounds."""
+        """Return where the value lies; nowhere where there is none, or no bounds."""
         if self.bounds is None or not isinstance(self.value, int | float):
             return ""
         low, high = self.bounds
@@ -279,7 +279,7 @@ class ErrorTables:
 
 
 def join_tables(parts: Sequence[Path], place: Path) -> None:
-    """One Parquet file of the rows of several, in their order."""
+    """Write one Parquet file of the rows of several, in their order."""
     import pyarrow.parquet
 
     files = [pyarrow.parquet.ParquetFile(part) for part in parts]
@@ -359,7 +359,7 @@ def _show_names_as_they_are(figure: "Figure") -> None:
 
 
 def read_result(folder: Path) -> Result:
-    """What result.json of a result folder says.
+    """Read the result.json of a result folder.
 
     Raises BadInput where it is missing, damaged or of another format.
     """

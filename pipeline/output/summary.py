@@ -53,7 +53,7 @@ def error_charts(judge: Judge) -> dict[str, Chart]:
 
 
 def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
-    """One row per metric: estimator, quantity, case, value."""
+    """Return one row per metric: estimator, quantity, case, value."""
     rows = [(*split_metric(key), value) for key, value in metrics.items()]
     return pd.DataFrame(rows, columns=["estimator", "quantity", "case", "value"])
 
@@ -114,7 +114,7 @@ def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
 
 
 def late_counts(late: pd.DataFrame) -> pd.DataFrame:
-    """How many messages came late: a row per estimator, case and what became of them; see `Judge.late`.
+    """Count late messages: a row per estimator, case and what became of them; see `Judge.late`.
 
     With their mean delay in seconds, and how many messages were used again for them.
     """
@@ -127,7 +127,7 @@ def late_counts(late: pd.DataFrame) -> pd.DataFrame:
 
 
 def late_chart(late: pd.DataFrame, case: str) -> Chart:
-    """How late messages came over time and what became of them, a panel for each estimator."""
+    """Draw how late messages came over time and what became of them, a panel for each estimator."""
     counts, panels = late_counts(late), []
     for name, rows in late.groupby("estimator", sort=False):
         series = [

@@ -1,4 +1,4 @@
-"""What the terminal shows: progress bars and tables. Standard output is for results alone.
+"""Shows progress bars and tables on the terminal. Standard output is for results alone.
 
 Texts may come from a log or a file's name: what could steer a terminal is shown, not obeyed.
 """
@@ -56,7 +56,7 @@ def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable
 
 @contextmanager
 def status() -> Iterator[Callable[[str], None]]:
-    """What shows how work goes, in one line on standard error; nothing where nobody watches."""
+    """Show how work goes, in one line on standard error; nothing where nobody watches."""
     with err.status("", spinner="line") if err.is_terminal else nullcontext() as line:
 
         def show(text: str) -> None:
@@ -77,7 +77,7 @@ def warn(text: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """One JSON document on standard output, whole or not at all: what is no finite number is null."""
+    """Print one JSON document, whole or not at all: what is no finite number is null."""
     sys.stdout.write(json.dumps(_finite(value), indent=2, allow_nan=False) + "\n")
 
 

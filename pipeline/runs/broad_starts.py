@@ -23,7 +23,7 @@ Starts = Mapping[str, Sequence[Initialized]]  # by the name of what is estimated
 
 
 def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
-    """The equally likely starts of a run, where the log does not state them; BadInput as `replay`."""
+    """Find the equally likely starts of a run, where the log does not state them; BadInput as `replay`."""
     stamps = [source.streams[topic].publish_time_ns[:1] for each in bound for topic in each.streams]
     first_ns = int(np.min(np.concatenate(stamps), initial=np.iinfo(np.int64).max))
     found: dict[str, list[Initialized]] = {}
@@ -47,12 +47,12 @@ def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
 
 
 def part_count(starts: Starts) -> int:
-    """How many replays a trial is."""
+    """Count the replays that a trial is."""
     return max(map(len, starts.values()), default=1)
 
 
 def begun_at(bound: Bound, starts: Starts) -> Bound:
-    """An estimator of runs that stand there once for each part, one part after another."""
+    """Make an estimator of runs that stand there once for each part, one part after another."""
     parts = starts.get(bound.name)
     return bound if parts is None else with_find(bound, partial(_part_of_runs, parts))
 
@@ -67,7 +67,7 @@ def _part_of_runs(parts: Sequence[Initialized], first: Mapping[str, Ragged], *_:
 
 
 def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The log of the mean of likelihoods, by what is estimated; a part that failed has none."""
+    """Compute the log of the mean of likelihoods, by what is estimated; a part that failed has none."""
     names = dict.fromkeys(name for part in parts for name in part)
     return {
         name: float(logsumexp([part.get(name, -np.inf) for part in parts]) - np.log(len(parts)))
@@ -76,12 +76,12 @@ def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def initialization_of(bound: Bound) -> Initialization | None:
-    """How an estimator finds its beginning, if it has to find one."""
+    """Return how an estimator finds its beginning, if it has to find one."""
     return bound.initialization if isinstance(bound, Recursive) else None
 
 
 def with_find(bound: Bound, find: Callable[..., Initialized]) -> Bound:
-    """An estimator that finds its beginning in another way, if it has to find one."""
+    """Make an estimator that finds its beginning in another way, if it has to find one."""
     if isinstance(bound, Recursive) and bound.initialization is not None:
         return replace(bound, initialization=replace(bound.initialization, find=find))
     return bound

@@ -59,7 +59,7 @@ class Cell:
 
     @property
     def runs(self) -> int:
-        """How many there are."""
+        """Return how many there are."""
         return self.end - self.first
 
     @property
@@ -109,7 +109,7 @@ class Sent(NamedTuple):
     logs: Sequence[tuple[Path, bytes]]
 
     def packed(self) -> tuple[bytes, dict[str, bytes]]:
-        """What `Cell.packed` gives, and the files that it writes, by their paths in its folder."""
+        """Return what `Cell.packed` gives, and the files that it writes, by paths in its folder."""
         with TemporaryDirectory() as scratch:
             root, folder = Path(scratch).resolve() / "root", Path(scratch) / "files"
             try:
@@ -138,7 +138,7 @@ class Sent(NamedTuple):
 
 @dataclass
 class Pace:
-    """How a campaign goes, as its progress shows it.
+    """Describes how a campaign goes, as its progress shows it.
 
     Attributes:
         runs: of all cells.
@@ -173,7 +173,7 @@ def judge(experiment: Experiment, setting: Setting) -> Pass:
 
 
 def judge_all(experiments: Sequence[Experiment], setting: Setting) -> Iterator[Pass]:
-    """What replaying and judging leaves of each experiment, in their order; see `judge`.
+    """Return what replaying and judging leaves of each experiment, in their order; see `judge`.
 
     Files stay where cells are kept.
     """
@@ -219,7 +219,7 @@ def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
 def work_off(
     cells: Sequence[Cell], open_pool: PoolFactory, checkpoints: Checkpoints, pace: Pace
 ) -> Iterator[Pass]:
-    """What cells leave, in their order; those that are kept are not worked off again.
+    """Yield what cells leave, in their order; those that are kept are not worked off again.
 
     Memory holds what is handed out and what comes in. Raises BadInput where the workers of a cell died
     again and again.

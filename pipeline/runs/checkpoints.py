@@ -1,4 +1,4 @@
-"""What a campaign that is not finished has done so far, in a folder beside its result.
+"""Keeps what a campaign that is not finished has done so far, in a folder beside its result.
 
     OUT.unfinished/
         fuselog.lock    held by the process that works on the campaign
@@ -36,7 +36,7 @@ _LOG = logging.getLogger("fuselog")
 
 
 class Checkpoints:
-    """The folder, whose lock is held."""
+    """Keeps a campaign's cells in a folder, whose lock is held."""
 
     def __init__(self, folder: Path, lock: FileLock) -> None:
         self.folder = folder
@@ -74,15 +74,15 @@ class Checkpoints:
                 shutil.rmtree(path, ignore_errors=True)
 
     def place_of(self, key: str) -> Path:
-        """Where the files of a cell go."""
+        """Return where the files of a cell go."""
         return self.folder / key
 
     def has(self, key: str) -> bool:
-        """Whether a cell is done, with all its files."""
+        """Tell whether a cell is done, with all its files."""
         return self._left(key) is not None
 
     def read(self, key: str) -> Any:
-        """What a cell left; None where it is not done."""
+        """Read what a cell left; None where it is not done."""
         left = self._left(key)
         return None if left is None else pickle.loads(left.pickled)
 

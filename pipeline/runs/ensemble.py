@@ -83,7 +83,7 @@ def cut_in_parts(
 
 @dataclass
 class Pass:
-    """What a streamed pass leaves.
+    """Holds what a streamed pass leaves.
 
     Attributes:
         judge: of all runs.
@@ -107,7 +107,7 @@ class Pass:
 
     @property
     def coverage(self) -> list[Row]:
-        """What became of every topic."""
+        """Return what became of every topic."""
         return rows_of(self.usages, self.untaken, self.judge.doubts)
 
     def merge(self, other: "Pass") -> None:
@@ -268,7 +268,7 @@ def parameters_of(bound: Sequence[Bound]) -> dict[str, dict[str, Any]]:
 
 
 def stated_of(bound: Sequence[Bound], source: Source) -> dict[str, dict[str, str]]:
-    """By label, the parameters that are None and that channels of a log state: "VALUE (TOPIC)".
+    """Return by label the parameters that are None and that channels of a log state: "VALUE (TOPIC)".
 
     Of several topics that state the same value the first is named.
     """
@@ -316,7 +316,7 @@ def replay_blocks(
 def of_run(
     block: Mapping[str, Ragged], errors: Sequence[Errors], run: int
 ) -> tuple[dict[str, Any], list[Errors]]:
-    """What a timeline draws: the streams of one run, and its errors."""
+    """Return what a timeline draws: the streams of one run, and its errors."""
     streams = {topic: rows.of_run(run) for topic, rows in block.items()}
     return streams, [errors_at(each, each.run == run) for each in errors]
 
@@ -369,7 +369,7 @@ def judge_logs(
 def estimates_metadata(
     source: Source, estimators: Settings, path: Path, log: Path, order: Clock = "publish_time"
 ) -> RunMetadata:
-    """What the estimates log at `path` says of itself: its run, estimators, span, clock and log.
+    """Describe the estimates log at `path`, for its metadata: its run, estimators, span, clock and log.
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """

@@ -1,4 +1,4 @@
-"""Who works off the cells of a campaign: this process, others on this machine, a Dask cluster."""
+"""Opens the workers of a campaign's cells: this process, others on this machine, a Dask cluster."""
 
 import hashlib
 import logging
@@ -33,7 +33,7 @@ PACKAGES = ("recorders", "replay", "pipeline")
 
 
 class WorkerPool(NamedTuple):
-    """Workers that are there.
+    """Holds an executor and what is known of its workers.
 
     Attributes:
         executor: hands work to them.
@@ -53,11 +53,15 @@ class WorkerPool(NamedTuple):
 PoolFactory = Callable[[], AbstractContextManager[WorkerPool]]
 
 
-def pool_for(workers: int | None, scheduler: str | None, runs: int) -> PoolFactory:
-    """Who works on so many runs: whom the options ask for, else processes on all cores if that pays.
+def pool_for(
+    workers: int | None, scheduler: str | None, runs: int, executor: Executor | None = None
+) -> PoolFactory:
+    """Choose who works on so many runs: whom the options ask for, else all cores if that pays.
 
-    Raises BadInput where both options are given.
+    An executor that is there does all of it. Raises BadInput where both options are given.
     """
+    if executor is not None:
+        return pool_of(executor)
     if scheduler is not None and workers is not None:
         raise BadInput(
             f"--workers {workers} --scheduler {scheduler}: a scheduler has its own workers; give one "
@@ -84,7 +88,7 @@ class InlineExecutor(Executor):
     """Does the work when it is submitted, in the calling thread."""
 
     def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """What the work gave, or raised if it is no interrupt."""
+        """Do the work at once; the future has what it gave, or raised if that is no interrupt."""
         future: Future[Any] = Future()
         try:
             future.set_result(work(*args, **kwargs))
@@ -95,7 +99,7 @@ class InlineExecutor(Executor):
 
 @contextmanager
 def inline_pool() -> Iterator[WorkerPool]:
-    """Nobody but the calling process, whose replay uses all cores."""
+    """Open a pool of the calling process alone, whose replay uses all cores."""
     yield WorkerPool(InlineExecutor(), 1)
 
 
@@ -108,7 +112,7 @@ def threads() -> Iterator[WorkerPool]:
 
 
 def processes(count: int) -> PoolFactory:
-    """So many processes on this machine, each on one core; they end with this one, however that ends."""
+    """Make a pool of so many processes, each on one core; they end with this one, however that ends."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:

@@ -122,7 +122,7 @@ def _spelt_out(label: str, stated: Mapping[str, dict[str, Any]], *above: str) ->
 
 @dataclass(frozen=True)
 class Setting:
-    """Where and how an experiment runs.
+    """States where and how an experiment runs.
 
     Attributes:
         folder: what is written goes there.
@@ -171,19 +171,21 @@ def shipped(kind: str) -> dict[str, Path]:
 
 
 class Stated(NamedTuple):
-    """What an experiment is before settings go over it.
+    """Holds what an experiment is before settings go over it.
 
     Attributes:
         name: what it is called.
         source: what it was read from, as messages name it.
         values: its entries.
-        folder: what its files count from.
+        folder: what its logs count from.
+        files: what else it was read from.
     """
 
     name: str
     source: str
     values: Mapping[str, Any]
     folder: Path
+    files: Sequence[Path] = ()
 
     @property
     def labels(self) -> Collection[str]:
@@ -223,7 +225,7 @@ def read_experiment(name: str) -> Stated:
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
     path = known.get(name, Path(name))
-    return Stated(path.stem, name, read_toml(path), path.parent)
+    return Stated(path.stem, name, read_toml(path), path.parent, () if name in known else (path,))
 
 
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
@@ -319,7 +321,7 @@ def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
 
 
 def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:
-    """What claims may name: the number of the runs, and what a study's options have of numbers."""
+    """Return what claims may name: the number of the runs, and the numbers of a study's options."""
     stated = {name: value for name, value in options if isinstance(value, int | float)}
     return {"runs": experiment.runs, **stated}
 

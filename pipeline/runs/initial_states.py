@@ -1,4 +1,4 @@
-"""Where a replay starts that does not begin at the log's own prior.
+"""Starts replays elsewhere than at the log's own prior.
 
 An estimator with a prior begins there. Where the replayed span begins later, that prior is of another
 time, and the state must come from elsewhere: from the truth, or from what an earlier replay estimated.
@@ -76,7 +76,7 @@ def origins_of(
     order: Clock,
     gap_limit_s: float,
 ) -> list[Origin]:
-    """What each run starts from; none where that is not stated.
+    """Find what each run starts from; none where that is not stated.
 
     Args:
         sources: the runs.

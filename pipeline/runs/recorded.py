@@ -38,7 +38,7 @@ class Replayed:
 
     @property
     def judged(self) -> list[Errors | Innovations | SetErrors | Output]:
-        """All that metrics may judge."""
+        """Return all that metrics may judge."""
         outputs = [
             Output(*split_topic(topic), topic.rpartition("/")[2], rows, self.sources)
             for topic, rows in self.outputs.items()

@@ -1,4 +1,4 @@
-"""What every study does: obtain runs, replay and judge them, keep the first logs, draw the first run.
+"""Does what every study does: obtain runs, replay and judge them, keep the first logs, draw a run.
 
 A study keeps what is its own: cases, claims, tables, figures.
 """
@@ -74,7 +74,7 @@ class Runner:
         )
 
     def replay(self, sources: Sequence[MemorySource], estimators: Settings | None = None) -> Replayed:
-        """What the experiment's estimators, or others, make of runs; all in memory."""
+        """Replay runs by the experiment's estimators, or others; all in memory."""
         return replay_ensemble(
             sources,
             self.experiment.estimators if estimators is None else estimators,

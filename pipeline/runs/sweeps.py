@@ -231,7 +231,7 @@ def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
 
 
 def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | Figure"]:
-    """Of each quantity and case a heat map over two numbers, else curves over every parameter."""
+    """Draw each quantity and case: a heat map over two numbers, else curves over every parameter."""
     numbers = all(isinstance(value, int | float) for each in over for value in each.taken)
     grid = math.prod(len(each.taken) for each in over) == table["point"].nunique()
     figures: dict[str, Chart | Figure] = {}

@@ -1,4 +1,4 @@
-"""How well logs tell parameters: intervals, correlations, profiles, and in words what they cannot tell.
+"""Measures how well logs tell parameters: intervals, correlations, profiles, and what they cannot tell.
 
 All by the curvature of minus the log-likelihood at its least: its inverse is the parameters' covariance.
 """
@@ -24,7 +24,7 @@ WIDEST = 3.0  # in coordinates: times or divided by 20
 
 
 class Confidence(NamedTuple):
-    """What the curvature tells of m of k parameters, those that lie at no bound.
+    """Holds what the curvature tells of m of k parameters, those that lie at no bound.
 
     Attributes:
         places: (m,) which of them.
@@ -49,7 +49,7 @@ class Confidence(NamedTuple):
 
 
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
-    """What a curvature (m, m) tells of the parameters at these places."""
+    """Compute what a curvature (m, m) tells of the parameters at these places."""
     values, vectors = np.linalg.eigh(curvature)
     rises = values > 0.0
     covariance = (vectors / np.where(rises, values, np.inf)) @ vectors.T

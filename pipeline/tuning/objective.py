@@ -1,4 +1,4 @@
-"""What a tuning minimises: logs replayed with other parameters, and what their replays cost.
+"""Computes what a tuning minimises: logs replayed with other parameters, and their replays' cost.
 
 Every log is replayed by itself; a point costs what the sums over all logs do, in their order. Logs and
 points are shared among threads, whose kernels run side by side, or among the workers of a pool.
@@ -62,7 +62,7 @@ class Run(NamedTuple):
 
 
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
-    """What estimators read of a log, and its truths, in memory."""
+    """Read what estimators read of a log, and its truths, into memory."""
     topics = {topic for each in bound for topic in (*each.static, *each.streams)}
     topics |= {
         name
@@ -135,7 +135,7 @@ def _cost_of_squares(sums: Sums) -> float:
 
 
 class Criterion(NamedTuple):
-    """What a tuning goes by.
+    """Holds what a tuning goes by.
 
     Attributes:
         sums: what is summed over logs, of one log's outputs.
@@ -271,7 +271,7 @@ class Objective:
             self._told.append(told)
 
     def begins_alike(self, values: Floats) -> bool:
-        """Whether filters would begin at the same stamps with these values (k,)."""
+        """Tell whether filters would begin at the same stamps with these values (k,)."""
         return self.by == "likelihood" or all(
             _stamps(run) == _stamps(self.begun(values, run)) for run in self.runs
         )
@@ -294,7 +294,7 @@ class Objective:
         return bind(self.label, run.ensemble, with_values(self.settings, self.names, values))
 
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
-        """What the estimator makes of a log with these values (k,), by topic; BadInput as `replay`."""
+        """Replay a log with these values (k,): outputs by topic; BadInput as `replay`."""
         bound = [
             with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
             for each in self._bound(values, run)
@@ -302,7 +302,7 @@ class Objective:
         return collect(replay(run.ensemble, bound))
 
     def sums(self, points: Floats, run: Run, told: int) -> list[Sums | None]:
-        """What a log tells at each point (n, k); None where it gave another number of messages."""
+        """Sum what a log tells at each point (n, k); None where it gave another number of messages."""
         return [self._sums(point, run, told) for point in points]
 
     def _sums(self, values: Floats, run: Run, told: int) -> Sums | None:

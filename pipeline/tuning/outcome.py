@@ -1,4 +1,4 @@
-"""What a tuning found: tables, figures, sentences, settings to replay with, a result folder."""
+"""Presents what a tuning found: tables, figures, sentences, settings to replay with, a result folder."""
 
 import json
 import math
@@ -35,8 +35,8 @@ SETTINGS = "settings.toml"
 IMPROBABLE = 1e-3  # of white innovations: they are none
 
 
-class Found(NamedTuple):
-    """Where a search ended.
+class SearchOutcome(NamedTuple):
+    """States where a search ended.
 
     Attributes:
         coordinates: what was searched for.
@@ -61,7 +61,7 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tuning:
-    """What a tuning found.
+    """Holds what a tuning found.
 
     Attributes:
         label: the estimator's.
@@ -80,7 +80,7 @@ class Tuning:
     held_out_logs: Sequence[Source]
     settings: Mapping[str, Mapping[str, Any]]
     objective: Objective
-    found: Found
+    found: SearchOutcome
     costs: Floats
     held_out_costs: Floats | None
     folds: pd.DataFrame
@@ -116,7 +116,7 @@ class Tuning:
 
     @property
     def correlation(self) -> pd.DataFrame:
-        """How the errors of what was searched for (logarithms, where positive) hang together."""
+        """Return how the errors of what was searched for (logarithms, where positive) correlate."""
         if self.found.told is None:
             return pd.DataFrame()
         names = [self.found.coordinates.free[place].name for place in self.found.told.places]
@@ -212,7 +212,7 @@ class Tuning:
 
     @property
     def notes_of_search(self) -> list[str]:
-        """Those of the search alone, which need no replay."""
+        """Return the notes of the search alone, which need no replay."""
         return list(self._notes_of_search())
 
     def _notes_of_search(self) -> Iterator[str]:

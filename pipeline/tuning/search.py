@@ -51,13 +51,13 @@ class Free(NamedTuple):
 
     @property
     def is_kept(self) -> bool:
-        """Whether it stays at its start."""
+        """Tell whether it stays at its start."""
         return self.low == self.high
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """What is searched over: of k parameters the logarithm, or the value in a unit of its own."""
+    """Holds what is searched over: of k parameters the logarithm, or the value in a unit of its own."""
 
     free: Sequence[Free]
     units: Floats
@@ -83,7 +83,7 @@ class Coordinates:
         return low, high
 
     def at_bounds(self, point: Floats) -> NDArray[np.bool_]:
-        """Which coordinates (k,) of a point lie at a bound."""
+        """Return which coordinates (k,) of a point lie at a bound."""
         low, high = self.bounds
         return (point - low < CURVATURE_STEP) | (high - point < CURVATURE_STEP)
 
@@ -160,7 +160,7 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
 def least(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
 ) -> tuple[Floats, bool]:
-    """Where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
+    """Find where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
 
     In coordinates. A descent from far off can end in another minimum than the least, such as one in
     which two modes have changed their parts. So it begins, and ends, where no change of a single

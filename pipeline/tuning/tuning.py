@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.api.planning import Kind, Log, settings_of, sources_of
-from pipeline.runs.executors import WorkerPool, pool_for, pool_of
+from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
     CRITERIA,
@@ -27,7 +27,7 @@ from pipeline.tuning.objective import (
     silent,
     with_values,
 )
-from pipeline.tuning.outcome import START, TUNED, Found, Source, Tuning
+from pipeline.tuning.outcome import START, TUNED, SearchOutcome, Source, Tuning
 from pipeline.tuning.search import (
     Coordinates,
     Free,
@@ -151,11 +151,9 @@ def _pool(
     workers: int | None, scheduler: str | None, executor: Executor | None
 ) -> AbstractContextManager[WorkerPool | None]:
     """Who evaluates; None stands for threads of this process."""
-    if executor is not None:
-        return pool_of(executor)()
-    if workers is None and scheduler is None:
+    if workers is None and scheduler is None and executor is None:
         return nullcontext()
-    return pool_for(workers, scheduler, 1)()
+    return pool_for(workers, scheduler, 1, executor)()
 
 
 def _gate(bound: Sequence[Bound]) -> float:
@@ -221,7 +219,7 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
     return Free(name, start, low, min(high, greatest), is_positive, is_assumed)
 
 
-def _settled(objective: Objective, free: Sequence[Free], grid: int) -> Found:
+def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
     """The values of least cost with which filters begin where they began in the search.
 
     Without a prior in the log, where a filter begins depends on the values: on how far it trusts its
@@ -237,7 +235,9 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> Found:
     return found._replace(begins_alike=found.was_stopped or objective.begins_alike(found.optimum))
 
 
-def _search(objective: Objective, free: Sequence[Free], grid: int, point: Floats | None = None) -> Found:
+def _search(
+    objective: Objective, free: Sequence[Free], grid: int, point: Floats | None = None
+) -> SearchOutcome:
     """The values of least cost, and how well they are told; from a point (k,), in coordinates, if given.
 
     A parameter that the logs tell nothing of stays at its start. Raises BadInput where the cost does not
@@ -262,14 +262,14 @@ def _search(objective: Objective, free: Sequence[Free], grid: int, point: Floats
                 coordinates, point = nearer, ended
                 told, is_at_edge = _told(objective, coordinates, point)
         optimum, evaluations = coordinates.values(point), objective.best.evaluations
-        return Found(
+        return SearchOutcome(
             coordinates, optimum, evaluations, told, has_converged=has_converged, is_at_edge=is_at_edge
         )
     except KeyboardInterrupt as stopped:
         if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
             raise
         best_yet = objective.best
-        return Found(coordinates, best_yet.point, best_yet.evaluations, was_stopped=True)
+        return SearchOutcome(coordinates, best_yet.point, best_yet.evaluations, was_stopped=True)
 
 
 def _told(

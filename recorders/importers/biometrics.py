@@ -53,7 +53,7 @@ class ScoreMatricesParameters(Matchers):
 
 
 class Matrix(NamedTuple):
-    """One file: ids of probes and gallery, scores (probes, gallery)."""
+    """Holds one file: ids of probes and gallery, scores (probes, gallery)."""
 
     probes: list[str]
     gallery: list[str]

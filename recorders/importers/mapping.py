@@ -1,4 +1,4 @@
-"""One language for mappings: how fields of fuselog's messages are made of what others log.
+"""Defines one language for mappings: how fields of fuselog's messages are made of what others log.
 
 The mappings of ROS messages (`importers.ros.mapping`) and of tables (`importers.tables`) say this alike;
 what a source is, a field of a message or a column, is theirs.
@@ -118,7 +118,7 @@ class StreamMapping(Parameters):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What the stream's channel states."""
+        """Return what the stream's channel states."""
         stated = {name: repr(number) for name, number in self.states.items()}
         if not self.components:
             return stated
@@ -333,7 +333,7 @@ def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
 
 
 def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Which messages (n,) lack a number that they must have, or have none at all.
+    """Return which messages (n,) lack a number that they must have, or have none at all.
 
     `columns` may be without some fields.
     """

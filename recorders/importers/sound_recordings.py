@@ -65,7 +65,7 @@ class Recorded(NamedTuple):
 
 
 class Sound(NamedTuple):
-    """One sound: the files that may have it, and when it begins and ends there, ns since 1970."""
+    """Describes one sound: the files that may have it, its begin and end there, ns since 1970."""
 
     name: str
     files: list[str]

@@ -64,7 +64,7 @@ def unit(text: str) -> Unit:
 
 
 def unit_of(name: str) -> str:
-    """What a field or component is in by its name; empty where it has no unit.
+    """Return the unit of a field or component by its name; empty where it has no unit.
 
     >>> unit_of("specific_force_mps2"), unit_of("orientation_w")
     ('m/s^2', '')
@@ -73,7 +73,7 @@ def unit_of(name: str) -> str:
 
 
 def conversion(given: str, name: str) -> float:
-    """By what numbers in a unit are multiplied for the field or component `name`.
+    """Return by what numbers in a unit are multiplied for the field or component `name`.
 
     Raises BadInput where the unit is none, or of another kind of quantity.
 

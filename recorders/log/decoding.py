@@ -1,4 +1,4 @@
-"""From the bytes of opened regions to the columns of one topic.
+"""Decodes the bytes of opened regions into the columns of one topic.
 
 How messages are laid out is believed only after a check: our fixed layout where every constant byte
 agrees, else the protobuf library reads them one by one. A foreign log is read slowly, never wrongly.

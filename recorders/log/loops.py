@@ -29,7 +29,7 @@ _CHANNEL = int(Opcode.CHANNEL)
 
 
 class Scan(NamedTuple):
-    """What a walk over a chunk's records finds; offsets in bytes, times in ns.
+    """Holds what a walk over a chunk's records finds; offsets in bytes, times in ns.
 
     `messages` are channel by channel, each in file order, and `counts` says how many each channel has.
     `end` is where the walk stopped: the chunk's length, or the first record that is not whole.
@@ -67,7 +67,7 @@ def scan(data: NDArray[np.uint8]) -> Scan:
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
-    """Whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
+    """Tell whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
     if offsets[-1] + pattern.size > len(data):
         return False
     agreed = _loop(_agree, len(offsets) * pattern.size)

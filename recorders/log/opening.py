@@ -15,7 +15,7 @@ from recorders.log.run import RECORD_NAME, RunMetadata
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a log; MCAP allows several channels to share it. `metadata` is what they agree on."""
+    """Describes one topic, which several channels may share; `metadata` is what they agree on."""
 
     name: str
     schema_name: str
@@ -34,7 +34,7 @@ class Log:
 
     @cached_property
     def run(self) -> RunMetadata | None:
-        """What the run was, where the log says so."""
+        """Return what the run was, where the log says so."""
         record = self.container.metadata.get(RECORD_NAME)
         return None if record is None else RunMetadata.from_record(record, self.path)
 
@@ -45,7 +45,7 @@ class Log:
 
     @cached_property
     def companions(self) -> dict[str, Topic]:
-        """What is in the log for viewers alone, by name, sorted."""
+        """Return what is in the log for viewers alone, by name, sorted."""
         return {name: topic for name, topic in self._all.items() if COMPANION_OF in topic.metadata}
 
     @cached_property
@@ -81,7 +81,7 @@ class Log:
 
     @property
     def loss_statement(self) -> str | None:
-        """What is missing from a recovered log, in one sentence; None where nothing is."""
+        """Say what is missing from a recovered log, in one sentence; None where nothing is."""
         parts = [self._lost_messages(), _listed(self.container.damages, "damages")]
         stated = ": ".join(filter(None, parts))
         return f"{self.path}: {stated}" if stated else None

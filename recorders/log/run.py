@@ -1,4 +1,4 @@
-"""What a run was: enough, in the log itself, to record it again."""
+"""Describes a run: enough, in the log itself, to record it again."""
 
 import json
 from dataclasses import dataclass, field

@@ -33,7 +33,7 @@ NUMPY_TYPES: dict[Kind, np.dtype] = {
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a message.
+    """Describes one field of a message.
 
     `may_be_nan` says that NaN stands for a value that is missing, `may_be_absent` that logs written
     before there was such a field lack it: who reads them asks whether the column is there.

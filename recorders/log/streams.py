@@ -1,4 +1,4 @@
-"""One topic of a log, held in memory as columns."""
+"""Holds one topic of a log in memory, as columns."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -152,7 +152,7 @@ def stream_of(
     metadata: Mapping[str, str] | None = None,
     allow_nan: bool = False,
 ) -> Stream:
-    """As `make_stream`, of all columns by name; with `allow_nan`, NaN may stand in any of them."""
+    """Make a stream as `make_stream` does, of all columns by name; `allow_nan` lets NaN stand in any."""
     published = _as_column(topic, "publish_time_ns", publish_time_ns)
     logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
     # an empty vector is as good as an absent one

@@ -1,4 +1,4 @@
-"""What an acoustic sensor hears of a supersonic shot, in the plane.
+"""Models what an acoustic sensor hears of a supersonic shot, in the plane.
 
 Osborne, Bar-Shalom, George and Kaplan, "Statistical Efficiency of Target Localization from Angle and
 Shockwave Measurements", JAIF 2014. Angles are anticlockwise from the x axis, in rad. Component-first:
@@ -46,7 +46,7 @@ def azimuth_range(shooter: Components, sensor: Components) -> tuple[Component, C
 def fired_from(
     place: Components, velocity: Components, sensor: Components, speed_of_sound_mps: Component
 ) -> tuple[Component, Component]:
-    """Where something was whose sound a sensor hears now, when it is at `place` by now.
+    """Find where something was whose sound a sensor hears now, when it is at `place` by now.
 
     The sound's time of travel is that of the distance now, corrected once: what is left out is the
     square of velocity over the speed of sound, 2 cm of 1 km at 1.5 m/s.
@@ -59,7 +59,7 @@ def fired_from(
 
 
 def shockwave_side(azimuth: Component, trajectory: Component, medium: Medium) -> Component:
-    """On which side of the line of fire a sensor hears the shockwave: +1 or -1; 0 where it does not.
+    """Find on which side of the line of fire a sensor hears the shockwave: +1 or -1; 0 for none.
 
     It does within 90 deg less the Mach angle of the line, the line itself left out (figure 2). Eq (7)
     says the same, but for angles that need wrapping.
@@ -165,6 +165,6 @@ def sensor_components(sensor: int) -> list[str]:
 
 
 def stated_metadata(noise: Noise, medium: Medium) -> dict[str, str]:
-    """How a channel of detections states noise (`sigma_muzzle_blast_rad`, ...) and medium."""
+    """State noise (`sigma_muzzle_blast_rad`, ...) and medium as a channel of detections does."""
     stated = {f"sigma_{name}": value for name, value in noise._asdict().items()} | medium._asdict()
     return {name: repr(value) for name, value in stated.items()}

@@ -1,4 +1,4 @@
-"""By how much later a sound comes at one microphone than at another: generalised cross-correlation.
+"""Measures how much later a sound comes at one microphone than at another, by cross-correlation.
 
 Knapp and Carter, "The Generalized Correlation Method for Estimation of Time Delay", IEEE Transactions
 on Acoustics, Speech, and Signal Processing 24(4), 1976. The phase of the cross-spectrum is the delay's,
@@ -25,7 +25,7 @@ STEPS = 5
 
 
 class Delay(NamedTuple):
-    """By how much later one signal is than another; `likeness` is 1 where all phases agree with it."""
+    """States how much later one signal is than another; `likeness` is 1 where all phases agree."""
 
     delay_s: float
     variance_s2: float
@@ -33,7 +33,7 @@ class Delay(NamedTuple):
 
 
 class Arrivals(NamedTuple):
-    """When a sound came, microphone by microphone, beside the one that hears it most clearly.
+    """Holds when a sound came at each microphone, beside the one that hears it most clearly.
 
     Attributes:
         reference: which one that is.
@@ -56,7 +56,7 @@ def delay_between(
     longest_s: float,
     weighting: Weighting = "phat",
 ) -> Delay:
-    """By how much later `late` (samples,) is than `early` (samples,), at most `longest_s` either way.
+    """Measure how much later `late` (samples,) is than `early`, at most `longest_s` either way.
 
     The variance is that of the equation that the delay solves, sum w omega sin(phase left) = 0, from
     what is left of the phases themselves (the sandwich of Huber, "The behavior of maximum likelihood
@@ -102,7 +102,7 @@ def arrivals(
     longest_s: Floats,
     weighting: Weighting = "phat",
 ) -> Arrivals:
-    """When a sound came at each of n microphones, from recordings (n, samples) of the same time.
+    """Measure when a sound came at each of n microphones, from recordings (n, samples) of the same time.
 
     Delays between all pairs are at most `longest_s` (n, n). A microphone's variance is the sum of three:
     of noise, two of which are the variance of a pair's delay; of echoes and neighbouring peaks, by how

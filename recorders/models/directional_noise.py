@@ -33,7 +33,7 @@ def saddlepoint(concentrations: ArrayLike) -> NDArray[np.float64]:
 def sample_bingham(
     axes: ArrayLike, concentrations: ArrayLike, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """One sample (..., d) of each Bingham distribution, axes (..., d, d) and concentrations (..., d).
+    """Draw one (..., d) of each Bingham distribution, axes (..., d, d) and concentrations (..., d).
 
     Exact rejection sampling under an angular central Gaussian envelope (Kent, Ganeiban, Mardia, "A new
     unified approach for the simulation of a wide class of directional distributions", JCGS 27, 2018);

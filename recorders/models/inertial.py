@@ -41,7 +41,7 @@ def gravity(latitude_deg: Component, height_m: Component) -> Component:
 
 
 def earth_rate(latitude_deg: Component) -> Vector:
-    """How the plane turns with the earth, rad/s, about east, north, up."""
+    """Compute how the plane turns with the earth, rad/s, about east, north, up."""
     latitude = np.radians(latitude_deg)
     return 0.0, EARTH_RATE_RADPS * np.cos(latitude), EARTH_RATE_RADPS * np.sin(latitude)
 

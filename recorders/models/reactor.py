@@ -17,5 +17,5 @@ def react(pressures: Components, duration_s: Component) -> tuple[Component, Comp
 
 
 def total_pressure(pressures: Components) -> tuple[Component]:
-    """What the sensor reads, without noise."""
+    """Compute what the sensor reads, without noise."""
     return (pressures[0] + pressures[1],)

@@ -1,4 +1,4 @@
-"""Whether a body stands, from its inertial samples alone.
+"""Detects from its inertial samples alone whether a body stands.
 
 A body that stands feels gravity, which does not change, and does not turn. Skog, Handel, Nilsson and
 Rantakokko, Zero-Velocity Detection - An Algorithm Evaluation, IEEE Transactions on Biomedical
@@ -13,7 +13,7 @@ Integers = NDArray[np.int64]
 
 
 def unrest(time_ns: Integers, force: Floats, rate: Floats, window_s: float) -> tuple[Floats, Floats]:
-    """How much a unit was shaken and turned during the window that ends with each sample.
+    """Measure how much a unit was shaken and turned during the window that ends with each sample.
 
     Args:
         time_ns: (n,), sorted.

@@ -1,4 +1,4 @@
-"""How channels name the components of a state."""
+"""Names the components of a state, as channels do."""
 
 from collections.abc import Sequence
 

@@ -73,7 +73,7 @@ class AcousticParameters(Parameters):
 
     @property
     def noise(self) -> Noise:
-        """What the sensors' errors are like."""
+        """Return what the sensors' errors are like."""
         return Noise(
             float(np.radians(self.sigma_muzzle_blast_deg)),
             float(np.radians(self.sigma_shockwave_deg)),

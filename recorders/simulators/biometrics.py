@@ -92,7 +92,7 @@ class BiometricScoresParameters(Parameters):
 
 
 class Users(NamedTuple):
-    """What each user brings to every matcher: standard normals (users, matchers)."""
+    """Holds what each user brings to every matcher: standard normals (users, matchers)."""
 
     genuine: Floats
     probe: Floats

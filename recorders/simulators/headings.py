@@ -47,7 +47,7 @@ class HeadingsParameters(Parameters):
     prior_sigma_rad: PositiveFloat = 1.0
 
     def covariances(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Those of system and measurement noise, (2, 2), rad^2."""
+        """Return the covariances of system and measurement noise, (2, 2), rad^2."""
         return (
             equal_sigmas(self.system_sigma_rad, self.system_correlation),
             equal_sigmas(self.measurement_sigma_rad, self.measurement_correlation),

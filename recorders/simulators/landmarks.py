@@ -43,7 +43,7 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 
 
 class Drive(NamedTuple):
-    """What one robot did: poses (steps + 1, 3) at the odometry stamps, velocities (steps, 2)."""
+    """Holds what one robot did: poses (steps + 1, 3) at the odometry stamps, velocities (steps, 2)."""
 
     times_s: NDArray[np.float64]
     poses: NDArray[np.float64]
@@ -61,7 +61,7 @@ class Drive(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """One sensor's looks: stamps (n,), pairs of look and target, and what is true of each pair."""
+    """Holds one sensor's looks: stamps (n,), pairs of look and target, and what is true of each pair."""
 
     times_s: NDArray[np.float64]
     look: NDArray[np.int64]

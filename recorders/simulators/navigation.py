@@ -31,11 +31,11 @@ class Path(NamedTuple):
     attitude: BSpline
 
     def orientation(self, times_s: Floats) -> Rotation:
-        """How the body is turned, forward, left, up to east, north, up."""
+        """Return how the body is turned, forward, left, up to east, north, up."""
         return Rotation.from_euler("ZYX", self.attitude(times_s))
 
     def turn_rate(self, times_s: Floats) -> Floats:
-        """How fast it turns against the plane, (n, 3) in the body's axes."""
+        """Return how fast it turns against the plane, (n, 3) in the body's axes."""
         _, pitch, roll = self.attitude(times_s).T
         yaw_rate, pitch_rate, roll_rate = self.attitude.derivative()(times_s).T
         return np.stack(

@@ -56,12 +56,12 @@ class OpticalParameters(Parameters):
 
     @property
     def nominal_attitude_rad(self) -> Array:
-        """How the sensors were meant to be turned, (sensors, 3)."""
+        """Return how the sensors were meant to be turned, (sensors, 3)."""
         return self._per_sensor("nominal_attitude_deg", self.nominal_attitude_deg)
 
     @property
     def bias_rad(self) -> Array:
-        """By how much they are not, (sensors, 3)."""
+        """Return by how much they are turned otherwise, (sensors, 3)."""
         return self._per_sensor("bias_deg", self.bias_deg)
 
     def _per_sensor(self, name: str, given_deg: list[Triple] | None) -> Array:

@@ -68,7 +68,7 @@ class ShotSequenceParameters(AcousticParameters):
 
 
 class Heard(NamedTuple):
-    """What all sensors measure of all shots, (shots, sensors); NaN for a shockwave that is not heard.
+    """Holds all sensors' measurements of all shots, (shots, sensors); NaN for an unheard shockwave.
 
     `arrival_s` is since the epoch; `is_heard` is false of what a sensor missed.
     """

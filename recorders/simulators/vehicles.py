@@ -128,13 +128,13 @@ class VehiclesParameters(Parameters):
 
     @property
     def field_area_m2(self) -> float:
-        """How large the field is."""
+        """Return how large the field is."""
         west, east, south, north = self.field_m
         return (east - west) * (north - south)
 
 
 class Drive(NamedTuple):
-    """What all vehicles did.
+    """Holds what all vehicles did.
 
     `nominal` starts (vehicles, 4) are what is known before, `states` (steps + 1, vehicles, 4) the truth,
     `accelerations` (steps, vehicles, 2) hold for a step each.

@@ -246,7 +246,7 @@ def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
 
 
 def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
-    """One prediction x (+) w in place: algorithm 1, whose second input is Z^w, not the printed Z^v.
+    """Predict x (+) w in place: algorithm 1, whose second input is Z^w, not the printed Z^v.
 
     It works in the frame of the mode, where small moments keep their digits next to large ones.
 
@@ -288,7 +288,7 @@ def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> 
 
 
 def update(axes: NDArray, z: NDArray, inverse_noise: NDArray, measurement: Vector) -> None:
-    """One measurement update in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
+    """Update by one measurement in place: algorithm 2 with M = z (+) (D M^v), not the printed M^p.
 
     Args:
         axes: principal axes (d, d) in columns, the mode last.

@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
-    """What is exceeded with one minus this probability, by that many degrees of freedom."""
+    """Return what is exceeded with one minus this probability, by that many degrees of freedom."""
     from scipy.special import gammaincinv
 
     return 2.0 * gammaincinv(np.divide(degrees, 2.0), probability)
 
 
 def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
-    """What is exceeded with this probability."""
+    """Return what is exceeded with this probability."""
     from scipy.special import chdtri
 
     return chdtri(degrees, probability)

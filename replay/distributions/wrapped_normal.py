@@ -29,7 +29,7 @@ class WrappedNormal(NamedTuple):
 
 
 class CircularMoments(NamedTuple):
-    """What the deterministic samples preserve: first trigonometric moments exp(i mean - variance / 2).
+    """Makes samples that preserve the first trigonometric moments exp(i mean - variance / 2).
 
     Attributes:
         mean: circular means (..., 2).

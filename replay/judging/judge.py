@@ -65,7 +65,7 @@ TIME_BIN_NS = 1_000_000
 
 
 class Judged(NamedTuple):
-    """What is judged of a block: the errors of estimates and of sets, and the innovations."""
+    """Holds what is judged of a block: the errors of estimates and of sets, and the innovations."""
 
     errors: list[Errors]
     sets: list[SetErrors]
@@ -74,7 +74,7 @@ class Judged(NamedTuple):
 
 @dataclass
 class StreamDiagnostics:
-    """What a stream says of the replay itself, for sentences."""
+    """Collects what a stream says of the replay itself, for sentences."""
 
     failed: dict[int, str] = field(default_factory=dict)
     speaking: set[int] | None = None
@@ -241,11 +241,11 @@ class Judge:
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Where metrics of NEES and NIS lie with 95 % if an estimator is consistent, by their keys."""
+        """Compute where metrics of NEES and NIS lie with 95 % for consistent estimators, by key."""
         return self.intervals(0.95)
 
     def intervals(self, probability: float) -> dict[str, tuple[float, float]]:
-        """Where metrics of NEES and NIS lie with a probability if an estimator is consistent, by keys.
+        """Compute where metrics of NEES and NIS lie with a probability if all is well, by key.
 
         Errors of a run's steps hang together, so that NEES has the interval of one step's mean over the
         runs; innovations do not, and NIS has that of them all.
@@ -269,12 +269,12 @@ class Judge:
 
     @property
     def has_numbers(self) -> bool:
-        """Whether there are numbers, but for what a replay says of itself."""
+        """Tell whether there are numbers, but for what a replay says of itself."""
         return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in TOLD))
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """By topic, what is doubtful about a truth, of the first run of which there is something."""
+        """Return by topic what is doubtful about a truth, of the first run that has something."""
         found = dict(self._doubts)
         for truths in self._truths:
             found = truths.doubts | found
@@ -324,7 +324,7 @@ class Judge:
 
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
-        """For every estimate stream with truth, by topic, a row per step: see `tables.step_table`."""
+        """Return by topic, for estimates with truth, a row per step: see `tables.step_table`."""
         from replay.judging.tables import step_table
 
         return {
@@ -334,7 +334,7 @@ class Judge:
 
     @property
     def runs_table(self) -> "pd.DataFrame":
-        """One row per estimator, case and run: how many estimates, RMSE of each quantity, mean NEES."""
+        """Return one row per estimator, case and run: estimates, RMSE of each quantity, mean NEES."""
         from replay.judging.tables import joined, run_table
 
         return joined(run_table(each) for each in self._quantities.values())
@@ -348,14 +348,14 @@ class Judge:
 
     @property
     def modes(self) -> "pd.DataFrame":
-        """How probable modes are: a row per estimator, case, span of time and mode; see `MeansOfAll`."""
+        """Return modes' probabilities: a row per estimator, case, span and mode; see `MeansOfAll`."""
         from replay.judging.tables import joined
 
         return joined(self._means.modes())
 
     @property
     def effective(self) -> "pd.DataFrame":
-        """What share of the particles is effective: a row per estimator, case and span of time."""
+        """Return the effective share of the particles: a row per estimator, case and span of time."""
         from replay.judging.tables import joined
 
         return joined(self._means.effective())
@@ -369,7 +369,7 @@ class Judge:
 
     @property
     def judged(self) -> dict[str, Errors]:
-        """Of every estimate stream that has errors, by topic, the last block: its names and kinds."""
+        """Return by topic the last block of estimates that have errors: its names and kinds."""
         return {topic: each.errors for topic, each in self._quantities.items()}
 
 

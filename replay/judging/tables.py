@@ -1,4 +1,4 @@
-"""What is judged, as tables: rows per step, per run and span of time, per estimate.
+"""Makes tables of what is judged: rows per step, per run and span of time, per estimate.
 
 They are made of the judge's sums when they are asked for: what prints metrics alone needs no pandas.
 """
@@ -21,7 +21,7 @@ def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
 
 
 def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataFrame:
-    """One row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
+    """Return one row per step over the runs: RMSE of position and components, mean NEES, 95 % intervals.
 
     Where there are more than `judge.STEPS` steps, a row is of several; `step` is the first of them. Of
     a bound there is what it is over the ensemble, if there is that.
@@ -51,7 +51,7 @@ def step_table(quantities: Quantities, bounds: Bounds | None = None) -> pd.DataF
 
 
 def time_table(quantities: Quantities) -> pd.DataFrame:
-    """One row per run and span of time."""
+    """Return one row per run and span of time."""
     errors, by_time = quantities.errors, quantities.by_time
     cells, count, sums = by_time.filled()
     columns: dict[str, object] = {
@@ -65,7 +65,7 @@ def time_table(quantities: Quantities) -> pd.DataFrame:
 
 
 def run_table(quantities: Quantities) -> pd.DataFrame:
-    """One row per run."""
+    """Return one row per run."""
     errors = quantities.errors
     cells, count, sums = quantities.by_time.filled()
     runs, place = np.unique(cells[:, 0], return_inverse=True)
@@ -81,7 +81,7 @@ def run_table(quantities: Quantities) -> pd.DataFrame:
 
 
 def error_table(errors: Errors) -> pd.DataFrame:
-    """One row per run and step: error and sigma of every component, NEES."""
+    """Return one row per run and step: error and sigma of every component, NEES."""
     sigma = np.sqrt(np.diagonal(errors.covariance, axis1=1, axis2=2))
     columns: dict[str, object] = {
         "estimator": errors.estimator,

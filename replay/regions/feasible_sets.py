@@ -89,7 +89,7 @@ def arena_around(points: ArrayLike, margin_m: float) -> Arena:
 
 
 def excess_rad(pairs: Pairs, points: Floats) -> Floats:
-    """How far each pair's bound is exceeded at points (..., 2): (..., n), feasible where <= 0.
+    """Compute how far each pair's bound is exceeded at points (..., 2): (..., n), feasible where <= 0.
 
     The exact membership test, (4). NaN on a landmark itself, where the angle has no value.
     """

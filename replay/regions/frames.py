@@ -26,7 +26,7 @@ NOT_CUT = (CONTRADICTS_ITSELF, CONTRADICTS_PAST, UNDECIDED)
 
 
 class Known(NamedTuple):
-    """What is known beside the bearings: their bound, and where the robot can be.
+    """Holds what is known beside the bearings: their bound, and where the robot can be.
 
     `arena_m` is (low x, low y, high x, high y). None where it follows from the sensor's maximum range,
     which is None where that is the longest that it measured.
@@ -38,12 +38,12 @@ class Known(NamedTuple):
     maximum_range_m: float | None
 
     def metadata(self) -> dict[str, str]:
-        """As a channel states it."""
+        """State it as a channel does."""
         return {name: json.dumps(value) for name, value in self._asdict().items()}
 
     @classmethod
     def of(cls, metadata: Mapping[str, str]) -> "Known":
-        """What a channel states."""
+        """Read what a channel or parameters state, in the order of STATED."""
         return cls(*(json.loads(metadata[name]) for name in cls._fields))
 
 
@@ -112,7 +112,7 @@ def _within(places: Floats, range_m: float) -> Arena:
 
 
 class Bounds(NamedTuple):
-    """How far odometry and bearings err at most."""
+    """Describes how far odometry and bearings err at most."""
 
     position: Growth
     heading: Growth
@@ -120,7 +120,7 @@ class Bounds(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Bounds":
-        """From the five numbers of a channel or of parameters, in the order of STATED."""
+        """Read what a channel or parameters state, in the order of STATED."""
         return cls(Growth(*values[:2]), Growth(*values[2:4]), values[4])
 
 

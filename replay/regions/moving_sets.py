@@ -71,7 +71,7 @@ class Growth(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How a robot moved from one stamp to another, seen from its pose at the first.
+    """Describes how a robot moved from one stamp to another, seen from its pose at the first.
 
     The true `displacement_m` (2,) is within a disc of `position_error_m`, the turn within an interval.
     """
@@ -138,7 +138,7 @@ def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
 def moved(
     places: shapely.Geometry, headings: Headings, motion: Motion, direction: int = 1
 ) -> shapely.Geometry:
-    """Where a robot is after a motion, or with the direction -1 where it was before it.
+    """Compute where a robot is after a motion, or with the direction -1 where it was before it.
 
     `headings` are those before the motion. The displacements of all of them lie on an arc, and this in a
     disc: one around the origin where they span half a circle or more.

@@ -116,7 +116,7 @@ def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
 
 
 def slack(ring: Floats, points: Floats, order: Order) -> Floats:
-    """How much room the ring leaves at points (..., 2): 1 - u^2, or (9/4) u^2 (1 - u^2) for order 8."""
+    """Compute the ring's room at points (..., 2): 1 - u^2, or (9/4) u^2 (1 - u^2) for order 8."""
     squared = evaluate(ring[None], points)[..., 0] ** 2
     return 1.0 - squared if order == 4 else 2.25 * squared * (1.0 - squared)
 
@@ -155,7 +155,7 @@ def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid
 
 
 def order_of(ellipsoid: PseudoEllipsoid) -> Order:
-    """How many monomials it is made of."""
+    """Count the monomials that it is made of."""
     return 4 if len(ellipsoid.vector) == 4 else 8
 
 

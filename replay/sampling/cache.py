@@ -24,7 +24,7 @@ SHIPPED = files("fuselog_data") / "lcd-samples.bin"
 
 @dataclass(frozen=True)
 class SetName:
-    """What identifies one moment-corrected LCD set."""
+    """Identifies one moment-corrected LCD set."""
 
     dimension: int
     count: int

@@ -1,4 +1,4 @@
-"""How far a sample set is from N(0, I), by localized cumulative distributions (LCD).
+"""Measures how far a sample set is from N(0, I), by localized cumulative distributions (LCD).
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 Definition V.2 and (26): the modified Cramér-von Mises distance D, here divided by pi^(N/2). The paper

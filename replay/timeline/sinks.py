@@ -1,4 +1,4 @@
-"""Where a timeline goes: a file, or a live viewer.
+"""Sends a timeline to a file, or to a live viewer.
 
 A file appears under its name only when it is whole. Rerun encodes it into memory, and it is written from
 here: Rerun's own writer of files tells nobody of a disk that is full as it ends, and may wait forever.

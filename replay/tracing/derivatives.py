@@ -85,7 +85,7 @@ Slopes = dict[int, Node]
 
 
 def slopes_of(trace: Trace, outputs: Sequence[Node], seeds: Mapping[Node, Slopes]) -> list[Slopes]:
-    """How outputs change with the variables by which inputs change; what is not in there is zero.
+    """Compute how outputs change with the variables by which inputs change; what is missing is zero.
 
     Args:
         trace: whose graph it is, and grows by what is found.

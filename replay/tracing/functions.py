@@ -41,7 +41,7 @@ Argument = int | tuple[str, ...] | Shape | None
 
 
 class Result(NamedTuple):
-    """What a function gives: the nodes it returns, and whether they are one number and no tuple.
+    """Holds what a function gives: the nodes it returns, and whether they are one number and no tuple.
 
     `written` are the entries of arrays that it changes: argument, place, and the node.
     """
@@ -75,11 +75,11 @@ class TracedFunction:
 
     @property
     def outputs(self) -> list[Node]:
-        """All that it returns and writes."""
+        """Return all that it returns and writes."""
         return [*self.result.returned, *(node for _, _, node in self.result.written)]
 
     def kernel_identity(self) -> str:
-        """What is part of a kernel's key: the graph."""
+        """Return what is part of a kernel's key: the graph."""
         return self._identity
 
     @cached_property
@@ -132,7 +132,7 @@ class Derivative:
 
     @property
     def places(self) -> tuple[Any, ...]:
-        """Where the numbers behind the values belong."""
+        """Return where the numbers behind the values belong."""
         return tuple(self.entries)
 
     @property
@@ -141,7 +141,7 @@ class Derivative:
         return [*self.function.result.returned, *self.entries.values()]
 
     def kernel_identity(self) -> str:
-        """What is part of a kernel's key."""
+        """Return what is part of a kernel's key."""
         return _digest([repr(self.function.arguments), repr(self.places), *described(self.outputs)])
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Any:
@@ -167,7 +167,7 @@ class Derivative:
 
 
 def arguments_like(values: Sequence[Any]) -> tuple[Argument, ...]:
-    """How arguments such as these are described."""
+    """Return how arguments such as these are described."""
     return tuple(
         (getattr(each, "_fields", None) or len(each)) if isinstance(each, tuple) else None
         for each in values

@@ -48,11 +48,11 @@ class Node:
 
     @property
     def is_constant(self) -> bool:
-        """Whether its value is known."""
+        """Tell whether its value is known."""
         return self.operation is CONSTANT
 
     def is_number(self, value: float) -> bool:
-        """Whether it is known to be this number."""
+        """Tell whether it is known to be this number."""
         return self.operation is CONSTANT and not self.is_truth and self.value == value
 
 
@@ -75,7 +75,7 @@ class Graph:
         return found
 
     def input(self, place: Any) -> Node:
-        """What is handed in."""
+        """Return what is handed in."""
         return self._node(INPUT, (), place, (INPUT, place))
 
     def constant(self, value: Any) -> Node:
@@ -95,7 +95,7 @@ class Graph:
         return self._node(POWER, (base,), exponent, (POWER, base.number, exponent))
 
     def select(self, condition: Node, yes: Node, no: Node) -> Node:
-        """One of two; the other is no part of the result, whatever it is."""
+        """Select one of two; the other is no part of the result, whatever it is."""
         if condition.is_constant:
             return yes if condition.value else no
         if yes is no:
@@ -152,7 +152,7 @@ class Graph:
 
 
 def evaluated(operation: Any, *values: Any) -> Any:
-    """What an operation gives for numbers; infinity and NaN without a word, as compiled code."""
+    """Compute what an operation gives for numbers; infinity and NaN without a word, as compiled code."""
     with np.errstate(all="ignore"):
         if operation in (operator.not_, operator.and_, operator.or_, operator.xor):
             return operation(*values)

@@ -1,4 +1,4 @@
-"""What a function reads beside its arguments, so that one can tell whether it would do the same again.
+"""Finds what a function reads beside its arguments, to know whether it would do the same again.
 
 That is known where all of it is seen and nothing of it can change unseen: its code, its defaults, its
 closure, and the globals and attributes of modules that its bytecode names; each of them a number, a
@@ -45,7 +45,7 @@ _ABSENT = object()
 
 
 class Reads(NamedTuple):
-    """What a function reads: each place, and what was there.
+    """Holds what a function reads: each place, and what was there.
 
     Attributes:
         functions: it and those that it calls, with their code and defaults.
@@ -58,7 +58,7 @@ class Reads(NamedTuple):
     names: list[tuple[Mapping[str, Any], str, Any]]
 
     def are_unchanged(self) -> bool:
-        """Whether there is the same at every place."""
+        """Tell whether there is the same at every place."""
         for function, code, defaults in self.functions:
             if function.__code__ is not code or function.__defaults__ is not defaults:
                 return False
@@ -73,7 +73,7 @@ class Reads(NamedTuple):
 
 
 def reads_of(function: Any) -> Reads | None:
-    """What a function reads; None where something of that may change unseen."""
+    """Find what a function reads; None where something of that may change unseen."""
     reads = Reads([], [], [])
     return reads if _sees(reads, function) else None
 

@@ -18,7 +18,7 @@ from replay.tracing.graph import Graph, Node
 
 
 class CannotTrace(TypeError):
-    """What a function does that no graph holds, and what to write instead."""
+    """Says what a function does that no graph holds, and what to write instead."""
 
 
 MOST_WAYS = 256
@@ -100,7 +100,7 @@ class Traced(np.lib.mixins.NDArrayOperatorsMixin):
 
 
 class Trace:
-    """One call of a function with traced numbers: the graph, and the way through its conditions."""
+    """Records one call of a function with traced numbers: the graph, the way through its conditions."""
 
     def __init__(self, graph: Graph, decisions: dict[Node, bool]) -> None:
         self.graph = graph
@@ -108,7 +108,7 @@ class Trace:
         self.more: list[Node] = []  # conditions met that were not decided before
 
     def decided(self, number: Traced) -> bool:
-        """Which way is taken at a condition: a new one holds, and is tried the other way later."""
+        """Decide which way is taken at a condition: a new one holds, and is tried otherwise later."""
         node = (
             number.node
             if number.node.is_truth
@@ -135,7 +135,7 @@ class Trace:
 
 
 def where(condition: Any, yes: Any, no: Any) -> Any:
-    """One of two numbers, of which the other may be anything."""
+    """Select one of two numbers, of which the other may be anything."""
     numbers = [each for each in (condition, yes, no) if isinstance(each, Traced)]
     if not numbers:
         return yes if condition else no
@@ -256,7 +256,7 @@ _OF_TABLES = (np.interp, np.searchsorted, np.choose)
 
 
 def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None = None) -> Any:
-    """What a function of NumPy's gives for traced and other numbers, or arrays of them."""
+    """Apply a function of NumPy's to traced and other numbers, or arrays of them."""
     if function in _OF_TABLES:
         return _COMPOSED[function](*inputs, **(options or {}))
     if any(not isinstance(each, Traced) and np.ndim(each) for each in inputs):

@@ -27,6 +27,7 @@ LARGER = {
 # Functions of more parameters: what the door offers by keyword, commands and what they call, and others.
 WIDER = {
     "pipeline/api/api.py": {"run", "sweep"},
+    "pipeline/api/planning.py": {"plan_replay"},
     "pipeline/api/replays.py": {"replay"},
     "pipeline/api/trajectories.py": {"evaluate"},
     "pipeline/checking/command.py": {"check_path"},
@@ -37,7 +38,7 @@ WIDER = {
         "view_path",
     },
     "pipeline/command_line/experiment_commands.py": {"run_named", "sweep_named"},
-    "pipeline/comparing/command.py": {"compare_sides"},
+    "pipeline/comparing/command.py": {"compare_candidates"},
     "pipeline/diagnosing/command.py": {"diagnose_log"},
     "pipeline/runs/ensemble.py": {"replay_parts"},
     "pipeline/tuning/command.py": {"tune_logs"},

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+import fuselog as fl
 from pipeline.command_line import main
 from pipeline.runs import campaigns
 from pipeline.runs.checkpoints import checkpoints_of
@@ -359,6 +360,8 @@ def test_options_that_contradict_or_lead_nowhere_are_refused(tmp_path, capsys):
     pytest.importorskip("distributed")
     assert main([*begin, "--scheduler", "local:many"]) == 2
     assert "give local:N with a number of workers" in capsys.readouterr().err
+    with pytest.raises(BadInput, match="give local:N with a number of workers"):
+        fl.run("landmarks", runs=130, scheduler="local:many", out=tmp_path / "result")
     assert not list(tmp_path.iterdir())
 
 

@@ -46,7 +46,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Section:
-    """What the page shows of one result folder; `lead` is what one sees at once."""
+    """Holds what the page shows of one result folder; `lead` is what one sees at once."""
 
     name: str
     result: Result
@@ -85,7 +85,7 @@ def write_report(folders: Sequence[Path], page: Path, *, viewer: bool = False) -
 
 
 def is_report(page: Path) -> bool:
-    """Whether a file is a page that `write_report` wrote, as it was written."""
+    """Tell whether a file is a page that `write_report` wrote, as it was written."""
     content = page.read_bytes()
     return content == _signed(content.rpartition(_SIGNATURE)[0])
 

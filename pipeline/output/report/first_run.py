@@ -1,4 +1,4 @@
-"""What the first run of a result looks like: a plan of its paths and particles, or its timeline."""
+"""Shows the first run of a result: a plan of its paths and particles, or its timeline."""
 
 import io
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the report calls its sections: the experiment, and what is different in its settings."""
+"""Names the report's sections: the experiment, and what is different in its settings."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

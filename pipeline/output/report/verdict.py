@@ -21,7 +21,7 @@ MEANING = {
 
 
 def verdict(result: Result) -> tuple[str, str]:
-    """What was run; then which claims hold, or which estimator is best and whether it is consistent."""
+    """Say what was run; then which claims hold, or which estimator is best and if it is consistent."""
     tables = metric_tables(result.metrics, result.bounds)
     came = _of_claims(result) if result.claims else _best(tables, _runs(result))
     return _what_was_run(result, tables), came

@@ -1,4 +1,4 @@
-"""What is taken of a bag: how the messages of each topic are read, and what their streams are named.
+"""Chooses what is taken of a bag: how each topic's messages are read, and what their streams are named.
 
 A stream is named by the namespace of its topic and by what it is: /odom gives /odometry, /robot1/imu
 gives /robot1/inertial. Where two topics would give the same name, both are named by the topic:
@@ -20,7 +20,7 @@ from recorders.importers.ros.parameters import RosParameters
 
 
 class Reader(NamedTuple):
-    """How the messages of a connection are read; `taken` is None for transforms."""
+    """Describes how the messages of a connection are read; `taken` is None for transforms."""
 
     type: MessageType
     taken: Taken | None
@@ -30,14 +30,14 @@ class Reader(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """How the messages of connections are read, and by topic why those of others are not."""
+    """Describes how the messages of connections are read, and by topic why those of others are not."""
 
     readers: dict[Connection, Reader]
     not_taken: dict[str, str]
 
 
 def choose(bag: Bag, parameters: RosParameters) -> Choice:
-    """What is taken of a bag.
+    """Choose what is taken of a bag.
 
     Raises BadInput where what is asked for is not in the bag or cannot be read, or nothing is taken.
     """

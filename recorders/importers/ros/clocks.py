@@ -13,7 +13,7 @@ from recorders.errors import BadInput
 
 @dataclass
 class Clocks:
-    """By topic, the span of the header's stamps, of the bag's, and of their difference, in ns."""
+    """Keeps by topic the span of the header's stamps, of the bag's, and of their difference, in ns."""
 
     header: dict[str, tuple[int, int]] = field(default_factory=dict)
     bag: dict[str, tuple[int, int]] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""From the bytes of ROS messages to columns, for any message type.
+"""Decodes the bytes of ROS messages into columns, for any message type.
 
 A message without strings and sequences has one byte layout. With them the layout depends on their
 lengths alone, and messages of one topic rarely differ in these: so the layout is found once, by walking
@@ -77,7 +77,7 @@ class _Text(NamedTuple):
 
 @dataclass
 class Layout:
-    """Where each field of a message is, for messages of equal lengths of texts and sequences.
+    """States where each field of a message is, for messages of equal lengths of texts and sequences.
 
     Fields are named by their paths: `pose.pose.position.x`, `transforms.0.child_frame_id`. `fixed` are
     the bytes, by their places, that all messages of the layout share: those of the lengths.
@@ -89,7 +89,7 @@ class Layout:
     fixed: dict[int, int] = field(default_factory=dict)
 
     def fits(self, raw: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Which of the messages (n, size) have this layout."""
+        """Return which of the messages (n, size) have this layout."""
         return (raw[:, list(self.fixed)] == np.array(list(self.fixed.values()), np.uint8)).all(axis=1)
 
 

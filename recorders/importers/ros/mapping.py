@@ -23,7 +23,7 @@ from recorders.parsing import read_toml
 
 
 class MessageMapping(StreamMapping):
-    """What messages of one type become; sources are paths of their fields.
+    """Holds what messages of one type become; sources are paths of their fields.
 
     Attributes:
         name: last part of the stream's name.
@@ -36,7 +36,7 @@ class MessageMapping(StreamMapping):
     frame: str = FRAME
 
     def paths(self) -> list[str]:
-        """Those of all fields."""
+        """Return the paths of all fields."""
         return [*self.sources(), *(source for source, _ in self.conditions())]
 
 
@@ -60,7 +60,7 @@ def read_mapping(path: Path) -> dict[str, MessageMapping]:
 
 
 def taken(mapping: MessageMapping, where: str) -> Taken:
-    """What reads messages by a mapping; it raises BadInput where they lack a field."""
+    """Make what reads messages by a mapping; it raises BadInput where they lack a field."""
     schema = schema_of(mapping, where)
 
     def parts(messages: Messages) -> Iterator[Part]:

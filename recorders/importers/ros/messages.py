@@ -1,4 +1,4 @@
-"""What messages of ROS become: for each type the streams, their columns, and what their channels state.
+"""Maps each type of ROS messages to its streams, their columns, and what their channels state.
 
 The types are those of common_interfaces and vision_msgs; the conventions on what is unknown are those
 of sensor_msgs: a covariance of zeros, or whose first number is -1, is none.
@@ -24,7 +24,7 @@ _PLANAR = 1e-6
 
 @dataclass(frozen=True)
 class Part:
-    """What some messages (n,) say for one stream.
+    """Holds what some messages (n,) say for one stream.
 
     Attributes:
         kind: the last part of the stream's name.
@@ -47,7 +47,7 @@ class Part:
 
 
 class Taken(NamedTuple):
-    """How messages of a type are taken.
+    """Describes how messages of a type are taken.
 
     Attributes:
         kinds: of the streams that they give.

@@ -69,7 +69,7 @@ class StreamMaker:
 
     @property
     def messages(self) -> int:
-        """How many have come of the bag."""
+        """Count the messages that have come of the bag."""
         return sum(written.messages for written in self._written.values())
 
     def tell(self, subject: str, fact: str, count: int) -> None:

@@ -42,7 +42,7 @@ class Utf8(io.RawIOBase):
         self._blocks, self._rest = blocks, b""
 
     def readable(self) -> bool:
-        """As files are asked."""
+        """Tell whether files can be read, as they are asked."""
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]

@@ -21,7 +21,7 @@ from recorders.importers.tables.mapping import (
     shipped,
 )
 from recorders.importers.tables.plane import Plane
-from recorders.importers.tables.rows import Rows, Told
+from recorders.importers.tables.rows import ReadCounts, Rows
 from recorders.log import Stream, make_stream
 from recorders.parameters import Parameters
 from recorders.recording import Blocks, Importer
@@ -71,7 +71,7 @@ def _blocks(
     paths: list[Path], mapping: LogMapping, generator: np.random.Generator, told: Blocks
 ) -> Iterator[list[Stream]]:
     files, others = find_files(mapping, paths)
-    counts: Told = Counter()
+    counts: ReadCounts = Counter()
     sources = [Rows(file, counts, generator) for file in files]
     firsts = {
         number: first

@@ -277,7 +277,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
     return folders
 
 
-class Found(NamedTuple):
+class FileMatch(NamedTuple):
     """A file, its mapping, and what the names in braces stand for."""
 
     path: Path
@@ -285,14 +285,14 @@ class Found(NamedTuple):
     names: dict[str, str]
 
 
-def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[Found], list[Path]]:
+def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch], list[Path]]:
     """The files of a mapping among files and folders, and those of the folders that are none of them.
 
     A file of a folder is that of the first table whose pattern it fits; what this import or another one
     is writing there is no file yet. Raises BadInput where a table
     has no file, or a file that is given has no table.
     """
-    found: list[Found] = []
+    found: list[FileMatch] = []
     others: list[Path] = []
     for path in paths:
         inside = [path]
@@ -319,7 +319,7 @@ def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[Found], lis
     return found, others
 
 
-def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[Found]:
+def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> Iterator[FileMatch]:
     """The tables that a file is one of; the only file of the only table may have any name."""
     for table in mapping.tables:
         pattern = (
@@ -327,6 +327,6 @@ def _matches(mapping: LogMapping, file: Path, name: str, *, is_alone: bool) -> I
         )
         names = fitted(pattern, name)
         if names is not None:
-            yield Found(file, table, names)
+            yield FileMatch(file, table, names)
         elif is_alone and len(mapping.tables) == 1:
-            yield Found(file, table, dict.fromkeys(names_in(pattern), file.stem))
+            yield FileMatch(file, table, dict.fromkeys(names_in(pattern), file.stem))

@@ -15,7 +15,7 @@ def names_in(pattern: str) -> list[str]:
 
 
 def fitted(pattern: str, name: str) -> dict[str, str] | None:
-    """What the names in braces stand for where a name fits a pattern, else None.
+    """Return what the names in braces stand for where a name fits a pattern, else None.
 
     Each stands for at least one character, and as the stars for as many as can be, from the left; no
     wild part stands for a slash.

@@ -22,7 +22,7 @@ class Plane(NamedTuple):
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What the channels of streams in the plane state."""
+        """Return what the channels of streams in the plane state."""
         stated = {f"origin_{name}": repr(value) for name, value in self.origin}
         # a model would take stated origins for those of a tangent plane
         return stated if self.projection is None else {"projection": self.projection}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput, some_of
 from recorders.importers.mapping import Mapped, Source, checked, mapped, not_finite, schema_of
 from recorders.importers.tables.files import Batch, Table, open_table
-from recorders.importers.tables.mapping import Attitude, Found, Origin, TableStream
+from recorders.importers.tables.mapping import Attitude, FileMatch, Origin, TableStream
 from recorders.importers.tables.plane import Plane
 from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping, read_counter, stamps_ns
 from recorders.importers.units import conversion
@@ -23,7 +23,7 @@ QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
 # Messages whose vectors are in the axes of the plane.
 _IN_PLANE = {"PositionFix", "VelocityFix", "TruthState", "Pose"}
 
-Told = Counter[tuple[str, str]]
+ReadCounts = Counter[tuple[str, str]]
 
 
 class Rows:
@@ -33,9 +33,9 @@ class Rows:
     or lacks a column that its mapping names.
     """
 
-    def __init__(self, found: Found, told: Told, generator: np.random.Generator) -> None:
+    def __init__(self, found: FileMatch, counts: ReadCounts, generator: np.random.Generator) -> None:
         self.path, self.mapping, self._names = found
-        self._told, self._generator = told, generator
+        self._counts, self._generator = counts, generator
         own = self.mapping
         self.table = self._open()
         self.count = 0
@@ -50,7 +50,7 @@ class Rows:
 
     @property
     def is_done(self) -> bool:
-        """Whether all rows were given."""
+        """Tell whether all rows were given."""
         return self._next is None
 
     # What is read.
@@ -303,10 +303,10 @@ class Rows:
 
     def _tell(self, subject: str, fact: str, count: int) -> None:
         if count:
-            self._told[subject, fact] += count
+            self._counts[subject, fact] += count
 
     def notes(self) -> dict[str, str]:
-        """What was read of the file."""
+        """Describe what was read of the file."""
         name = self.path.name
         topics = ", ".join(self._filled(stream.topic) for stream in self.mapping.streams)
         notes = {name: f"{self.count} rows as {topics}"}

@@ -73,7 +73,7 @@ class TimeMapping(Parameters):
 
     @property
     def zero_ns(self) -> int:
-        """What numbers count from, less leap seconds and the offset from UTC."""
+        """Return what numbers count from, less leap seconds and the offset from UTC."""
         since = _date_ns(_GPS_ZERO if self.week else self.zero)
         return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
 

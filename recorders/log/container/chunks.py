@@ -64,17 +64,17 @@ class Damaged(ValueError):
 
 
 class Span(NamedTuple):
-    """From the first to the last time, both included."""
+    """Spans from the first to the last time, both included."""
 
     first_ns: int
     last_ns: int
 
     def holds(self, other: "Span") -> bool:
-        """Whether the other lies inside this one."""
+        """Tell whether the other lies inside this one."""
         return self.first_ns <= other.first_ns and other.last_ns <= self.last_ns
 
     def meets(self, other: "Span") -> bool:
-        """Whether they have a time in common."""
+        """Tell whether they have a time in common."""
         return self.first_ns <= other.last_ns and other.first_ns <= self.last_ns
 
 

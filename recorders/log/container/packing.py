@@ -1,4 +1,4 @@
-"""From streams to the bytes of chunks: merged in log-time order, cut at record borders, indexed."""
+"""Packs streams into the bytes of chunks: merged in log-time order, cut at record borders, indexed."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple

@@ -42,7 +42,7 @@ _LOST = 0
 
 @dataclass(frozen=True)
 class Region:
-    """One chunk, or one run of records outside chunks, and what is known of it without opening it.
+    """Describes one chunk, or one run of records outside chunks, without opening it.
 
     The span of publish time is absent where only a foreign index tells of the chunk; `channel_ids` is
     None where the index does not say which channels it holds.
@@ -55,13 +55,13 @@ class Region:
 
     @property
     def extent(self) -> tuple[int, int]:
-        """Where it is in the file, for `read_bytes`."""
+        """Return where it is in the file, for `read_bytes`."""
         return self.offset, self.length
 
 
 @dataclass
 class Container:
-    """What a file holds: channels and schemas by id, metadata by name, regions in file order.
+    """Describes what a file holds: channels and schemas by id, metadata by name, regions in file order.
 
     Both counts are by channel: the messages that can be read, and those that a whole summary states.
     Attachments are known by name alone.

@@ -36,7 +36,7 @@ def note_span(offset: int, length: int, span: Span) -> tuple[str, str]:
 
 
 def noted_span(pairs: Mapping[str, str], offset: int, length: int) -> Span | None:
-    """What `note_span` noted; None where it did not, as in a file that another tool has rewritten."""
+    """Return what `note_span` noted; None where it did not, as in a file that another tool rewrote."""
     noted = pairs.get(f"{offset}+{length}")
     return None if noted is None else Span(*map(int, noted.split()))
 

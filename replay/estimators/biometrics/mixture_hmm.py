@@ -31,7 +31,7 @@ class MixtureHmm(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """How a model is fitted: every covariance gets `floor` on its diagonal."""
+    """Describes how a model is fitted: every covariance gets `floor` on its diagonal."""
 
     components: int
     left_right: bool

@@ -20,7 +20,7 @@ IMPOSTORS_PER_USER = 2
 
 
 class Pairs(NamedTuple):
-    """Which comparisons are fused: probe and gallery user (n,) of each, and their fold (users,).
+    """States which comparisons are fused: probe and gallery user (n,) of each, and their fold (users,).
 
     Without folds (None) nothing is learnt.
     """

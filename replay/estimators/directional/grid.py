@@ -23,7 +23,7 @@ _NEGLIGIBLE = 1e-12
 
 
 class GridEstimates(NamedTuple):
-    """What a filter on a grid over the torus says.
+    """Holds what a filter on a grid over the torus says.
 
     Attributes:
         state: probabilities (runs, n, n) after the last row.

@@ -1,4 +1,4 @@
-"""Where a shot came from: the three localizations of Osborne et al., JAIF 2014.
+"""Locates where a shot came from: the three localizations of Osborne et al., JAIF 2014.
 
 The parameters are the shooter's position, the bullet's direction (not for bearings only, which say
 nothing about it) and, where they are estimated along, the sensors' positions. Where they are not, each
@@ -35,7 +35,7 @@ CONSTANT = (0.0, 0.0, 0.0)
 
 
 class Mode(StrEnum):
-    """What the sensors send to the fusion centre."""
+    """Chooses what the sensors send to the fusion centre."""
 
     BEARINGS_ONLY = "bearings-only"
     LOCAL_ESTIMATES = "local-estimates"
@@ -43,7 +43,7 @@ class Mode(StrEnum):
 
 
 class Setting(NamedTuple):
-    """How the estimator sees the world.
+    """Describes how the estimator sees the world.
 
     `cross_covariances` keeps those between range and angles in local estimates. The paper leaves them
     out: with them the search is unstable, and the bound of eq (48) falls below that of the native
@@ -58,7 +58,7 @@ class Setting(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """One shot per run as all sensors heard it; (runs, sensors), positions (runs, sensors, 2).
+    """Holds one shot per run as all sensors heard it; (runs, sensors), positions (runs, sensors, 2).
 
     The shockwave and the time difference are NaN where the shockwave was not heard.
     """
@@ -103,7 +103,7 @@ def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m:
 def noise_free(
     medium: Medium, shooter_m: Floats, trajectory_rad: Floats, sensor_m: Floats
 ) -> Detections:
-    """What perfect sensors hear; shapes as for `bound`."""
+    """Compute what perfect sensors hear; shapes as for `bound`."""
     position = np.broadcast_to(sensor_m, (len(shooter_m), *sensor_m.shape[-2:]))
     with np.errstate(invalid="ignore"):
         angles = model.hear(
@@ -113,7 +113,7 @@ def noise_free(
 
 
 def starting_point(setting: Setting, heard: Detections) -> Floats:
-    """Where the bearings meet, the mean trajectory that the shockwaves tell, and the position fixes.
+    """Find where the bearings meet, the shockwaves' mean trajectory, and the position fixes.
 
     The tangents and cotangents of eqs (32)-(34) are the same rays with other weights.
     """

@@ -34,7 +34,7 @@ BLOCK_RUNS = 256
 
 
 class Linearization(NamedTuple):
-    """What a model says at given parameters.
+    """Holds what a model says at given parameters.
 
     residual: (runs, m) measured minus predicted, angles wrapped.
     jacobian: (runs, m, n) derivative of the prediction.
@@ -53,7 +53,7 @@ Model = Callable[[Floats, Rows], Linearization]
 
 
 class Status(IntEnum):
-    """How the search of one run ended."""
+    """Describes how the search of one run ended."""
 
     CONVERGED = 0
     NO_START = 1
@@ -95,7 +95,7 @@ class Solution(NamedTuple):
 
     @property
     def converged(self) -> Booleans:
-        """Which runs have an estimate, (runs,)."""
+        """Return which runs have an estimate, (runs,)."""
         return self.status == Status.CONVERGED
 
 
@@ -261,7 +261,7 @@ def cramer_rao_bound(at: Linearization) -> Bound:
 
 
 def unobservable_directions(at: Linearization) -> list[Floats]:
-    """For each run the directions that no measurement sees, unit columns (n, n - rank), own units."""
+    """Find each run's directions that no measurement sees, unit columns (n, n - rank), own units."""
     root, scale = _scaled_root(at)
     values, right = _singular_values(root)
     directions = scale[:, :, None] * right

@@ -37,7 +37,7 @@ SAME_TURN = 1e-6
 
 
 class Scene(NamedTuple):
-    """What is known before the measurements.
+    """Holds what is known before the measurements.
 
     position_m and nominal_attitude_rad (yaw, pitch, roll) are (sensors, 3), y up. sigma_rad (sensors, 2)
     is the noise of azimuth and elevation. known_bias_rad (sensors, 3) is NaN where it is wanted.
@@ -50,12 +50,12 @@ class Scene(NamedTuple):
 
     @property
     def wanted(self) -> Booleans:
-        """Which biases are estimated, (3 sensors,)."""
+        """Return which biases are estimated, (3 sensors,)."""
         return np.isnan(self.known_bias_rad).ravel()
 
 
 class Observability(NamedTuple):
-    """What the measurements of one run can tell.
+    """Holds what the measurements of one run can tell.
 
     `turning_axis` is the unit vector about which all sensors and targets may turn together unseen, None
     where the gap is none or another one.
@@ -93,7 +93,7 @@ def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Sol
 
 
 def starting_point(scene: Scene, measured: Floats) -> Floats:
-    """Where the rays of each target meet, biases taken as zero, (runs, n)."""
+    """Find where the rays of each target meet, biases taken as zero, (runs, n)."""
     attitude = scene.nominal_attitude_rad + np.nan_to_num(scene.known_bias_rad)
     unit = np.stack(direction(measured[..., 0], measured[..., 1], attitude.T[:, None]), axis=-1)
     targets = intersect_rays(scene.position_m, unit).reshape(len(measured), -1)

@@ -1,4 +1,4 @@
-"""Where rays meet: the starting point of localization from angles."""
+"""Intersects rays: the starting point of localization from angles."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What batch estimators say: estimates where a solution was found, how each ended, failures by name."""
+"""Writes what batch estimators give: the estimates that were found, how each ended, failures by name."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from replay.estimators.localization.least_squares import SENTENCES, Solution
 
 
 class Batches(NamedTuple):
-    """Which measurements are solved together: the run of each batch, in order, and its last stamp."""
+    """States what is solved together: the run of each batch, in order, and its last stamp."""
 
     runs: int
     run: Integers

@@ -89,20 +89,20 @@ def sight(pose: Components, place: Components) -> Components:
     return distance + defined, bearing + defined
 
 
-def see(pose: Components, landmark: Components, parameters: Any) -> Components:
+def range_and_bearing(pose: Components, landmark: Components, parameters: Any) -> Components:
     """Range and bearing of a landmark, with the sensor's bias."""
     distance, bearing = sight(pose, landmark)
     return distance + parameters.bias_range_m, bearing + parameters.bias_bearing_rad
 
 
-def see_range(pose: Components, landmark: Components, parameters: Any) -> Components:
-    """The range alone."""
-    return (see(pose, landmark, parameters)[0],)
+def range_alone(pose: Components, landmark: Components, parameters: Any) -> Components:
+    """Return the range alone."""
+    return (range_and_bearing(pose, landmark, parameters)[0],)
 
 
-def see_bearing(pose: Components, landmark: Components, parameters: Any) -> Components:
-    """The bearing alone."""
-    return (see(pose, landmark, parameters)[1],)
+def bearing_alone(pose: Components, landmark: Components, parameters: Any) -> Components:
+    """Return the bearing alone."""
+    return (range_and_bearing(pose, landmark, parameters)[1],)
 
 
 def sight_noise(parameters: Any) -> Components:
@@ -120,8 +120,8 @@ def bearing_noise(parameters: Any) -> Components:
     return (parameters.sigma_bearing_rad**2,)
 
 
-def be_there(pose: Components, reference: Any, parameters: Any) -> Components:
-    """The pose itself."""
+def pose_itself(pose: Components, reference: Any, parameters: Any) -> Components:
+    """Return the pose itself."""
     return pose[0], pose[1], pose[2]
 
 
@@ -130,8 +130,8 @@ def pose_noise(parameters: Any) -> Components:
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
 
 
-def be_turned(pose: Components, reference: Any, parameters: Any) -> Components:
-    """The heading alone."""
+def heading_alone(pose: Components, reference: Any, parameters: Any) -> Components:
+    """Return the heading alone."""
     return (pose[2],)
 
 
@@ -228,17 +228,17 @@ ROBOT = Model(
             "range_bearing",
             schemas.RANGE_BEARING,
             {**RANGE, **BEARING},
-            see,
+            range_and_bearing,
             sight_noise,
             reference=LANDMARKS,
         ),
-        Sensor("range", schemas.RANGE, RANGE, see_range, range_noise, reference=LANDMARKS),
-        Sensor("bearing", schemas.BEARING, BEARING, see_bearing, bearing_noise, reference=LANDMARKS),
+        Sensor("range", schemas.RANGE, RANGE, range_alone, range_noise, reference=LANDMARKS),
+        Sensor("bearing", schemas.BEARING, BEARING, bearing_alone, bearing_noise, reference=LANDMARKS),
         Sensor(
             "pose",
             schemas.POSE,
             POSE,
-            be_there,
+            pose_itself,
             pose_noise,
             read=read_pose,
             covariance=read_pose_covariance,
@@ -248,7 +248,7 @@ ROBOT = Model(
             "heading",
             schemas.ORIENTATION,
             {"heading_rad": "angle"},
-            be_turned,
+            heading_alone,
             heading_noise,
             read=read_heading,
             covariance=read_heading_covariance,

@@ -63,7 +63,7 @@ class MovingSightParameters(ModelParameters):
 
 
 def moved_target(state: Components, first: int, duration_s: Component) -> Components:
-    """Where the target whose components begin at `first` is after a while."""
+    """Predict where the target is after a while whose components begin at `first`."""
     return (
         state[first] + duration_s * state[first + 3],
         state[first + 1] + duration_s * state[first + 4],
@@ -141,7 +141,7 @@ def _sensor(number: int) -> Sensor:
 
 
 def first_target(state: Components, reference: Any, parameters: Any) -> Components:
-    """Where it says that it is."""
+    """Return where the first target is."""
     return state[0], state[1], state[2]
 
 

@@ -1,4 +1,4 @@
-"""Where something is from ranges to anchors whose places are known, as of ultra-wideband radios.
+"""Locates something from ranges to anchors whose places are known, as of ultra-wideband radios.
 
 `ranging-pose` has several tags on a body in the plane, and so its heading; `ranging-position` one tag.
 Velocities are random walks. Radios err by more than white noise: they have a bias, `bias_range_m`, an

@@ -32,7 +32,7 @@ class ReactorParameters(ModelParameters):
 
 
 def move(pressures: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """One step of the reaction."""
+    """Move the reaction by one step."""
     return react(pressures, parameters.step_s)
 
 
@@ -64,7 +64,7 @@ def moments(
 
 
 def read(pressures: Components, reference: Any, parameters: Any) -> Components:
-    """What the sensor reads."""
+    """Compute what the sensor reads."""
     return total_pressure(pressures)
 
 

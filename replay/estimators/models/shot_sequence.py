@@ -1,4 +1,4 @@
-"""Where a shooter is who moves, from all shots so far: the model `moving-shooter`.
+"""Locates a shooter who moves, from all shots so far: the model `moving-shooter`.
 
 A report has the muzzle blast's direction of arrival, the bullet's direction as the shockwave tells it,
 and the shockwave's lead. All are of the place from which the shot was fired: the sound has travelled
@@ -118,7 +118,7 @@ def hear_noise(parameters: Any) -> Components:
 def log_likelihood(
     state: Components, measured: Components, sensor: Components, parameters: Any
 ) -> float:
-    """Where each component is wrong with a probability, by itself: then it may be anything."""
+    """Compute the likelihood; each component is wrong with a probability, and may be anything then."""
     azimuth, trajectory, left, right = hear(state, sensor, parameters)
     turn, longest, share = 2.0 * HALF_TURN, parameters.longest_s, parameters.outlier_probability
     lead_s = parameters.sigma_time_difference_s

@@ -1,4 +1,4 @@
-"""Where a sound came from, by differences of its arrivals at microphones: the model `sound-source`.
+"""Locates a sound by differences of its arrivals at microphones: the model `sound-source`.
 
 All differences are of one reference, whose own error they share: it is a part of the state, so that the
 differences are independent given it. A source of microphones that all are at one height is taken to be
@@ -49,19 +49,19 @@ class SoundSourceParameters(ModelParameters):
 
 
 def stay(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """What does not move."""
+    """Keep the state: it does not move."""
     x, y, z, reference = state
     return x, y, z, reference
 
 
 def hear(state: Components, reference: Components, parameters: Any) -> Components:
-    """By how much later a sound comes at the first of two points than at the second, and errs there."""
+    """Compute how much later a sound comes at the first of two points than at the second, and errs."""
     away = distance(state, reference), distance(state, (reference[3], reference[4], reference[5]))
     return ((away[0] - away[1]) / parameters.speed_of_sound_mps + state[3],)
 
 
 def read_differences(stream: Stream) -> Floats:
-    """What is measured (n, 1)."""
+    """Read what is measured (n, 1)."""
     return stream["difference_s"][:, None]
 
 

@@ -1,4 +1,4 @@
-"""One vehicle from its own fixes: the paper's reference, association known.
+"""Tracks one vehicle by its own fixes: the paper's reference, association known.
 
 Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, section 4.1. Each vehicle is an estimate of its own.
@@ -60,7 +60,7 @@ def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> C
 
 
 def manoeuvring_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """As `acceleration_noise`, of larger accelerations."""
+    """Compute noise as `acceleration_noise`, of larger accelerations."""
     place, mixed, velocity = noise_moments(parameters.manoeuvring_sigma_mps2, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 
@@ -77,7 +77,7 @@ def standing_noise(state: Components, duration_s: Any, parameters: Any) -> Compo
 
 
 def mode_rates(parameters: Any) -> Components:
-    """From driving, manoeuvring and standing to the others, in this order."""
+    """Return the rates from driving, manoeuvring and standing to the others, in this order."""
     return (
         parameters.manoeuvres_per_s,
         0.0,
@@ -89,7 +89,7 @@ def mode_rates(parameters: Any) -> Components:
 
 
 def position(state: Components, reference: Any, parameters: Any) -> Components:
-    """Where the vehicle is."""
+    """Return where the vehicle is."""
     return state[0], state[2]
 
 

@@ -1,4 +1,4 @@
-"""Where inertial navigation starts from: levelled at rest, its heading from the course.
+"""Finds where inertial navigation starts from: levelled at rest, its heading from the course.
 
 Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013,
 section 5.6: roll and pitch from the specific force, of which gravity is all while nothing accelerates;
@@ -23,12 +23,13 @@ from replay.estimators.navigation.samples import (
     NS,
     STANDARD_GRAVITY_MPS2,
     USUAL_SIGMA_M,
-    InertialSamples,
-    ReceiverVelocities,
+    GnssMotion,
+    ImuSamples,
     mounted,
     read_motion,
     read_samples,
     stated_or,
+    unsteadiness,
 )
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.start import Started
@@ -39,7 +40,6 @@ SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off
 LARGEST_BIAS_RADPS = 0.1  # of the cheapest units it is a third of that
 USUAL_BIAS_RADPS = 0.0035  # the standard deviation of a small unit's that never rested
 SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and as alike otherwise
-PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
 
 
 class AlignmentParameters(ModelParameters):
@@ -119,7 +119,7 @@ def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
 
 
 def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Where to start from: the first fix within the unit's samples, and the velocity nearest to it.
+    """Find where to start: at the first fix within the unit's samples, with the velocity nearest to it.
 
     Args:
         streams: `inertial` samples, `fix`, positions in the plane (east, north, up), and perhaps
@@ -132,29 +132,29 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
     if "fix" not in streams:
         raise BadInput(f"no position is known from which {topic} could begin; give a topic of fixes")
     start_ns, place, spread = _first_place(streams["fix"], samples, topic, parameters)
-    velocities, how = read_motion(streams, parameters), "levelled, its heading unknown"
+    motion, how = read_motion(streams, parameters), "levelled, its heading unknown"
     mean, covariance = np.zeros(16), np.zeros((15, 15))
     mean[:3], covariance[:3, :3] = place, _wide(parameters.start_sigma_m, spread)
     covariance[3:6, 3:6] = parameters.unmeasured_sigma_mps**2 * np.eye(3)
     roll, pitch = _tilt(samples, topic, parameters)
     tilted = product(rotation(0.0, pitch, 0.0), rotation(roll, 0.0, 0.0))
     heading, heading_sigma, bias_sigma = 0.0, np.pi, USUAL_BIAS_RADPS
-    if velocities is not None:
-        row = int(np.argmin(np.abs(velocities.time_ns - start_ns)))
-        spread = velocities.covariance[row]
-        mean[3:6], covariance[3:6, 3:6] = velocities.mps[row], _wide(parameters.start_sigma_mps, spread)
-        mean[10:13], bias_sigma = _bias(samples, topic, velocities, row, parameters)
+    if motion is not None:
+        row = int(np.argmin(np.abs(motion.time_ns - start_ns)))
+        spread = motion.covariance[row]
+        mean[3:6], covariance[3:6, 3:6] = motion.mps[row], _wide(parameters.start_sigma_mps, spread)
+        mean[10:13], bias_sigma = _bias(samples, topic, motion, row, parameters)
         turning = _turned(samples, start_ns, tilted, mean[10:13])
-        found = _heading(turning, start_ns, velocities, row, parameters)
+        found = _heading(turning, start_ns, motion, row, parameters)
         if found is not None:
             heading, heading_sigma = found[0], stated_or(parameters.heading_sigma_rad, found[1])
             how = "levelled, its heading the course"
-            how += _mounting(samples, turning, start_ns, velocities, tilted, heading, parameters)
-        how += _leap(samples, velocities, row, parameters)
+            how += _mounting(samples, turning, start_ns, motion, tilted, heading, parameters)
+        how += _leap(samples, motion, row, parameters)
     mean[6:10] = product(rotation(0.0, 0.0, heading), tilted)
     up = np.array(into_body(mean[6:10], (0.0, 0.0, 1.0)))
     covariance[9:12, 9:12] = stated_or(parameters.gyro_bias_sigma_radps, bias_sigma) ** 2 * np.eye(3)
-    unsteadiness_mps2 = _unsteadiness(samples, velocities, parameters)
+    unsteadiness_mps2 = unsteadiness(samples, motion, parameters)
     tilts = np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])
     covariance[tilts] = _tilt_covariance(up, unsteadiness_mps2, parameters)
     covariance[6:9, 6:9] += heading_sigma**2 * np.outer(up, up)
@@ -162,7 +162,7 @@ def align(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
-    """What looks wrong in the first samples of a body whose start is known.
+    """Find what looks wrong in the first samples of a body whose start is known.
 
     It is what `align` refuses, and only said here: the body may begin in motion.
 
@@ -178,13 +178,13 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
         _tilt(samples, topic, parameters)
     except BadInput as error:
         return [str(error)]
-    velocities = read_motion(streams, parameters)
-    if velocities is not None:
+    motion = read_motion(streams, parameters)
+    if motion is not None:
         try:
-            _bias(samples, topic, velocities, 0, parameters)
+            _bias(samples, topic, motion, 0, parameters)
         except BadInput as error:
             found.append(str(error))
-        found.append(_leap(samples, velocities, 0, parameters).removeprefix("; "))
+        found.append(_leap(samples, motion, 0, parameters).removeprefix("; "))
     return [each for each in found if each]
 
 
@@ -214,7 +214,7 @@ def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> F
 
 
 def _first_place(
-    fix: Stream, samples: InertialSamples, topic: str, parameters: Any
+    fix: Stream, samples: ImuSamples, topic: str, parameters: Any
 ) -> tuple[int, Floats, Floats]:
     """When the first fix within the samples was measured, its place (3,) and covariance (3, 3).
 
@@ -235,7 +235,7 @@ def _first_place(
     return int(time_ns[first]), np.nan_to_num(places.value[first]), places.covariance[first]
 
 
-def _tilt(samples: InertialSamples, topic: str, parameters: Any) -> tuple[float, float]:
+def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, float]:
     """Roll and pitch, rad, under which the mean of the first specific forces points up.
 
     Raises BadInput where that is not gravity in m/s2, or points down.
@@ -257,27 +257,8 @@ def _tilt(samples: InertialSamples, topic: str, parameters: Any) -> tuple[float,
     return float(np.arctan2(y, z)), float(np.arctan2(-x, np.hypot(y, z)))
 
 
-def _unsteadiness(
-    samples: InertialSamples, velocities: ReceiverVelocities | None, parameters: Any
-) -> float:
-    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
-
-    It is as much as they differ among themselves, and as the velocity changes meanwhile.
-    """
-    begin_ns = samples.time_ns[0]
-    until_ns = begin_ns + round(parameters.level_s / NS)
-    spread = samples.force[samples.time_ns < until_ns].std(axis=0)
-    changed = np.zeros(3)
-    if velocities is not None:
-        ends = np.interp([begin_ns, until_ns], velocities.time_ns, np.arange(len(velocities.time_ns)))
-        first, last = np.rint(ends).astype(int)
-        changed = (velocities.mps[last] - velocities.mps[first]) / parameters.level_s
-    plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
-    return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))
-
-
 def _bias(
-    samples: InertialSamples, topic: str, velocities: ReceiverVelocities, row: int, parameters: Any
+    samples: ImuSamples, topic: str, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[Floats, float]:
     """The mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
 
@@ -285,8 +266,8 @@ def _bias(
 
     Raises BadInput where it is more than a gyro errs.
     """
-    moved = velocities.first_above(row, parameters.still_mps)
-    end_ns = samples.time_ns[-1] if moved is None else velocities.time_ns[moved]
+    moved = motion.first_above(row, parameters.still_mps)
+    end_ns = samples.time_ns[-1] if moved is None else motion.time_ns[moved]
     at_rest = samples.time_ns < end_ns - round(parameters.rest_margin_s / NS)
     if not at_rest.any():
         return np.zeros(3), USUAL_BIAS_RADPS
@@ -307,9 +288,9 @@ def _bias(
     return bias, float(np.sqrt(sigma + EARTH_RATE_RADPS**2))
 
 
-def _leap(samples: InertialSamples, velocities: ReceiverVelocities, row: int, parameters: Any) -> str:
+def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) -> str:
     """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
-    moved = velocities.first_above(row, parameters.still_mps)
+    moved = motion.first_above(row, parameters.still_mps)
     level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / NS)
     if moved is None:
         return ""
@@ -318,19 +299,19 @@ def _leap(samples: InertialSamples, velocities: ReceiverVelocities, row: int, pa
     sets_off = np.flatnonzero((np.abs(change) > noise).any(axis=1))
     if not len(sets_off):
         return ""
-    later_s = float(velocities.time_ns[moved] - samples.time_ns[sets_off[0]]) * NS
+    later_s = float(motion.time_ns[moved] - samples.time_ns[sets_off[0]]) * NS
     if abs(abs(later_s) - LEAP_SECONDS) > LEAP_MARGIN_S:
         return ""
     shift_s = np.copysign(LEAP_SECONDS, -later_s) + parameters.inertial_delay_s
     return (
-        f"; {velocities.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
+        f"; {motion.topic} starts to move {later_s:.3g} s after the unit: if one clock has the "
         f"{LEAP_SECONDS} leap seconds between GPS time and UTC and the other has not, "
         f"inertial_delay_s={shift_s:g} moves the unit's"
     )
 
 
 def _turned(
-    samples: InertialSamples, start_ns: int, tilted: Components, bias: Floats
+    samples: ImuSamples, start_ns: int, tilted: Components, bias: Floats
 ) -> tuple[Floats, Floats]:
     """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
     since = samples.time_ns >= start_ns
@@ -348,35 +329,31 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 
 
 def _heading(
-    turning: tuple[Floats, Floats],
-    start_ns: int,
-    velocities: ReceiverVelocities,
-    row: int,
-    parameters: Any,
+    turning: tuple[Floats, Floats], start_ns: int, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[float, float] | None:
     """The heading at the start, rad, and its standard deviation; None where nothing moves.
 
     It is the first course, less what the body turned about up until then. A body that looks where it
     goes has the same of all later courses; how much they differ is how far it may be off.
     """
-    fast = velocities.first_above(row, parameters.course_mps)
+    fast = motion.first_above(row, parameters.course_mps)
     if fast is None:
         return None
-    until_ns = velocities.time_ns[fast] + round(parameters.course_s / NS)
-    rows = np.arange(fast, np.searchsorted(velocities.time_ns, until_ns))
-    rows = rows[np.hypot(*velocities.mps[rows, :2].T) > parameters.course_mps]
-    east, north, _ = velocities.mps[rows].T
-    heading = np.arctan2(north, east) - np.interp((velocities.time_ns[rows] - start_ns) * NS, *turning)
+    until_ns = motion.time_ns[fast] + round(parameters.course_s / NS)
+    rows = np.arange(fast, np.searchsorted(motion.time_ns, until_ns))
+    rows = rows[np.hypot(*motion.mps[rows, :2].T) > parameters.course_mps]
+    east, north, _ = motion.mps[rows].T
+    heading = np.arctan2(north, east) - np.interp((motion.time_ns[rows] - start_ns) * NS, *turning)
     apart = wrap_angle(heading - heading[0])
-    noise = velocities.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
+    noise = motion.covariance[fast, :2, :2].trace() / 2.0 / (east[0] ** 2 + north[0] ** 2)
     return float(heading[0]), float(min(np.sqrt(np.mean(apart**2) + noise), np.pi))
 
 
 def _mounting(
-    samples: InertialSamples,
+    samples: ImuSamples,
     turning: tuple[Floats, Floats],
     start_ns: int,
-    velocities: ReceiverVelocities,
+    motion: GnssMotion,
     tilted: Components,
     heading: float,
     parameters: Any,
@@ -386,18 +363,16 @@ def _mounting(
     Both are compared over the intervals of the velocities, in the plane and as complex numbers.
     """
     since_s, turned = turning
-    fast = velocities.first_above(0, parameters.course_mps)
-    end_s = (
-        since_s[-1] if fast is None else (velocities.time_ns[fast] - start_ns) * NS + parameters.course_s
-    )
-    stamps_s = (velocities.time_ns - start_ns) * NS
+    fast = motion.first_above(0, parameters.course_mps)
+    end_s = since_s[-1] if fast is None else (motion.time_ns[fast] - start_ns) * NS + parameters.course_s
+    stamps_s = (motion.time_ns - start_ns) * NS
     rows = np.flatnonzero((stamps_s >= 0.0) & (stamps_s <= min(end_s, since_s[-1])))
     if len(rows) < 3:
         return ""
     ahead, left, _ = into_plane(tilted, samples.force[samples.time_ns >= start_ns].T)
     gained = _integral((ahead + 1j * left) * np.exp(1j * (heading + turned)), since_s)
     felt = np.diff(np.interp(stamps_s[rows], since_s, gained))
-    seen = np.diff(velocities.mps[rows, 0] + 1j * velocities.mps[rows, 1])
+    seen = np.diff(motion.mps[rows, 0] + 1j * motion.mps[rows, 1])
     together = np.vdot(felt, seen)
     apart = float(np.angle(together))
     if abs(together) < ALIKE * np.linalg.norm(felt) * np.linalg.norm(seen) or abs(apart) < SIDEWAYS_RAD:

@@ -128,7 +128,7 @@ def field_noise(parameters: Any) -> Components:
 
 
 def first_of_periods(stream: Stream) -> Booleans:
-    """Which samples (n,) are the first of a second of the clock, whatever block they come in."""
+    """Return which samples (n,) are the first of a second of the clock, whatever block they come in."""
     rate_hz = stream.metadata.get("rate_hz")
     steps_ns = np.diff(stream.publish_time_ns)
     step_ns = 1e9 / float(rate_hz) if rate_hz else np.median(steps_ns[steps_ns > 0])

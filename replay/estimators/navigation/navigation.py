@@ -154,7 +154,7 @@ def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components
 
 
 def position(state: Components, reference: Any, parameters: Any) -> Components:
-    """Where the end of the lever arm is."""
+    """Compute where the end of the lever arm is."""
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     x, y, z = into_plane((qw, qx, qy, qz), lever)
@@ -162,7 +162,7 @@ def position(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def velocity(state: Components, samples: Components, parameters: Any) -> Components:
-    """How fast the end of the lever arm moves, which turns with the body."""
+    """Compute how fast the end of the lever arm moves, which turns with the body."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
     rate = turn_rate(samples, (gx, gy, gz), parameters)
     lever = parameters.lever_x_m, parameters.lever_y_m, parameters.lever_z_m

@@ -19,7 +19,7 @@ VELOCITY = components_of(NAVIGATION[3:6])
 NS = 1e-9
 
 
-class InertialSamples(NamedTuple):
+class ImuSamples(NamedTuple):
     """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
 
     time_ns: Integers
@@ -27,7 +27,7 @@ class InertialSamples(NamedTuple):
     rate: Floats
 
 
-class ReceiverVelocities(NamedTuple):
+class GnssMotion(NamedTuple):
     """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
 
     topic: str
@@ -42,12 +42,12 @@ class ReceiverVelocities(NamedTuple):
 
 
 def mounted(sample: Any, parameters: Any) -> Any:
-    """What the unit measures, in the body's axes; three components, or columns of them."""
+    """Turn what the unit measures into the body's axes; three components, or columns of them."""
     roll, pitch = parameters.mounting_roll_rad, parameters.mounting_pitch_rad
     return from_mounting(roll, pitch, parameters.mounting_yaw_rad, sample)
 
 
-def read_samples(inertial: Stream, parameters: Any) -> InertialSamples:
+def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
     """The finite samples at the times at which they were measured."""
     columns = [
         np.stack(mounted(inertial[name].T, parameters), axis=1)
@@ -59,7 +59,7 @@ def read_samples(inertial: Stream, parameters: Any) -> InertialSamples:
         raise BadInput(f"topic {inertial.topic}: has no samples to begin with")
     time_ns = inertial.publish_time_ns[finite] - round(parameters.inertial_delay_s / NS)
     force, rate = (column[finite] for column in columns)
-    return InertialSamples(time_ns, force, rate)
+    return ImuSamples(time_ns, force, rate)
 
 
 def stated_or(sigma: float | None, otherwise: Any) -> Any:
@@ -67,7 +67,7 @@ def stated_or(sigma: float | None, otherwise: Any) -> Any:
     return otherwise if sigma is None or np.isnan(sigma) else sigma
 
 
-def read_motion(streams: Mapping[str, Stream], parameters: Any) -> ReceiverVelocities | None:
+def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | None:
     """The velocities that are finite; None where there are none."""
     stream = streams.get("velocity")
     if stream is None:
@@ -78,6 +78,24 @@ def read_motion(streams: Mapping[str, Stream], parameters: Any) -> ReceiverVeloc
     if not finite.any():
         return None
     time_ns = stream.publish_time_ns - round(parameters.velocity_delay_s / NS)
-    return ReceiverVelocities(
-        stream.topic, time_ns[finite], found.value[finite], found.covariance[finite]
-    )
+    return GnssMotion(stream.topic, time_ns[finite], found.value[finite], found.covariance[finite])
+
+
+PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
+
+
+def unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
+    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
+
+    It is as much as they differ among themselves, and as the velocity changes meanwhile.
+    """
+    begin_ns = samples.time_ns[0]
+    until_ns = begin_ns + round(parameters.level_s / NS)
+    spread = samples.force[samples.time_ns < until_ns].std(axis=0)
+    changed = np.zeros(3)
+    if motion is not None:
+        ends = np.interp([begin_ns, until_ns], motion.time_ns, np.arange(len(motion.time_ns)))
+        first, last = np.rint(ends).astype(int)
+        changed = (motion.mps[last] - motion.mps[first]) / parameters.level_s
+    plumb = PLUMB_SIGMA_RAD * STANDARD_GRAVITY_MPS2
+    return float(np.sqrt(np.mean(spread**2) + np.mean(changed[:2] ** 2) + plumb**2))

@@ -1,4 +1,4 @@
-"""What a body may carry beside an inertial unit and GNSS: compass, barometer, wheels, radio tags.
+"""Models what a body may carry beside an inertial unit and GNSS: compass, barometer, wheels, radio tags.
 
 Sensors of the state of `navigation`, each on a topic of its own that a log may lack. Groves, Principles
 of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd edition, 2013, chapters 6 and 15.

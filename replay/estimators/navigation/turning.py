@@ -1,4 +1,4 @@
-"""How a body's state is corrected together with its heading, which may be hardly known.
+"""Corrects a body's state together with its heading, which may be hardly known.
 
 What an inertial unit measures acts in the plane turned by the heading, what fixes measure acts as it is.
 Given the heading both act linearly. So the mean of any other part of the state, as a function of the

@@ -78,7 +78,7 @@ class CooperativeParameters(Parameters):
 
 
 class CooperativeState(NamedTuple):
-    """What goes from block to block, and why robots take no part: (runs, robots), "" where they do.
+    """Holds the robots' states, and why robots take no part: (runs, robots), "" where they do.
 
     `announced` says of whom that was told, or need not be.
     """

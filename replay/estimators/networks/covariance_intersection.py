@@ -41,7 +41,7 @@ class Fused(NamedTuple):
 
 
 class FusionMemory(NamedTuple):
-    """What K estimates are fused in: their informations (K, n, n), and weights (K,) to come."""
+    """Holds the informations (K, n, n) of K estimates that are fused, and weights (K,) to come."""
 
     information: Floats
     better: Floats

@@ -18,7 +18,7 @@ from replay.tracing.functions import traced
 
 
 class RobotStates(NamedTuple):
-    """What goes from block to block; first axis = run. `failure` is one of gaussian's.
+    """Holds the robots' states between blocks; first axis = run. `failure` is one of gaussian's.
 
     The mean (3 n,) and covariance (3 n, 3 n) are of all n robots; only the joint filter has entries
     between robots.
@@ -32,7 +32,7 @@ class RobotStates(NamedTuple):
 
 
 class RobotSettings(NamedTuple):
-    """Noise of the robots' odometry and sensors, both (n, 2), who is an anchor, and the gate."""
+    """Holds the noise of the robots' odometry and sensors, both (n, 2), the anchors, and the gate."""
 
     density: Floats
     variance: Floats
@@ -41,7 +41,7 @@ class RobotSettings(NamedTuple):
 
 
 class SightingFusion(NamedTuple):
-    """How a sighting of another robot is used: in one state of all, by an intersection, or naively.
+    """Chooses how a sighting of another robot is used: one state of all, intersection, or naively.
 
     The weight of an intersection is that of the least trace or else of the least determinant.
     """
@@ -52,7 +52,7 @@ class SightingFusion(NamedTuple):
 
 
 class RobotEvents(NamedTuple):
-    """The events of all runs in order: whose they are, and what they say.
+    """Holds the events of all runs in order: whose they are, and what they say.
 
     `robots` (m, 2) are the one that speaks and the one that it sees, -1 where it sees none. Odometry has
     the value (forward, turn) and `is_sighting` false; a sighting has (range, bearing), of a robot or of
@@ -69,14 +69,14 @@ class RobotEvents(NamedTuple):
 
 
 class RobotResults(NamedTuple):
-    """The speaker's pose (m, 3) and covariance (m, 3, 3) after every event; NaN where none is said."""
+    """Holds the robot's pose (m, 3) and covariance (m, 3, 3) after an event; NaN if not wanted."""
 
     mean: Floats
     covariance: Floats
 
 
 class RobotMemory(NamedTuple):
-    """Memory of one run.
+    """Holds what the kernel works in, for one run.
 
     Attributes:
         state, transition, gain, variances: of a drive (3,), (3, 3), (3, 2), (2,).

@@ -86,17 +86,17 @@ def put(given: Estimate, place: Estimate) -> None:
 
 
 def one_of(estimates: Estimate, i: int) -> Estimate:
-    """One of several estimates; changing it changes them."""
+    """Return one of several estimates; changing it changes them."""
     return Estimate(estimates.mean[i], estimates.covariance[i], estimates.independent[i])
 
 
 def steps_for(tolerance: float) -> int:
-    """How many steps of a golden section leave a tenth of the root of the tolerance."""
+    """Count the steps of a golden section that leave a tenth of the root of the tolerance."""
     return 3 + int(np.ceil(np.log(0.1 * np.sqrt(tolerance)) / np.log(GOLDEN)))
 
 
 def golden(step: int, steps: int, value: float, section: Floats) -> float:
-    """Where in (0, 1) a search for the least value looks next, after `value` at the last place.
+    """Find where in (0, 1) a search for the least value looks next, after `value` at the last place.
 
     Golden section; the last of all steps is the middle of what is left. `section` (7,) is what the
     search remembers: both ends, both inner places and their values, and which one was asked for. Written

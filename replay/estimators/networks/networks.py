@@ -106,7 +106,7 @@ def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int
 
 
 def message_bytes(name: str, states: int) -> int:
-    """What one message carries: stamp, mean and the covariance's triangle, twice that for split CI."""
+    """Count a message's bytes: stamp, mean, the covariance's triangle, twice that for split CI."""
     triangle = states * (states + 1) // 2
     doubles = {ALONE: 0, "split-ci": 1 + states + 2 * triangle}.get(name, 1 + states + triangle)
     return 8 * doubles

@@ -1,4 +1,4 @@
-"""What the nodes of a network do between events: predict, measure, send, receive and fuse."""
+"""Runs the nodes of a network between events: they predict, measure, send, receive and fuse."""
 
 from typing import NamedTuple
 
@@ -41,7 +41,7 @@ class Sensing(NamedTuple):
 
 
 class NodeFusion(NamedTuple):
-    """The rule's number in `covariance_intersection.RULES`, and how exactly its weights are optimised.
+    """Holds the rule's number in `covariance_intersection.RULES`, and how exactly weights are optimised.
 
     With `own_first` a node fuses its own x*, not its prediction. A message differs by `divergence` nats
     at least from what the last one says, which is `interval_ns` old at least; `gate` is the largest
@@ -61,7 +61,7 @@ class NodeFusion(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """What the nodes of one run know, first axis = node.
+    """Holds what the nodes of one run know, first axis = node.
 
     Attributes:
         time_ns: (nodes,), of their estimates.
@@ -78,7 +78,7 @@ class Nodes(NamedTuple):
 
 
 class NodeMemory(NamedTuple):
-    """What one core works in: the nodes of a run, and what one of them fuses, with weights (most,)."""
+    """Holds what one core works in: a run's nodes, and what one of them fuses, weights (most,)."""
 
     nodes: Nodes
     parts: Estimate
@@ -105,7 +105,7 @@ def node_memory(nodes: int, most: int, states: int) -> NodeMemory:
 
 
 class NodeResults(NamedTuple):
-    """What the kernel fills, a row per activity: estimates, x* as it is sent, and whether it is.
+    """Holds a row per activity: the estimates, x* as it is sent, and whether it is.
 
     `refused` (m,) says of every message that arrived whether the gate kept it out.
     """
@@ -200,7 +200,7 @@ def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance:
 
 
 def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) -> bool:
-    """Whether an estimate may be of the same state, however both are correlated.
+    """Tell whether an estimate may be of the same state, however both are correlated.
 
     The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
     """
@@ -293,7 +293,7 @@ def is_due(
     fusion: NodeFusion,
     nodes: Nodes,
 ) -> bool:
-    """Whether x* may be sent again, and differs enough from what the last message says of now."""
+    """Tell whether x* may be sent again, and differs enough from what the last message says of now."""
     if nodes.last_ns[node] < 0:
         return True
     if now - nodes.last_ns[node] < fusion.interval_ns:

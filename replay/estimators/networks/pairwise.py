@@ -86,7 +86,7 @@ def trace_at(is_split: bool, weight: float, pair: Estimate, fused: Estimate) -> 
 
 
 class Stake(NamedTuple):
-    """What a state (n,) has at stake in a sighting with rows H (m, n): what its best weight depends on.
+    """Holds what the best weight of a sighting with rows H (m, n) depends on, of a state (n,).
 
     Attributes:
         states: n.

@@ -37,7 +37,7 @@ class AssumedParameters(Parameters):
 
     @property
     def covariance(self) -> Floats:
-        """Of the rotation vector, rad^2, (3, 3)."""
+        """Return the covariance of the rotation vector, rad^2, (3, 3)."""
         return np.radians(self.sigma_deg) ** 2 * np.eye(3)
 
 
@@ -76,7 +76,7 @@ class VqfParameters(AssumedParameters):
 
 
 class ComplementarySettings(NamedTuple):
-    """The gains, and the covariance (3, 3) that is assumed."""
+    """Holds the gains, and the covariance (3, 3) that is assumed."""
 
     gain: float
     bias_gain: float
@@ -84,7 +84,7 @@ class ComplementarySettings(NamedTuple):
 
 
 class ComplementaryState(NamedTuple):
-    """What is carried, first axis runs: orientations (runs, 4), zero for none yet; biases; stamps."""
+    """Carries orientations (runs, 4), zero for none yet; biases; stamps."""
 
     orientation: Floats
     bias: Floats
@@ -92,7 +92,7 @@ class ComplementaryState(NamedTuple):
 
 
 def start(given: Given[Any]) -> tuple[ComplementarySettings, ComplementaryState]:
-    """Nothing known."""
+    """Start with nothing known."""
     values = given.parameters
     settings = ComplementarySettings(values.gain, getattr(values, "bias_gain", 0.0), values.covariance)
     return settings, ComplementaryState(

@@ -40,7 +40,7 @@ _NS = 1e-9
 
 
 class InertialModel(NamedTuple):
-    """What the filter takes for granted, the same for all logs.
+    """Holds what the filter takes for granted, the same for all logs.
 
     Attributes:
         rest_s: how long the body rests at the start.
@@ -76,7 +76,7 @@ class InertialSamples(NamedTuple):
 
 
 class InertialState(NamedTuple):
-    """What the filter carries from sample to sample, first axis runs.
+    """Holds what the filter carries from sample to sample, first axis runs.
 
     Attributes:
         time_ns: of the first sample, the last one, the start of the block, (runs, 3); -1 for none yet.
@@ -102,7 +102,7 @@ class InertialState(NamedTuple):
 
 
 class OrientationEstimates(NamedTuple):
-    """Per sample: orientation (rows, 4) and covariance of its rotation vector, body frame, (rows, 3, 3).
+    """Holds per sample the orientation (rows, 4), and covariance in the body frame (rows, 3, 3).
 
     NaN while the orientation is unknown, and where a sample is not finite.
     """
@@ -112,7 +112,7 @@ class OrientationEstimates(NamedTuple):
 
 
 class ReckoningState(NamedTuple):
-    """What dead reckoning carries from sample to sample, first axis runs.
+    """Holds what dead reckoning carries from sample to sample, first axis runs.
 
     Attributes:
         orientation: (runs, 4), zero until the rest is over, NaN after a gap.

@@ -11,7 +11,7 @@ from replay.distributions.bingham_kernels import Vector
 
 
 def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
-    """Whether no component of the three vectors is NaN or infinite."""
+    """Tell whether no component of the three vectors is NaN or infinite."""
     total = 0.0
     for i in range(3):
         total += rate[i] + force[i] + field[i]
@@ -33,7 +33,7 @@ def turn_quaternion(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, fl
 
 
 def turn_back(turned: Vector, vector: NDArray) -> None:
-    """What a fixed vector becomes, in place, in the frame of a body that has turned by a quaternion."""
+    """Turn a fixed vector, in place, into the frame of a body that has turned by a quaternion."""
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
     a, b, c = vector[0], vector[1], vector[2]
     d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)

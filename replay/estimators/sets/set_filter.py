@@ -129,7 +129,7 @@ class SetStep(NamedTuple):
 
 @dataclass
 class Anchor:
-    """What is known of a robot at an earlier stamp; `parts` as in Step."""
+    """Holds what is known of a robot at an earlier stamp; `parts` as in SetStep."""
 
     time_ns: int
     pose: Floats

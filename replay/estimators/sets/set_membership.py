@@ -103,7 +103,7 @@ def solve(
 
 
 def set_metadata(topic: str, truth: str, known: Known) -> dict[str, str]:
-    """What sets say of themselves: of which components, beside which truth, from which frames."""
+    """Describe sets in their channel: of which components, beside which truth, from which frames."""
     return {
         "components": "x_m,y_m",
         "kinds": "linear,linear",
@@ -178,7 +178,7 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> 
 
 
 def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
-    """What the parameters say and, where they do not, the channels' metadata."""
+    """Read what the parameters say and, where they do not, the channels' metadata."""
     bound_rad = None if parameters.bound_deg is None else float(np.radians(parameters.bound_deg))
     arena_m: tuple[float, ...] | None = parameters.arena_m
     if arena_m is None and "arena_m" in landmarks.metadata:

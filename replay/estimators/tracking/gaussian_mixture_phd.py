@@ -223,7 +223,7 @@ def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixtu
 
 
 def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
-    """What the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
+    """Read what the parameters say and, where they do not, the scan's channel: see `given_or_stated`."""
     names = PhdSettings._fields[:-1]
     numbers = [given_or_stated(parameters, [scan], name) for name in names]
     return PhdSettings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])

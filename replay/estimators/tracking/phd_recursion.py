@@ -27,7 +27,7 @@ EXTRACTED = 0.5
 
 
 class PhdSettings(NamedTuple):
-    """The parameters as the kernel has them; the gate is in squared sigmas."""
+    """Holds the parameters as the kernel has them; the gate is in squared sigmas."""
 
     variance_m2: float
     detection_probability: float
@@ -43,7 +43,7 @@ class PhdSettings(NamedTuple):
 
 @varying(2)
 class Mixture(NamedTuple):
-    """What is carried: first axis run, second the components, of which `used` are taken.
+    """Carries the mixture: first axis run, second the components, of which `used` are taken.
 
     used, time_ns, failure: (runs,); time is below zero before the first scan. weight, mean, covariance:
     (runs, most), (runs, most, 4), (runs, most, 4, 4).
@@ -68,7 +68,7 @@ class Scans(NamedTuple):
 
 
 class Sets(NamedTuple):
-    """What is said of every scan: the expected number of things, and the elements of the set.
+    """Holds the output of every scan: the expected number of things, and the elements of the set.
 
     Scan s has room for elements from `room[s]` on, and has filled `elements[s]` of them.
     """
@@ -84,7 +84,7 @@ class Sets(NamedTuple):
 
 @varying(1, step=0, shift=0)
 class PhdMemory(NamedTuple):
-    """Memory of one core.
+    """Holds what one core works in.
 
     Attributes:
         weight, mean, covariance: the components after a scan, before they are reduced.

@@ -21,7 +21,7 @@ NO_TRACK = -1
 
 
 class ReportSettings(NamedTuple):
-    """The parameters as the kernel has them; the levels' (LEVELS,)."""
+    """Holds the parameters as the kernel has them; the levels' (LEVELS,)."""
 
     acceleration_density: Floats
     position_variance: Floats
@@ -81,7 +81,7 @@ class Reports(NamedTuple):
 
 
 class ReportResults(NamedTuple):
-    """What is said of every report: its track's number, mean (n, 4) and spread (n, 3)."""
+    """Holds the output of every report: its track's number, mean (n, 4) and spread (n, 3)."""
 
     number: Integers
     mean: Floats
@@ -90,7 +90,7 @@ class ReportResults(NamedTuple):
 
 @varying(2)
 class ReportMemory(NamedTuple):
-    """What the reports of one stamp are associated in: see `replay.inference.association.association`.
+    """Holds what associates the reports of one stamp: see `replay.inference.association.association`.
 
     Rows are reports, columns tracks; what is `missed` by all tracks begins a new one.
     """
@@ -133,7 +133,7 @@ def density_at(difference: tuple[float, float, float, float], a: float, b: float
 def differences(
     mean: Floats, position: Floats, velocity: Floats, duration_s: float
 ) -> tuple[float, float, float, float]:
-    """What is reported (x, vx, y, vy) minus what a track predicts."""
+    """Compute what is reported (x, vx, y, vy) minus what a track predicts."""
     return (
         position[0] - mean[0] - duration_s * mean[1],
         velocity[0] - mean[1],
@@ -148,7 +148,7 @@ def mixed(weight: float, settings: ReportSettings) -> float:
 
 
 def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> bool:
-    """Whether a course is the one before, or both are not available."""
+    """Tell whether a course is the one before, or both are not available."""
     if np.isnan(course_rad) or np.isnan(before_rad):
         return np.isnan(course_rad) and np.isnan(before_rad)
     turned = abs((course_rad - before_rad + np.pi) % (2.0 * np.pi) - np.pi)
@@ -156,12 +156,12 @@ def is_held(course_rad: float, before_rad: float, settings: ReportSettings) -> b
 
 
 def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: ReportSettings) -> bool:
-    """Whether a track was, and a report is, so slow that the course says little of the motion."""
+    """Tell whether a track was, and a report is, so slow that the course says little of the motion."""
     return speed_mps < settings.slow_mps and tracks.speed_mps[run, place] < settings.slow_mps
 
 
 def birth_density(velocity: Floats, own_variance: float, settings: ReportSettings) -> float:
-    """How densely vessels not met before report this, per m^2, s and (m/s)^2."""
+    """Compute how densely vessels not met before report this, per m^2, s and (m/s)^2."""
     moving = 1.0 / (np.pi * settings.top_speed_mps**2)
     variance = settings.slow_mps**2 + own_variance
     squared = (velocity[0] ** 2 + velocity[1] ** 2) / variance
@@ -173,7 +173,7 @@ def birth_density(velocity: Floats, own_variance: float, settings: ReportSetting
 def ratio_of(
     run: int, place: int, event: int, reports: Reports, tracks: Tracks, settings: ReportSettings
 ) -> float:
-    """How much likelier a report is of a track than of a vessel not met before."""
+    """Compute how much likelier a report is of a track than of a vessel not met before."""
     duration_s = (reports.time_ns[event] - tracks.time_ns[run, place]) * 1e-9
     if duration_s <= 0.0:
         return 0.0

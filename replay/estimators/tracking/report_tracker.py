@@ -82,7 +82,7 @@ def _compiled() -> Callable[..., None]:
 
 
 def start(_: Mapping[str, Ragged]) -> None:
-    """Nothing is known before the first report, not even how many runs there are."""
+    """Start with nothing: before the first report not even the number of runs is known."""
 
 
 def run(

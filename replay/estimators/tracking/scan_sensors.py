@@ -14,18 +14,18 @@ from replay.inference.association.scans import ScanSensor
 
 
 def away(target: Components, origin: Any) -> tuple[Any, Any]:
-    """Where a target is from a sensor."""
+    """Compute where a target is from a sensor."""
     return target[0] - origin[0], target[2] - origin[1]
 
 
 def is_within(bearing_rad: Component, begin_rad: Component, end_rad: Component) -> bool:
-    """Whether a bearing is in the sector anticlockwise from one angle to another; NaN is no sector."""
+    """Tell whether a bearing is in the sector anticlockwise between two angles; NaN is no sector."""
     turned = (bearing_rad - begin_rad) % (2.0 * np.pi)
     return turned < (end_rad - begin_rad) % (2.0 * np.pi)
 
 
 def between(range_m: Component, near: Component, far: Component, parameters: Any) -> Component:
-    """What is `near` up to a range, and `far` from another one on; linear between them."""
+    """Interpolate between `near` up to a range and `far` from another one on."""
     if range_m <= parameters.near_range_m:
         return near
     if range_m >= parameters.far_range_m:
@@ -35,7 +35,7 @@ def between(range_m: Component, near: Component, far: Component, parameters: Any
 
 
 def detection_of(target: Components, origin: Any, parameters: Any) -> Component:
-    """How probable a detection is: by range, less in one sector, and none in the blind one."""
+    """Compute the probability of a detection: by range, less in one sector, none in the blind one."""
     x, y = away(target, origin)
     bearing_rad = np.arctan2(y, x)
     if is_within(bearing_rad, parameters.blind_from_rad, parameters.blind_to_rad):
@@ -60,7 +60,7 @@ def clutter_in_plane(range_m: Component, bearing_rad: Component, parameters: Any
 
 
 def place_of(target: Components, origin: Any, parameters: Any) -> Components:
-    """Where a target is from the sensor, `lag_s` ago, as a sensor says that is out by its bias."""
+    """Compute a target's place from a sensor, `lag_s` ago, as one says that is out by its bias."""
     x, y = away(target, origin)
     lag_s = parameters.lag_s
     return x - lag_s * target[1] + parameters.bias_x_m, y - lag_s * target[3] + parameters.bias_y_m
@@ -74,7 +74,7 @@ def place_noise(target: Components, origin: Any, parameters: Any) -> Components:
 
 
 def place_clutter(detection: Any, parameters: Any) -> Component:
-    """Per m^2."""
+    """Return the clutter per m^2."""
     x, y = detection
     return clutter_in_plane(np.hypot(x, y), np.arctan2(y, x), parameters)
 
@@ -104,7 +104,7 @@ def bearing_noise(target: Components, origin: Any, parameters: Any) -> Component
 
 
 def bearing_clutter(detection: Any, parameters: Any) -> Component:
-    """Per rad."""
+    """Return the clutter per rad."""
     density = parameters.clutter_per_rad
     if is_within(detection[0], parameters.sector_from_rad, parameters.sector_to_rad):
         density *= parameters.sector_clutter_factor
@@ -128,7 +128,7 @@ def polar_noise(target: Components, origin: Any, parameters: Any) -> Components:
 
 
 def polar_clutter(detection: Any, parameters: Any) -> Component:
-    """Per m and rad: in the plane, that is a square of as many metres as the range on one side."""
+    """Return the clutter per m and rad: a square in the plane, as wide as the range."""
     range_m, bearing_rad = detection
     return range_m * clutter_in_plane(range_m, bearing_rad, parameters)
 

@@ -1,4 +1,4 @@
-"""What a tracker takes its targets to be: a registered model with a position, or constant velocity."""
+"""Chooses a tracker's model of its targets: a registered model with a position, or constant velocity."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -60,7 +60,7 @@ TARGET = Model(
 
 
 class Targets(NamedTuple):
-    """What targets are taken to be.
+    """Describes what targets are taken to be.
 
     Attributes:
         stage: their model, with one motion or all modes.

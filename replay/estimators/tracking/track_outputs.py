@@ -1,4 +1,4 @@
-"""What a tracker puts out: the tracks after every scan, associations, innovations, what was not used."""
+"""Writes a tracker's outputs: tracks after every scan, associations, innovations, what was not used."""
 
 from collections.abc import Iterator
 

@@ -14,7 +14,7 @@ from replay.inference.association.track_smoothing import smooth_tracks
 
 
 class TrackSmootherState(NamedTuple):
-    """The tracker's state, and by block what it said."""
+    """Holds the tracker's state, and its outputs by block."""
 
     tracker: Any
     outputs: tuple[list[Ragged], ...]

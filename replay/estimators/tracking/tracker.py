@@ -270,7 +270,7 @@ def _check_scans(topics: Mapping[str, Topic], wanted: Sequence[str]) -> None:
 
 
 class TrackerSettings(NamedTuple):
-    """What the loop reads, a row for every sensor; and the errors that sensors have beside noise."""
+    """Holds what the loop reads, a row for every sensor, and sensors' errors beside noise."""
 
     names: tuple[str, ...]
     numbers: Floats
@@ -280,7 +280,7 @@ class TrackerSettings(NamedTuple):
 def settings_of(
     topics: Mapping[str, Topic], found: SensorTopics, parameters: TrackerParameters, targets: Targets
 ) -> TrackerSettings:
-    """What parameters and channels say of the sensors and targets."""
+    """Read what parameters and channels say of the sensors and targets."""
     names, own = number_fields(TrackerParameters), targets.parameters._asdict()
     kinds, by_sensor = [KINDS[kind] for kind in found.kinds], []
     for kind, scan in zip(kinds, found.scans, strict=True):

@@ -45,7 +45,7 @@ class TrackerSetup(NamedTuple):
 
 
 class TrackerState(NamedTuple):
-    """What is carried from block to block: the last own positions, and the tracks.
+    """Carries the last own positions and the tracks from block to block.
 
     Attributes:
         fixes: by topic and run.
@@ -57,7 +57,7 @@ class TrackerState(NamedTuple):
 
 
 def start(_: Mapping[str, Ragged]) -> None:
-    """Nothing is known before the first scan, not even how many runs there are."""
+    """Start with nothing: before the first scan not even the number of runs is known."""
 
 
 def run(
@@ -88,7 +88,7 @@ def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scan
 
 
 class OutOfSequenceState(NamedTuple):
-    """One run whose scans may come late.
+    """Holds one run whose scans may come late.
 
     Attributes:
         base: the tracks after all scans that no late one can precede any more.

@@ -1,4 +1,4 @@
-"""Which detection is of which vehicle: the best map, or all maps of an unordered scan with weights.
+"""Associates detections with vehicles: by the best map, or all maps of an unordered scan with weights.
 
 A map sends every vehicle to a detection of its own or to none; the detections left over are false.
 The weights are those of a scan with detection probability p_D and Poisson clutter of uniform density.
@@ -22,7 +22,7 @@ LEAST_MISSED = 1e-9
 
 
 class Scanning(NamedTuple):
-    """What is known of a sensor of unordered scans."""
+    """Holds what is known of a sensor of unordered scans."""
 
     variance_m2: float
     detection_probability: float
@@ -30,7 +30,7 @@ class Scanning(NamedTuple):
 
     @property
     def is_whole(self) -> bool:
-        """Whether a scan holds every vehicle once and nothing else."""
+        """Tell whether a scan holds every vehicle once and nothing else."""
         return self.detection_probability == 1.0 and self.clutter_per_m2 == 0.0
 
     @property
@@ -53,7 +53,7 @@ class Hypotheses(NamedTuple):
 
 
 def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -> Floats:
-    """Of every vehicle's being each detection, (runs, vehicles, detections); -inf outside the gate.
+    """Compute how likely a vehicle is a detection, (runs, vehicles, detections); -inf outside gates.
 
     Args:
         predicted: (runs, vehicles, axes).

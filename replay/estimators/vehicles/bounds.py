@@ -1,4 +1,4 @@
-"""What vehicles' total error comes to: exact for the Kalman filter, bounds for what uses more.
+"""Computes vehicles' total error: exact for the Kalman filter, bounds for what uses more.
 
 All axes of all vehicles are alike and uncoupled, so everything follows from one axis. The filter
 supposes accelerations; the truth has them (stochastic) or none (deterministic).
@@ -15,7 +15,7 @@ SETTLED = 2000
 
 
 class Axis(NamedTuple):
-    """One axis over the steps: squared position errors by the filter and of a truth without noise.
+    """Holds one axis over the steps: squared position errors by the filter and of a truth without noise.
 
     `gain` (2,) is the last one, of position and velocity.
     """

@@ -91,7 +91,7 @@ class Cloud(NamedTuple):
 
 
 class Method(NamedTuple):
-    """What is done: see `KINDS`."""
+    """Names what is done: see `KINDS`."""
 
     kind: str
     particles: int

@@ -1,4 +1,4 @@
-"""Where an infrastructure sensor stands, from unordered detections and where vehicles are thought to be.
+"""Finds where an infrastructure sensor stands, from unordered detections and the vehicles' estimates.
 
 Places are complex numbers here: a turn is a factor of length one, and the best one between centred
 points is the phase of their inner product (Procrustes in the plane). Which detection is of which vehicle
@@ -66,7 +66,7 @@ def register(places: Floats, detections: Floats, variance_m2: Floats | float) ->
 
 
 def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
-    """Whether detections (runs, vehicles, 2), NaN for none, are far enough apart to tell a heading."""
+    """Tell whether detections (runs, vehicles, 2), NaN for none, are far enough apart for a heading."""
     count = np.isfinite(detections[..., 0]).sum(axis=1)
     squared = np.nansum((detections - _middle(detections)) ** 2, axis=(1, 2))
     return np.asarray((count > 1) & (squared > count * LEAST_SPREAD**2 * variance_m2))

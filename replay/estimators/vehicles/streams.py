@@ -63,7 +63,7 @@ class VehiclesParameters(Parameters):
 
 
 class VehiclesState(NamedTuple):
-    """What is carried from block to block; first axis = run.
+    """Carries the joint state from block to block; first axis = run.
 
     `scans` counts the infrastructure sensor's; `registered` says that its pose was found.
     """
@@ -77,7 +77,7 @@ class VehiclesState(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """All that came, by run and frame: times (runs, frames), counts of frames (runs,), measurements.
+    """Holds all that came, by run and frame: times (runs, frames), counts (runs,), measurements.
 
     `fixes` (runs, frames, vehicles, 2) with `noise` (runs, frames, vehicles, 2, 2), and scans of the
     network and the infrastructure sensor (runs, frames, detections, 2), are NaN where there are none;
@@ -171,13 +171,13 @@ def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
 
 
 def motion_of(topics: Mapping[str, Topic], numbers: Sequence[int]) -> Motion:
-    """How the vehicles move, as their priors' channels state it."""
+    """Read how the vehicles move, as their priors' channels state it."""
     priors = [topics[f"/vehicle{number}/prior"] for number in numbers]
     return Motion(*(np.array([stated([prior], name) for prior in priors]) for name in Motion._fields))
 
 
 def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
-    """What a scan's channel states of its sensor; a log without it has no such sensor."""
+    """Read what a scan's channel states of its sensor; a log without it has no such sensor."""
     if topic not in topics:
         return Scanning(1.0, 1.0, 0.0)
     return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))

@@ -73,22 +73,22 @@ class Setup(NamedTuple):
 
     @property
     def has_pose(self) -> bool:
-        """Whether the state holds the sensor's pose."""
+        """Tell whether the state holds the sensor's pose."""
         return self.sensor in ("registration", "static")
 
     @property
     def uses_sums(self) -> bool:
-        """Whether unordered fixes become symmetric sums; else they are associated."""
+        """Tell whether unordered fixes become symmetric sums; else they are associated."""
         return self.fixes not in ("known", "hungarian", "set", "axes")
 
     @property
     def states(self) -> int:
-        """How many components the joint state has."""
+        """Return how many components the joint state has."""
         return STATES * self.motion.vehicles + POSE * self.has_pose
 
 
 def split_method(method: str) -> tuple[str, str]:
-    """What is done with the fixes, and with the infrastructure sensor: empty where that is not used."""
+    """Split a method into that for fixes and that for the infrastructure sensor, "" if unused."""
     fixes, _, sensor = method.rpartition("-")
     return (fixes, sensor) if fixes and sensor in SENSOR else (method, "")
 

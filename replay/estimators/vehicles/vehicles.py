@@ -34,14 +34,14 @@ class Joint(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How the vehicles move: turn rates and sigmas of the acceleration, (vehicles,) each."""
+    """Describes how the vehicles move: turn rates and sigmas of the acceleration, (vehicles,) each."""
 
     turn_rate_radps: Floats
     acceleration_sigma_mps2: Floats
 
     @property
     def vehicles(self) -> int:
-        """How many there are."""
+        """Return how many there are."""
         return len(self.turn_rate_radps)
 
 
@@ -75,7 +75,7 @@ def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
 
 
 class Gain(NamedTuple):
-    """What a linear measurement does to a covariance; S is the innovation's covariance.
+    """Holds what a linear measurement does to a covariance; S is the innovation's covariance.
 
     inverse: S^-1 (runs, m, m); log_determinant (runs,) of S; gain (runs, n, m); covariance after.
     """
@@ -207,7 +207,7 @@ def topology(places: Floats) -> Floats:
 
 
 def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats]:
-    """How much noise adds to the measured topology of these places on average, and its variance."""
+    """Compute mean and variance of what noise adds to the measured topology of these places."""
     count = places.shape[-2]
     added = 2.0 * count * (count - 1) * variance_m2
     variance = 4.0 * count**2 * variance_m2 * (spread_of(places) + (count - 1) * variance_m2)
@@ -249,14 +249,14 @@ def update_by_scalar(joint: Joint, measured: Scalar) -> Joint:
 
 
 class Sight(NamedTuple):
-    """What the infrastructure sensor should see: places (runs, m), and their Jacobian (runs, m, n)."""
+    """Holds what the infrastructure sensor should see: places (runs, m), Jacobian (runs, m, n)."""
 
     predicted: Floats
     rows: Floats
 
 
 def sight_of(motion: Motion, joint: Joint) -> Sight:
-    """What the sensor with the estimated pose should see of the estimated vehicles."""
+    """Predict what the sensor with the estimated pose should see of the estimated vehicles."""
     count, states = motion.vehicles, joint.mean.shape[1]
     places, pose = positions(motion, joint.mean), joint.mean[:, -POSE:]
     seen = np.stack(into_frame(pose.T[:, :, None], np.moveaxis(places, -1, 0)), axis=-1)
@@ -275,7 +275,7 @@ def sight_of(motion: Motion, joint: Joint) -> Sight:
 def update_by_shape(
     motion: Motion, joint: Joint, pose: Floats, seen: Floats, variance_m2: float
 ) -> Joint:
-    """What a sensor sees (runs, vehicles, 2) from a pose of which nothing is known before.
+    """Update by what a sensor sees (runs, vehicles, 2) from a pose of which nothing is known before.
 
     `pose` (runs, 3) is only where to linearise; NaN was not seen. What any change of the pose would
     change is left out of the update of the vehicles; then the pose follows from them.

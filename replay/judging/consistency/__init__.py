@@ -1,4 +1,4 @@
-"""Whether errors, innovations and scores are what an estimator says of them.
+"""Tests whether errors, innovations and scores are what an estimator says of them.
 
 Begin with `consistency`.
 """

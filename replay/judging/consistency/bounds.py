@@ -64,7 +64,7 @@ class Bounds:
 
     @property
     def size(self) -> int:
-        """How many components the tangent space has."""
+        """Return how many components the tangent space has."""
         return len(self.components)
 
     def add(self, output: Output) -> "Bounds":
@@ -145,7 +145,7 @@ class Bounds:
 
 
 def products_of(rows: Ragged, size: int) -> Products | None:
-    """Of every step; None where a noise is singular, or a measurement is exact."""
+    """Compute the products of every step; None where a noise is singular, or a measurement is exact."""
     transition, noise, information = (
         rows[name].reshape(-1, size, size) for name in ("transition", "noise", "information")
     )
@@ -187,7 +187,7 @@ def _add(state: Bounds, output: Output) -> Bounds:
 
 
 def root_mean_squares(state: Bounds) -> dict[str, float]:
-    """What no RMSE over all steps gets below, under the names that RMSE have.
+    """Compute what no RMSE over all steps gets below, under the names that RMSE have.
 
     Only where that is of the ensemble, which `over_ensemble` says by 1; else there is the average along
     the trajectories, as of errors (`metrics.ACCURACY`).

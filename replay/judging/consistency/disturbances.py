@@ -1,4 +1,4 @@
-"""Where a magnetic field is disturbed, by an estimate of orientation and of the field of the place."""
+"""Finds where a magnetic field is disturbed, by an estimate of orientation and of the place's field."""
 
 from typing import NamedTuple
 

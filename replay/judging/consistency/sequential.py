@@ -26,7 +26,7 @@ class Rates(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """What became of sequences (n,): whether they were accepted, and after how many probes.
+    """Holds what became of sequences (n,): whether they were accepted, and after how many probes.
 
     Those that came to no decision have 0 probes and are not accepted.
     """
@@ -36,7 +36,7 @@ class Decisions(NamedTuple):
 
     @property
     def rejected(self) -> Booleans:
-        """Which sequences (n,) were rejected."""
+        """Return which sequences (n,) were rejected."""
         return ~self.accepted & (self.probes > 0)
 
 
@@ -54,7 +54,7 @@ def thresholds(rates: Rates) -> tuple[float, float]:
 
 
 def wald_bounds(rates: Rates) -> Rates:
-    """What the rates of error cannot exceed by those thresholds: Wald's inequalities (3.18), (3.19)."""
+    """Compute what error rates cannot exceed by the thresholds: Wald's inequalities (3.18), (3.19)."""
     accept, reject = rates
     return Rates(accept / (1.0 - reject), reject / (1.0 - accept))
 

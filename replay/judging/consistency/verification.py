@@ -1,4 +1,4 @@
-"""How well scores verify and identify users: rates, ROC, equal error rate, cost of the likelihood ratio.
+"""Measures how well scores verify and identify users: rates, ROC, equal error rate, Cllr.
 
 Verification rate and relative rate increase: Zheng & Blasch, JAIF 2014, eq. 3. Cllr: Brummer & du Preez,
 Computer Speech & Language 2006. Scores are alike where they are great; a comparison is accepted where
@@ -43,17 +43,17 @@ class Fused(NamedTuple):
 
     @property
     def genuine(self) -> NDArray[np.bool_]:
-        """Which comparisons are of the same user."""
+        """Return which comparisons are of the same user."""
         return self.probe == self.gallery
 
     @property
     def is_complete(self) -> bool:
-        """Whether every probe is compared with every gallery entry."""
+        """Tell whether every probe is compared with every gallery entry."""
         return len(self.score) == (int(self.gallery.max()) + 1) ** 2
 
 
 def fused_of(stream: Stream) -> Fused:
-    """What a fusion's output stream says."""
+    """Read what a fusion's output stream says."""
     folds = stream.metadata.get("fold_of_user")
     threshold = stream.metadata.get("threshold")
     return Fused(
@@ -98,7 +98,7 @@ def cost_of_ratio(ratio: Floats, genuine: NDArray[np.bool_]) -> float:
 
 
 def identified(scores: Floats) -> int:
-    """How many columns of scores (probes, gallery) have their greatest, the first of equals, at home."""
+    """Count the columns of scores (probes, gallery) whose greatest, the first of equals, is at home."""
     best = np.argmax(np.where(np.isnan(scores), -np.inf, scores), axis=0)
     return int(np.count_nonzero(best == np.arange(len(best))))
 

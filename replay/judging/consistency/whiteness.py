@@ -1,4 +1,4 @@
-"""Whether innovations are white: normalised, uncorrelated in time, of mean square one.
+"""Tests whether innovations are white: normalised, uncorrelated in time, of mean square one.
 
 A measurement noise that is stated too small correlates successive innovations negatively, a process
 noise that is too small positively: Mehra, "On the identification of variances and adaptive Kalman
@@ -20,7 +20,7 @@ LAGS = 20
 
 
 class Whiteness(NamedTuple):
-    """What a series of normalised innovations tells.
+    """Holds what a series of normalised innovations tells.
 
     Attributes:
         size: how many there are.
@@ -38,7 +38,7 @@ class Whiteness(NamedTuple):
 
     @property
     def bound(self) -> float:
-        """What the magnitude of an autocorrelation of a white series exceeds once in twenty."""
+        """Return what the magnitude of an autocorrelation of a white series exceeds once in twenty."""
         return float(1.96 / np.sqrt(self.size))
 
 
@@ -67,7 +67,7 @@ def whitened(innovations: Stream) -> Floats:
 
 
 def whiteness(series: Sequence[Floats], lags: int = LAGS) -> Whiteness:
-    """What normalised innovations (n,) of one component tell, of one run or of several together.
+    """Measure the whiteness of normalised innovations (n,) of one component, of one run or several.
 
     Fewer than `lags` + 2 tell nothing: all but their count is NaN.
     """

@@ -76,7 +76,7 @@ class Difference(NamedTuple):
 
 
 def target_of(quantity: str) -> Target:
-    """What a registered metric should be; None for one of which this is not known."""
+    """Return what a registered metric should be; None for one of which this is not known."""
     return next((target for pattern, target in TARGETS.items() if fnmatch(quantity, pattern)), None)
 
 

@@ -41,7 +41,7 @@ BOUND = "bound"  # in the metadata of what is no estimate, but what no estimator
 
 
 class Quantity(NamedTuple):
-    """What an error figure shows of an estimate: its RMSE's name, its columns, the scale of its unit."""
+    """Describes what an error figure shows: its RMSE's name, its columns, the scale of its unit."""
 
     rmse: str
     columns: list[int]
@@ -50,7 +50,7 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class Errors:
-    """One estimate stream of an ensemble against its truth, where there is truth.
+    """Holds one estimate stream of an ensemble against its truth, where there is truth.
 
     Attributes:
         estimator: the estimator's label, such as `ekf`.
@@ -121,7 +121,7 @@ def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
 
 
 class Innovations(NamedTuple):
-    """One innovation stream of an ensemble; `degrees` is the number of measured components.
+    """Holds one innovation stream of an ensemble; `degrees` is the number of measured components.
 
     `log_likelihood` is NaN where the estimator states none, and None of a log from before it was stated.
     """
@@ -143,7 +143,7 @@ def split_topic(topic: str) -> tuple[str, str]:
 
 
 def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> tuple[float, float]:
-    """Where the mean of `runs` chi-square values lies with this probability if all is well.
+    """Compute where the mean of `runs` chi-square values lies with this probability if all is well.
 
     A mean NEES of 3 components over 50 runs is credible within
 
@@ -158,7 +158,7 @@ def chi_square_interval(degrees: int, runs: int, probability: float = 0.95) -> t
 def rmse_interval(
     runs: Floats, trace: Floats, squared: Floats, probability: float = 0.95
 ) -> tuple[Floats, Floats]:
-    """Where an RMSE over so many runs lies with this probability if the covariances P are right.
+    """Compute where an RMSE over so many runs lies with this probability if the covariances P are right.
 
     A sum of squared errors has mean tr P and variance 2 tr P^2, and nearly the distribution of a scaled
     chi-square variable with these (Box 1954, theorem 3.1); exactly so where all variances are equal.

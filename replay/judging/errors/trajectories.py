@@ -30,7 +30,7 @@ MOST_MOVES = 50
 
 @dataclass(frozen=True)
 class Comparison:
-    """How an estimated trajectory is compared with the true one.
+    """Describes how an estimated trajectory is compared with the true one.
 
     Attributes:
         align: see `alignment_of`.
@@ -245,7 +245,7 @@ def _angle_deg(left: Floats | None, right: Floats | None) -> Floats | None:
 
 
 def statistics(error: Floats) -> dict[str, float]:
-    """What evo tells of errors (n,), which are not negative."""
+    """Compute what evo tells of errors (n,), which are not negative."""
     return {
         "rmse": float(np.sqrt(np.mean(error**2))),
         "mean": float(np.mean(error)),
@@ -278,7 +278,7 @@ def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
 
 
 def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) -> float:
-    """What to add to the estimate's stamps, in s, so that it is nearest to the truth.
+    """Estimate what to add to the estimate's stamps, in s, so that it is nearest to the truth.
 
     From where the speeds of both correlate most, which no alignment changes, the search goes down to the
     offset with the least RMSE of aligned positions.

@@ -20,7 +20,7 @@ BLOCK_MESSAGES = 1 << 16
 
 
 class Doubt(NamedTuple):
-    """What is doubtful about a truth of so many messages."""
+    """Holds what is doubtful about a truth of so many messages."""
 
     messages: int
     why: str
@@ -74,7 +74,7 @@ class Truths:
 
     @property
     def doubts(self) -> dict[str, Doubt]:
-        """How a truth by which estimates are judged is stated twice: at one stamp, or by two topics."""
+        """Find how a truth of estimates is stated twice: at one stamp, or by two topics."""
         found: dict[str, list[str]] = {}
         judging = {topic for topic, _ in self._reached} | self._forgotten
         for (topic, other), apart in self._apart.items():

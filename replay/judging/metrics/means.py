@@ -1,4 +1,4 @@
-"""What estimators tell of themselves, as means over the runs for spans of time.
+"""Averages estimators' diagnostics over the runs, for spans of time.
 
 Such are the probabilities of modes, the effective share of particles, and messages that came late.
 """
@@ -29,7 +29,7 @@ LATE = (DROPPED, INSERTED, WAITED)
 
 
 class OutputDiagnostics(NamedTuple):
-    """What one output tells.
+    """Holds what one output tells.
 
     Attributes:
         what: one of the names above.
@@ -43,7 +43,7 @@ class OutputDiagnostics(NamedTuple):
 
 
 def diagnostics_of(output: Output) -> OutputDiagnostics | None:
-    """What an output tells that has a mean over time; None where it is of another kind."""
+    """Read what an output tells that has a mean over time; None where it is of another kind."""
     stream = output.rows.stream
     schema = stream.schema.full_name
     if schema == schemas.MODE_PROBABILITIES.full_name:
@@ -97,7 +97,7 @@ class Means:
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One row per span of time: its mean time, how many messages, and the mean of every value."""
+        """Return one row per span of time: its mean time, count of messages, mean of every value."""
         import pandas as pd  # which takes long to import
 
         _, count, sums = self.sums.filled()
@@ -140,7 +140,7 @@ class MeansOfAll:
                 yield means.what, table
 
     def modes(self) -> "Iterator[pd.DataFrame]":
-        """How probable modes are: a row per span of time and mode."""
+        """Return how probable modes are: a row per span of time and mode."""
         for what, table in self._tables(MODES, SMOOTHED_MODES):
             fixed = ["index", "estimator", "case", "elapsed_s", "estimates"]
             wide = table.rename(columns={"messages": "estimates"}).reset_index()
@@ -150,7 +150,7 @@ class MeansOfAll:
             yield long
 
     def effective(self) -> "Iterator[pd.DataFrame]":
-        """What share of the particles is effective: a row per span of time."""
+        """Return the effective share of the particles: a row per span of time."""
         for _, table in self._tables(EFFECTIVE):
             yield table.rename(columns={"messages": "estimates"})
 

@@ -1,4 +1,4 @@
-"""What a metric is, and how metrics become the numbers of all that is judged.
+"""Defines a metric, and how metrics become the numbers of all that is judged.
 
 They register by name, as estimators do. A metric is fed block by block, and what it makes of them can be
 merged: over the blocks of a long log, over the runs of an ensemble, over the workers of a campaign.
@@ -108,12 +108,12 @@ def find_metrics(names: Sequence[str] = ()) -> dict[str, Metric[Any, Any]]:
 
 
 def metric_key(estimator: str, quantity: str, case: str) -> str:
-    """What a number is called: `estimator.quantity[.case]`."""
+    """Name a number: `estimator.quantity[.case]`."""
     return ".".join(filter(None, (estimator, quantity, case)))
 
 
 class Measurement:
-    """What metrics make of all that is judged, as it comes.
+    """Collects what metrics make of all that is judged, as it comes.
 
     What is judged together (one output topic of one estimator) is told by a key.
     """
@@ -172,7 +172,7 @@ _RANKS: dict[type, int] = {Errors: 0, Innovations: 1, Output: 3}
 
 
 def measure(judged: Iterable[Any], metrics: Mapping[str, Metric[Any, Any]]) -> dict[str, float]:
-    """What the metrics say of all that was judged, each whole, as `estimator.quantity[.case]`.
+    """Measure all that was judged, each whole, as `estimator.quantity[.case]`.
 
     Raises BadInput where a metric raises.
     """

@@ -55,7 +55,7 @@ def accuracy(sums: Sums) -> dict[str, float]:
 
 
 def rmse_of(component: str) -> str:
-    """What the RMSE of a component is called: `turn_rmse_radps` of `turn_radps`."""
+    """Name the RMSE of a component: `turn_rmse_radps` of `turn_radps`."""
     quantity, _, unit = component.rpartition("_")
     return f"{quantity}_rmse_{unit}".strip("_")
 
@@ -131,7 +131,7 @@ def consistency(state: Consistent) -> dict[str, float]:
 
 
 def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Floats, Floats]:
-    """Where the mean NEES of `size` components lies over so many runs (n,): low and high (n,)."""
+    """Compute where the mean NEES of `size` components lies over so many runs (n,): low, high (n,)."""
     counts, place = np.unique(runs, return_inverse=True)
     bounds = np.array([chi_square_interval(size, int(count), probability) for count in counts])
     return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
@@ -181,12 +181,12 @@ def _failed(output: Output) -> Sums:
 
 
 def failures(sums: Sums) -> dict[str, float]:
-    """How many runs failed."""
+    """Count the runs that failed."""
     return {"failed_runs": float(len(sums["runs"]))} if sums else {}
 
 
 def covered(output: Output) -> Sums:
-    """Of the runs' spans, how many seconds there are and were estimated; measurements not used."""
+    """Count the seconds that the runs span and that were estimated, and the measurements not used."""
     schema = output.rows.stream.schema.full_name
     if schema == schemas.SKIPPED.full_name:
         return {"skipped": len(output.rows)}
@@ -200,7 +200,7 @@ def covered(output: Output) -> Sums:
 
 
 def coverage(sums: Sums) -> dict[str, float]:
-    """What share of the span the other figures are of, and how many measurements were not used."""
+    """Return the share of the span that other figures are of, and the measurements not used."""
     if "skipped" in sums:
         return {"skipped_measurements": float(sums["skipped"])}
     share = estimated_share(sums)
@@ -229,7 +229,7 @@ def _solved(output: Output) -> Sums:
 
 
 def solution(sums: Sums) -> dict[str, float]:
-    """How the batch solutions ended: the share that converged, and the most iterations of one.
+    """Return how the batch solutions ended: the share that converged, and the most iterations of one.
 
     Where a start is stated, also the mean cost at the end; of single iterations that at the start.
     """
@@ -253,7 +253,7 @@ def _effective(output: Output) -> Sums:
 
 
 def effective(sums: Sums) -> dict[str, float]:
-    """What share of a filter's particles counts, 1 / (N sum w^2): the mean over all estimates."""
+    """Return a filter's effective share of particles, 1 / (N sum w^2): the mean over all estimates."""
     return {"effective_share": sums["shares"] / sums["estimates"]} if sums.get("estimates") else {}
 
 

@@ -1,4 +1,4 @@
-"""What is kept of an estimate stream's errors: sums by step and by time, which merge."""
+"""Keeps the sums of an estimate stream's errors by step and by time, which merge."""
 
 from dataclasses import dataclass
 

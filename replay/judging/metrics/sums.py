@@ -69,7 +69,7 @@ class BinnedSums:
             self._double()
 
     def filled(self) -> tuple[Integers, Floats, Floats]:
-        """Of every cell that has rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
+        """Return every cell that has rows: group and bin (m, 2), count (m,) and sums (m, columns)."""
         used = self._sums[: self._groups, : self._bins]
         cells = np.argwhere(used[:, :, 0] > 0)
         rows = used[cells[:, 0], cells[:, 1]]

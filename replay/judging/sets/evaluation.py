@@ -43,12 +43,12 @@ class JudgedSets:
 
     @property
     def violations(self) -> int:
-        """How many sets miss the truth although bounds and arena hold: with guaranteed sets, none."""
+        """Count the sets that miss the truth although bounds and arena hold: none if guaranteed."""
         return int((self.known & self.bound_holds & self.in_arena & ~self.inside).sum())
 
     @property
     def outside_arena(self) -> int:
-        """How often the robot was not where it was taken to be, so that nothing is guaranteed."""
+        """Count how often the robot was not where it was taken to be, so that nothing is guaranteed."""
         return int((self.known & ~self.in_arena).sum())
 
 
@@ -120,7 +120,7 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
+    """Tell whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
     measured = sizes.metadata["measured"]
     streams = source.read(["/landmarks", measured])
     hold = np.zeros((2, len(places)), bool)

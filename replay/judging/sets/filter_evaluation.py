@@ -49,7 +49,7 @@ class JudgedFilter:
 
     @property
     def violations(self) -> int:
-        """How many sets miss the truth although they must hold it: with guaranteed sets, none."""
+        """Count the sets that miss the truth although they must hold it: with guaranteed sets, none."""
         return int((self.guaranteed & ~self.sets.inside).sum())
 
 
@@ -132,7 +132,7 @@ def odometry_error(
 
 
 def bearing_errors(seen: Bearings, pose: Floats) -> Floats:
-    """How far single bearings (n,) are off at a true pose (3,), rad."""
+    """Compute how far single bearings (n,) are off at a true pose (3,), rad."""
     away = seen.place_m - pose[:2]
     return np.abs(wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - pose[2] - seen.bearing_rad))
 

@@ -1,4 +1,4 @@
-"""How far tracks are from the trajectories of targets: trajectory GOSPA, HOTA and IDF1.
+"""Measures how far tracks are from targets' trajectories: trajectory GOSPA, HOTA and IDF1.
 
 Tracks and trajectories are (targets, steps, axes), NaN at the steps at which one is absent.
 

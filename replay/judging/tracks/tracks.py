@@ -26,7 +26,7 @@ KEPT_SHARE = 0.95
 
 
 class KeptTracks(NamedTuple):
-    """How many targets are judged, what share of them kept a track, and their mean share in it."""
+    """Holds how many targets are judged, what share of them kept a track, and their mean share in it."""
 
     targets: int
     kept_share: float
@@ -34,7 +34,7 @@ class KeptTracks(NamedTuple):
 
 
 def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
-    """One row per target of reports (n,), most reports first.
+    """Return one row per target of reports (n,), most reports first.
 
     Columns: target, reports; track, its own, -1 for none; share of its reports in that; largest_share in
     any track; tracks, how many have a report of it; switches, how often successive reports of it are in
@@ -71,7 +71,7 @@ def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
 
 
 def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPORTS) -> KeptTracks:
-    """How the targets with more than so many reports kept their tracks."""
+    """Return how the targets with more than so many reports kept their tracks."""
     shares = table.loc[table["reports"] > reports, column].to_numpy()
     if len(shares) == 0:
         return KeptTracks(0, np.nan, np.nan)
@@ -79,7 +79,7 @@ def kept(table: "pd.DataFrame", column: str = "share", reports: int = MANY_REPOR
 
 
 def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[Integers, Integers]:
-    """How many numbers spoke within the last `live_s`: times (m,) at which that changes, counts (m,).
+    """Count the numbers that spoke within the last `live_s`: times (m,) of changes, counts (m,).
 
     Times (n,) are sorted.
     """
@@ -99,7 +99,7 @@ Reports = dict[int, list[tuple[Integers, Integers]]]
 
 
 def reports_of(output: Output) -> Reports:
-    """Of every run the true targets and the tracks (n,) of its reports; {} where that is not known.
+    """Return every run's true targets and tracks (n,) of its reports; {} where that is not known.
 
     The rows of the stream are those of the reports, and so of the identities, in the span of a replay.
     Raises BadInput where the log is not the one that these are estimates of.

@@ -1,1 +1,1 @@
-"""What scenes of any family are drawn with: canvas, plane, plots; begin with `canvas`."""
+"""Draws scenes of any family: canvas, plane, plots; begin with `canvas`."""

@@ -1,4 +1,4 @@
-"""What a sensor sees, drawn about it: in its own frame, its x axis to the right.
+"""Draws what a sensor sees about it: in its own frame, its x axis to the right.
 
 Ranges are circles, bearings and lines of sight are rays from the origin, detections are points.
 """

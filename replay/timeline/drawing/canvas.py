@@ -1,4 +1,4 @@
-"""What there is to draw (a scene), what it is drawn on (a canvas), and who draws it (a timeline).
+"""Defines what is drawn (a scene), what it is drawn on (a canvas), and who draws it (a timeline).
 
 A timeline is made of parts: each sends its columns and returns the view that shows them. Everything
 that moves is on three timelines: `step`, `sim_time` (since the run's epoch) and `utc`. Where stamps are
@@ -48,7 +48,7 @@ DATES_FROM_NS = 946_684_800_000_000_000
 
 @dataclass(frozen=True)
 class Scene:
-    """One run and what the estimators made of it.
+    """Holds one run and what the estimators made of it.
 
     Attributes:
         source: the run's sensor streams and truth.
@@ -70,7 +70,7 @@ class Scene:
 
     @property
     def cases(self) -> list[str]:
-        """What is estimated, or has a truth: `robot1`, say. A log with a single one may call it ""."""
+        """Return what is estimated, or has a truth: `robot1`, say. A single one may be named ""."""
         estimated = [split_topic(topic)[1] for topic in self.outputs]
         found = {*estimated, *(_prefix(topic) for topic in self._truths)}
         return sorted(found, key=_natural) or [""]
@@ -120,12 +120,12 @@ class Scene:
         return found
 
     def read(self, topic: str) -> Stream:
-        """One of the run's topics, whole."""
+        """Read one of the run's topics, whole."""
         return self.source.read([topic])[topic]
 
     @property
     def dates(self) -> "Dates | None":
-        """What stamps are as dates, by the topic with most messages; None where they are dates."""
+        """Date stamps by the topic with most messages; None where they are dates."""
         streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
         return dates_of(max(streams, key=len)) if streams else None
 
@@ -210,7 +210,7 @@ class Canvas:
 
 @dataclass(frozen=True)
 class Timeline:
-    """How a scenario family is drawn: `draw` sends everything and returns the layout of its views."""
+    """Draws a scenario family: `draw` sends everything and returns the layout of its views."""
 
     draw: Callable[[Canvas, Scene], rrb.Container | rrb.View]
 
@@ -277,7 +277,7 @@ def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
 
 
 def gap_limit_ns(time_ns: Times) -> int:
-    """How long a stream with these times, sorted, may be silent before it is missed."""
+    """Return how long a stream with these times, sorted, may be silent before it is missed."""
     return int(max(GAP_INTERVALS * usual_interval_ns(time_ns), GAP_S * 1e9))
 
 

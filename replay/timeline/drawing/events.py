@@ -1,4 +1,4 @@
-"""What happened in a run, as text: gated and late measurements, failures, spans without a sensor."""
+"""Writes what happened in a run: gated and late measurements, failures, spans without a sensor."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -39,7 +39,7 @@ STATES: Mapping[str, Mapping[float, str]] = {
 
 
 class Happened(NamedTuple):
-    """What happened to an estimator or a sensor: a text for each time, all of one level."""
+    """Holds what happened to an estimator or a sensor: a text for each time, all of one level."""
 
     who: str
     level: str

@@ -93,7 +93,7 @@ def usual(places: Floats) -> Floats:
 
 
 def are_near(places: Floats) -> NDArray[np.bool_]:
-    """Which places are not far off: the map's view centres on all that it has."""
+    """Return which places are not far off: the map's view centres on all that it has."""
     low, high = usual(places)
     margin = FAR * (high - low).max()
     return ((places >= low - margin) & (places <= high + margin)).all(axis=1)

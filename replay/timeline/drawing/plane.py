@@ -47,7 +47,7 @@ LABEL_SHARE = 0.04
 
 
 class Stroke(NamedTuple):
-    """How a line looks: its colour, and its radius in pixels. Wide ones lie below narrow ones."""
+    """Describes how a line looks: colour, and radius in pixels. Wide ones lie below narrow ones."""
 
     colour: Colour
     radius_px: float = 1.0
@@ -285,7 +285,7 @@ def plane_view(
 
 
 def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
-    """What lies up to so long before the cursor, on every timeline."""
+    """Return what lies up to so long before the cursor, on every timeline."""
     steps = round(trail_s * 1e9 / max(usual_interval_ns(canvas.steps_ns), 1.0))
     cursor = rrb.TimeRangeBoundary.cursor_relative
     begin = cursor(seconds=-trail_s)

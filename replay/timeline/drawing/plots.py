@@ -66,7 +66,7 @@ def draw_quality_in_tabs(canvas: Canvas, scene: Scene, case: str) -> list[rrb.Ta
 
 
 def draw_errors(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """One plot per component of a case: each estimator's error inside its band of +-2 sigma."""
+    """Draw one plot per component of a case: each estimator's error inside its band of +-2 sigma."""
     found = scene.errors_of(case)
     components = dict.fromkeys(name for errors in found for name in errors.components)
     return [
@@ -181,7 +181,7 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
 
 
 def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """What share of each filter's particles is effective."""
+    """Draw what share of each filter's particles is effective."""
     plot, found = entity_path("plots", case, "effective"), False
     for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
         share, found = stream["effective"] / stream["particles"], True
@@ -190,7 +190,7 @@ def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeri
 
 
 def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """One plot per component of a case's Gaussian estimates: every estimator's mean, and the truth."""
+    """Draw one plot per component of a case's Gaussian estimates: estimators' means, and the truth."""
     found = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         found.append((estimator, scene.colour(estimator), stream, stream["mean"]))
@@ -215,7 +215,7 @@ def draw_curve(
     style: Style,
     most: int = DRAWN_ROWS,
 ) -> None:
-    """One curve of a plot: values (n,) over time, at most so many of them, peaks kept."""
+    """Draw one curve of a plot: values (n,) over time, at most so many of them, peaks kept."""
     rows = thin_curve(time_ns, values, most)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
     canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))

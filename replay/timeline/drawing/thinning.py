@@ -1,4 +1,4 @@
-"""What is kept of a long run for its timeline: whole while it is short, then evenly in time."""
+"""Thins a long run for its timeline: whole while it is short, then evenly in time."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -81,7 +81,7 @@ class Thinned(Generic[Rows]):
 
     @property
     def rows(self) -> Rows:
-        """What is kept."""
+        """Return what is kept."""
         if len(self._parts) > 1:
             self._thin()
         return self._parts[0]
@@ -121,7 +121,7 @@ class Thinned(Generic[Rows]):
 
 
 def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
-    """For the messages of a topic; of some schemas, they are all kept."""
+    """Thin the messages of a topic; of some schemas, they are all kept."""
     return Thinned(
         None if schema_name in WHOLE else limit,
         lambda stream: stream.publish_time_ns,
@@ -132,7 +132,7 @@ def thinned_stream(schema_name: str, limit: int) -> Thinned[Stream]:
 
 
 def thinned_errors(limit: int) -> Thinned[Errors]:
-    """For the errors of one run."""
+    """Thin the errors of one run."""
     return Thinned(
         limit,
         lambda errors: errors.time_ns,
@@ -185,12 +185,12 @@ class Thin:
 
     @property
     def outputs(self) -> dict[str, Stream]:
-        """What is kept, by topic."""
+        """Return what is kept, by topic."""
         return {topic: kept.rows for topic, kept in self._outputs.items()}
 
     @property
     def errors(self) -> list[Errors]:
-        """What is kept of the errors."""
+        """Return what is kept of the errors."""
         return [kept.rows for kept in self._errors.values()]
 
 
@@ -227,7 +227,7 @@ class Held:
         return self.of.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """What is held of the topics; of others, all."""
+        """Return what is held of the topics; of others, all."""
         others = self.of.read([topic for topic in topics if topic not in self.streams])
         return {
             topic: self.streams[topic] if topic in self.streams else others[topic] for topic in topics
@@ -272,7 +272,7 @@ class Sensed:
         return kept
 
     def read_to(self, time_ns: int) -> Held:
-        """What comes up to a stamp, and has not come yet, thinned to what is drawn."""
+        """Read what comes up to a stamp, and has not come yet, thinned to what is drawn."""
         self.advance(time_ns)
         streams = {topic: fresh.rows for topic, fresh in self._fresh.items()}
         self._fresh = self._empty(DRAWN_ROWS)

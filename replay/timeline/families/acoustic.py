@@ -33,7 +33,7 @@ CONE_SHARE = 0.7
 
 
 class Cone(NamedTuple):
-    """How a shot is drawn: the length of the bullet's way, and half the opening of the shockwave."""
+    """Describes how a shot is drawn: the length of the bullet's way, half the shockwave's opening."""
 
     length_m: float
     mach_angle_rad: float

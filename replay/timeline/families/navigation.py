@@ -49,7 +49,7 @@ TUBE, TUBE_STEP = 300, 0.5
 
 
 class Body(NamedTuple):
-    """Where a body is thought to be, or truly is.
+    """States where a body is thought to be, or truly is.
 
     Attributes:
         time_ns: (n,).

@@ -41,7 +41,7 @@ BEYOND = 1.05
 
 
 class Sensor(NamedTuple):
-    """Where a sensor stands (3,), its nominal yaw, pitch, roll (3,), and what it saw."""
+    """States where a sensor stands (3,), its nominal yaw, pitch, roll (3,), and what it saw."""
 
     number: int
     place: Floats

@@ -70,7 +70,7 @@ class Vehicles(NamedTuple):
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """Return how many there are."""
         return self.places.shape[1]
 
     def rows(self, time_ns: Times) -> NDArray[np.int64]:

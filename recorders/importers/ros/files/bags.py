@@ -1,4 +1,4 @@
-"""Which files a bag has: one, or those of a folder, split and compressed as ROS does it."""
+"""Finds the files of a bag: one, or those of a folder, split and compressed as ROS does it."""
 
 import re
 from collections import Counter
@@ -43,22 +43,22 @@ class Bag:
 
     @property
     def connections(self) -> list[Connection]:
-        """Those of all files."""
+        """Return the connections of all files."""
         return [each for file in self.files for each in file.connections]
 
     @property
     def others(self) -> list[str]:
-        """What is in all files beside messages."""
+        """Return what is in all files beside messages."""
         return [each for file in self.files for each in file.others]
 
     @property
     def losses(self) -> list[str]:
-        """What cannot be read, a sentence each; whole after the reading."""
+        """Return what cannot be read, a sentence each; whole after the reading."""
         return [*self.missing, *(loss for file in self.files for loss in file.losses)]
 
 
 def looks_like_bag(path: Path) -> bool:
-    """Whether a path is named as a bag that is no MCAP file: a folder of one, a .bag or a .db3 file."""
+    """Tell whether a path is named as a bag that is no MCAP file: a folder of one, a .bag or a .db3."""
     if path.is_dir():
         return (path / "metadata.yaml").exists() or bool(_members(path, {}))
     return path.suffix in (".bag", ".db3")

@@ -20,7 +20,7 @@ UNDEFINED = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 class Connection(NamedTuple):
-    """One publisher's topic in a file; its type is named as ROS 2 does, `nav_msgs/msg/Odometry`.
+    """Describes one publisher's topic in a file; its type is named as in ROS 2: `nav_msgs/msg/Odometry`.
 
     `encoding` is cdr or ros1 where the messages can be read.
     """
@@ -43,7 +43,7 @@ class Batch(NamedTuple):
 
 
 class BagFile(Protocol):
-    """One file of a bag.
+    """Reads one file of a bag.
 
     `losses` says what of it cannot be read; it is whole after the reading. `others` names what is in it
     beside messages.

@@ -13,7 +13,7 @@ _INTEGER_BYTES = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
 
 
 def missing_bytes(path: Path) -> int:
-    """How many bytes a database lacks of those that it states; 0 for what is no database."""
+    """Count the bytes that a database lacks of those that it states; 0 for what is no database."""
     with path.open("rb") as file:
         head = file.read(100)
     if not head.startswith(b"SQLite format 3\0"):

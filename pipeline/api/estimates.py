@@ -1,0 +1,153 @@
+"""Estimates logs judged by the truth of the logs that they are of, as `fuselog evaluate` prints it."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.api.trajectories import ComparedLogs, compare_logs
+from pipeline.output.coverage import recounted
+from pipeline.output.outputs import check_folder
+from pipeline.output.results import ErrorTables, result_folder, write_outcome
+from pipeline.output.summary import summarise, summary_table
+from pipeline.runs.ensemble import judge_logs
+from pipeline.runs.estimates import hash_files, log_of_estimates, stated_estimators
+from pipeline.runs.initial_states import check_same_run
+from recorders.errors import BadInput
+from recorders.log import NotMcap, open_log
+from replay.engine.replaying.usage import Row
+from replay.engine.streams.sources import LogSource
+from replay.judging.errors.trajectories import Comparison
+from replay.judging.judge import Judge
+from replay.judging.metrics.measuring import find_metrics
+
+
+@dataclass(frozen=True)
+class JudgedLogs:
+    """What estimates logs are worth.
+
+    Attributes:
+        sources: the estimates logs, and then the logs with the truth.
+        estimators: settings by label, as the first estimates log states them.
+        judge: of all runs.
+        compared: the estimates as trajectories, where these are compared.
+        coverage: what became of every topic.
+    """
+
+    sources: Sequence[LogSource]
+    estimators: Mapping[str, Any]
+    judge: Judge
+    compared: ComparedLogs
+    coverage: Sequence[Row]
+
+
+def judge_estimates(
+    estimates: Sequence[Path],
+    logs: Sequence[Path] = (),
+    *,
+    comparison: Mapping[str, Any],
+    out: Path | None = None,
+    metrics: Sequence[str] = (),
+    errors: bool = False,
+    recover: bool = False,
+    gap_limit_s: float = 0.2,
+) -> JudgedLogs:
+    """Judge estimates logs, a run each.
+
+    Args:
+        estimates: the estimates logs.
+        logs: those with the truth; by default the ones that the estimates were replayed from.
+        comparison: entries of a `Comparison`, if any: positions are then compared as trajectories too,
+            and estimates are judged in their alignment with the truth.
+        out: a result folder to write.
+        metrics: which ones; none stands for all.
+        errors: whether the folder keeps every single error.
+        recover: read what is whole of logs that were cut off or damaged.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Raises BadInput where a log has no estimates, is of another run, or there is nothing to judge.
+    """
+    if errors and out is None:
+        raise BadInput("--errors: errors are written into a result folder; give one with --out")
+    if logs and len(logs) != len(estimates):
+        raise BadInput(f"{len(estimates)} estimates logs and {len(logs)} --log; give one for each")
+    opened = [_opened(path, recover=recover) for path in estimates]
+    places = logs or [log_of_estimates(each.log) for each in opened]
+    if out is not None:
+        check_folder(out, {"input": [*estimates, *places]})
+    sources = [LogSource(open_log(path, recover=recover)) for path in places]
+    for each, source in zip(opened, sources, strict=True):
+        check_same_run(each, source)
+    wanted = find_metrics(metrics)
+    estimators = stated_estimators(opened[0])
+    compared = _compared(opened, sources, comparison, gap_limit_s)
+    with result_folder(out) if out is not None else nullcontext() as folder:
+        with ErrorTables(folder) if folder and errors else nullcontext() as kept:
+            judge = judge_logs(
+                compared.estimates,
+                sources,
+                wanted,
+                gap_limit_s=gap_limit_s,
+                on_errors=kept.add if kept else None,
+            )
+        if not judge.has_numbers:
+            raise BadInput(
+                f"{estimates[0]}: has nothing to judge, neither estimates with truth nor innovations; "
+                "give its log with --log"
+            )
+        coverage = recounted(opened, sources, estimators, judge.doubts)
+        if folder is not None:
+            settings = {
+                "title": f"estimates of {sources[0].name}",
+                "estimates": [str(path) for path in estimates],
+                "logs": [source.name for source in sources],
+                "estimators": estimators,
+                "gap_limit_s": gap_limit_s,
+                "metrics": list(metrics),
+                **comparison,
+            }
+            outcome = summarise(judge, coverage)
+            outcome.metrics.update(compared.metrics)
+            outcome.tables["summary"] = summary_table(outcome.metrics)
+            outcome.figures.update(compared.figures)
+            outcome.input_sha256 = hash_files([*estimates, *places])
+            write_outcome(folder, "evaluate", settings, outcome)
+    return JudgedLogs([*opened, *sources], estimators, judge, compared, coverage)
+
+
+def _opened(path: Path, *, recover: bool) -> LogSource:
+    """An estimates log; raises BadInput where it is none."""
+    try:
+        log = open_log(path, recover=recover)
+    except NotMcap as error:
+        raise BadInput(
+            f"{error}, or give with --truth the file that a trajectory is judged by"
+        ) from error
+    if not any(topic.startswith("/estimates/") for topic in log.topics):
+        raise BadInput(f"{path}: has no estimates; give a log that fuselog replay wrote")
+    return LogSource(log)
+
+
+def _compared(
+    estimates: Sequence[LogSource],
+    sources: Sequence[LogSource],
+    comparison: Mapping[str, Any],
+    gap_limit_s: float,
+) -> ComparedLogs:
+    """The estimates, compared as trajectories and aligned where that is asked for."""
+    if not comparison:
+        return ComparedLogs(estimates, {})
+    if "time_offset_s" in comparison:
+        raise BadInput(
+            "--time-offset: is for trajectory files, since all streams of a log have one clock; "
+            "leave it out"
+        )
+    how = Comparison(**{"association": "interpolated", "gap_limit_s": gap_limit_s, **comparison})
+    compared = compare_logs(estimates, sources, how)
+    if not compared.compared:
+        raise BadInput(
+            f"{estimates[0].name}: has no estimated positions with truth that could be aligned; leave "
+            "out --align"
+        )
+    return compared
