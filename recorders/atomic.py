@@ -110,6 +110,14 @@ def _working_folder(place: Path) -> Iterator[Path]:
         _remove(work, place, lock)
 
 
+def is_being_written(file: Path) -> bool:
+    """Tell whether a file is in a working folder: half an output, or its lock."""
+    return any(
+        each.name.startswith(".") and each.suffix == ".part" and (each / _LOCK).exists()
+        for each in file.parents
+    )
+
+
 def _make(place: Path) -> tuple[Path, FileLock]:
     """A new working folder and its lock, held."""
     while True:

@@ -6,8 +6,11 @@ from functools import partial
 from os import cpu_count
 from typing import NamedTuple
 
+import numpy as np
+
 from pipeline.diagnosing.hypotheses import Hypothesis
-from pipeline.diagnosing.likelihood import Gains, Likelihood, Peak, Trial, interval, peak
+from pipeline.diagnosing.likelihood import DROP_95, Gains, Likelihood, Peak, Trial, interval, peak
+from pipeline.diagnosing.numbers import number
 from replay.distributions import chi2
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
@@ -35,7 +38,7 @@ class Cause(NamedTuple):
     def words(self) -> str:
         """What is wrong, by how much, and what that is known by."""
         said = self.hypothesis.words(self.value, *self.ends)
-        known = f"without this the log-likelihood gains {self.gain:.4g}"
+        known = f"without this the log-likelihood gains {number(self.gain, 4)}"
         return f"{'Or instead, nearly as likely: ' if self.is_rival else ''}{said}; {known}"
 
 
@@ -58,7 +61,11 @@ def find_causes(
         with ThreadPoolExecutor(cpu_count()) as threads:
             peaks = list(threads.map(partial(_peak, gains_of, least), candidates))
         ranked = sorted(
-            (pair for pair in zip(peaks, candidates, strict=True) if pair[0].gain > least),
+            (
+                (at, each)
+                for at, each in zip(peaks, candidates, strict=True)
+                if at.gain > least and not _is_at_end(gains_of(each), at, each)
+            ),
             key=lambda pair: -pair[0].gain,
         )
         if not ranked:
@@ -100,6 +107,14 @@ def _gains(
 
 def _peak(gains_of: Callable[[Hypothesis], Gains], least: float, tried: Hypothesis) -> Peak:
     return peak(gains_of(tried), tried.tried, tried.limit, least)
+
+
+def _is_at_end(gains: Gains, at: Peak, of: Hypothesis) -> bool:
+    """Whether the number may as well be the last that is searched: its 95 % go on beyond."""
+    if not of.has_end:
+        return False
+    [last] = gains([float(np.copysign(of.limit, at.value))])
+    return last > at.gain - DROP_95
 
 
 def _cause(gains: Gains, at: Peak, of: Hypothesis) -> Cause:

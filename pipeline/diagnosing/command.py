@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.diagnosing.consistency import comparable
 from pipeline.diagnosing.diagnosis import diagnose
 from pipeline.output.outputs import check_outputs
 from pipeline.output.results import plain
@@ -57,19 +58,23 @@ def diagnose_log(
         found.view(save)
         written.append(str(save))
     judge = found.replay.judge
+    metrics = comparable(plain(judge.metrics), found.log_likelihood)
     if as_json:
         print_json(
             {
+                "found": found.told,
+                "hypotheses": found.hypotheses,
+                "least_gain": found.least_gain if found.hypotheses else None,
                 "sentences": found.causes.replace({np.nan: None}).to_dict("records"),
                 "components": found.components.replace({np.nan: None}).to_dict("records"),
                 "notes": list(found.notes),
-                "metrics": plain(judge.metrics),
+                "metrics": metrics,
                 "bounds": judge.bounds,
                 "written": written,
             }
         )
         return
-    print_metrics(plain(judge.metrics), judge.bounds)
+    print_metrics(metrics, judge.bounds)
     columns = ("component", "mean", "mean square", "beyond 3 sigma", "next", "white by chance")
     print_table(
         columns,

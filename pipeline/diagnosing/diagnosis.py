@@ -20,6 +20,7 @@ from pipeline.api.replays import Kind as EstimatorKind
 from pipeline.api.replays import Log, Replay, replay, settings_of, sources_of
 from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
+from pipeline.diagnosing.consistency import unnamed, unseen_errors
 from pipeline.diagnosing.findings import (
     Finding,
     component_table,
@@ -44,12 +45,10 @@ from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.evaluation import split_topic
-from replay.judging.metrics.measuring import metric_key
 
 MOST_SENTENCES = 5
 MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
 NOTHING = "nothing found"
-SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
 OPEN = {"gate_probability": 1.0}
 PROFILE_BINS = 60
 
@@ -80,6 +79,7 @@ class Diagnosis:
         components: a row per measured component; see `component_table`.
         hypotheses: how many causes were tried, and `least_gain` what the least of those named gains.
         notes: what one has to know of the diagnosis.
+        log_likelihood: of all measurements that causes were sought by, with an open gate; or NaN.
     """
 
     label: str
@@ -89,6 +89,7 @@ class Diagnosis:
     hypotheses: int
     least_gain: float
     notes: Sequence[str]
+    log_likelihood: float
 
     def __repr__(self) -> str:
         return "\n".join([f"{self.label} over {self.replay.logs[0].name}", *self.told, *self.notes])
@@ -271,7 +272,7 @@ def diagnose(
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes = []
     causes: list[Cause] = []
-    tried, least = 0, np.inf
+    tried, least, likely = 0, np.inf, np.nan
     if innovations.state("log_likelihood"):
         opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
         likelihood = Likelihood(label)
@@ -279,6 +280,7 @@ def diagnose(
         notes += note
         base = Trial(part, opened)
         alternatives = hypotheses(bound, base, likelihood.begin(base))
+        [likely] = likelihood([base])
         causes = find_causes(likelihood, base, alternatives, MOST_SENTENCES)
         tried, least = len(alternatives), least_gain(len(alternatives))
     else:
@@ -293,8 +295,10 @@ def diagnose(
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
         *of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
-        *(_of_errors(done, label) if not causes else []),
+        *(unseen_errors(done, label) if not causes else []),
     ]
+    if not causes and not findings:
+        findings += unnamed(done, innovations, tried)
     sentences += [Sentence(*each) for each in findings]
     return Diagnosis(
         label,
@@ -304,6 +308,7 @@ def diagnose(
         tried,
         least,
         [*notes, *_notes(done, sentences)],
+        likely,
     )
 
 
@@ -362,29 +367,14 @@ def _first_part(
 
 def _sentence(cause: Cause, trying: Trying) -> Sentence:
     of = cause.hypothesis
-    advice = trying.over(of.mend(cause.value))
+    mend = of.mend(cause.value)
+    if mend is None:
+        return Sentence(
+            of.kind, of.topic, f"{cause.words}; the gate that is set keeps these out", None, cause
+        )
+    advice = trying.over(mend)
     words = f"{cause.words}; try {trying.words(advice)}"
     return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
-
-
-def _of_errors(done: Replay, label: str) -> list[Finding]:
-    """Errors that innovations do not see."""
-    metrics, found = done.judge.metrics, []
-    for key, (_, high) in done.judge.bounds.items():
-        _, quantity, case = split_metric(key)
-        nis = metrics.get(metric_key(label, "nis_per_component", case), np.inf)
-        value = metrics[key]
-        if quantity == "nees" and isinstance(value, float) and value > high and nis < SEEN:
-            found.append(
-                Finding(
-                    "unseen error",
-                    f"/{case}/truth" if case else "/truth",
-                    f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
-                    f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
-                    "the state follows; let a bias be estimated, or see fuselog observability LOG",
-                )
-            )
-    return found
 
 
 def _notes(done: Replay, sentences: Sequence[Sentence]) -> list[str]:

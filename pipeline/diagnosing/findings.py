@@ -84,24 +84,29 @@ def of_innovations(
         case = split_topic(topic)[1] or "the estimate"
         is_in = stream["accepted"] != 0
         times_ns = stream.publish_time_ns
-        for begin, end in _long_runs(~is_in, LOCKED_OUT):
+        share = float(np.mean(~is_in)) if len(stream) else 0.0
+        of_all = (
+            f"{100.0 * share:.2g} % of the measurements, where {100.0 * (1.0 - gate):.2g} % are expected"
+        )
+        locked_out = _long_runs(~is_in, LOCKED_OUT)
+        if locked_out:
+            begin, end = locked_out[0]
+            more = f" and {len(locked_out) - 1} times more" if len(locked_out) > 1 else ""
             yield Finding(
                 "gate",
                 topic,
                 f"{case}: the gate keeps out all {end - begin} measurements from "
-                f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}: the filter "
-                "has drifted away, and what would correct it is kept out; --set gate_probability=1, "
-                "or gate_reopens_s=1",
+                f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}{more}, "
+                f"{of_all}: also what would correct the filter; --set gate_probability=1, or "
+                "gate_reopens_s=1",
                 int(times_ns[begin]),
             )
-        share = float(np.mean(~is_in)) if len(stream) else 0.0
-        if share > KEPT_OUT and not has_outliers:
+        elif share > KEPT_OUT and not has_outliers:
             yield Finding(
                 "gate",
                 topic,
-                f"{case}: the gate keeps out {100.0 * share:.2g} % of the measurements, where "
-                f"{100.0 * (1.0 - gate):.2g} % are expected, and they are no outliers: noise or errors "
-                "are larger than stated; --set gate_probability=1 until that is mended",
+                f"{case}: the gate keeps out {of_all}, and they are no outliers; "
+                "--set gate_probability=1 until the cause is mended",
             )
         yield from _divergence(topic, case, stream, epoch_ns)
 

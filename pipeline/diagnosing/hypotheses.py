@@ -18,6 +18,7 @@ from pipeline.altering import alterations as alter
 from pipeline.altering.changes import bare, entry_of
 from pipeline.diagnosing.advice import Advice, precise, rounded
 from pipeline.diagnosing.likelihood import Trial
+from pipeline.diagnosing.numbers import number
 from pipeline.tuning.objective import with_values
 from recorders.log import Stream, Topic
 from recorders.parameters import Parameters
@@ -42,6 +43,7 @@ Kind = Literal[
     "covariance floor",
     "divergence",
     "unseen error",
+    "unnamed",
 ]
 NOISE = re.compile(r"(^|_)(sigma|density)(_|$)")
 BEGINNING = re.compile(
@@ -72,7 +74,7 @@ class Hypothesis:
         limit: of the number's magnitude.
         without: the trial without the fault of this number.
         words: what is wrong, from the number and the ends of its 95 % interval.
-        mend: what to try against this number.
+        mend: what to try against this number; None where it is done already.
     """
 
     kind: Kind
@@ -82,7 +84,12 @@ class Hypothesis:
     limit: float
     without: Callable[[Trial, float], Trial]
     words: Callable[[float, float, float], str]
-    mend: Callable[[float], Advice]
+    mend: Callable[[float], Advice | None]
+
+    @property
+    def has_end(self) -> bool:
+        """Whether what lies beyond the limit is not searched; an angle is, where it comes round."""
+        return len(self.tried) > 1 and self.limit not in (np.pi, np.inf)
 
 
 def hypotheses(
@@ -161,17 +168,14 @@ def _noise_of(parameters: Parameters, name: str, read: Sequence[Topic]) -> float
 
 def _times(at: float, low: float, high: float) -> str:
     least, most = (
-        _number(np.exp(abs(end)) if at * end > 0 else 1.0) for end in sorted((low, high), key=abs)
+        number(np.exp(abs(end)) if at * end > 0 else 1.0) for end in sorted((low, high), key=abs)
     )
-    return f"the standard deviation is {np.exp(abs(at)):.3g} times ({least} to {most}) too {_size(at)}"
+    factor = number(np.exp(abs(at)))
+    return f"the standard deviation is {factor} times ({least} to {most}) too {_size(at)}"
 
 
 def _size(at: float) -> str:
     return "small" if at > 0.0 else "large"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def _spreads(stream: Stream) -> Iterator[Hypothesis]:
@@ -223,7 +227,7 @@ def _bias(
     is_angle = field == "bearing_rad"
 
     def words(at: float, low: float, high: float) -> str:
-        size = f"{stream.topic}: {name} is too large by {at:.3g} ({low:.3g} to {high:.3g})"
+        size = f"{stream.topic}: {name} is too large by {number(at)} ({number(low)} to {number(high)})"
         if not is_angle:
             return size
         return f"{size}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
@@ -273,7 +277,8 @@ def _clocks(
 
     def late(at: float, low: float, high: float) -> str:
         return (
-            f"{topic}: comes {1e3 * at:.3g} ms late ({1e3 * low:.3g} to {1e3 * high:.3g}) by its stamps"
+            f"{topic}: comes {number(1e3 * at)} ms late ({number(1e3 * low)} to {number(1e3 * high)}) "
+            "by its stamps"
         )
 
     def mend_late(at: float) -> Advice:
@@ -342,6 +347,7 @@ def _outliers(parameters: Parameters | None) -> Iterator[Hypothesis]:
         settings = {**trial.settings, "gate_probability": GATE, **_reopens(parameters)}
         return trial._replace(settings=settings)
 
+    is_closed = getattr(parameters, "gate_probability", 1.0) <= GATE
     yield Hypothesis(
         "outliers",
         "gate_probability",
@@ -350,7 +356,7 @@ def _outliers(parameters: Parameters | None) -> Iterator[Hypothesis]:
         1.0,
         without,
         lambda *_: "some measurements are outliers: of something else, or false",
-        lambda _: Advice("gate_probability", GATE),
+        lambda _: None if is_closed else Advice("gate_probability", GATE),
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
+from pipeline.runs.broad_starts import Starts, begun_at, broad_starts, mean_likelihood, part_count
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.engine.replaying.estimator import Bound, bind
@@ -47,17 +48,25 @@ class Likelihood:
         volumes: by topic, the extents (m,) of the innovations' components, of which outliers may lie
             anywhere.
         count: how many innovations all trials have; another number cannot be compared.
+        starts: where all trials begin, where the log does not state it.
     """
 
     label: str
     volumes: Mapping[str, Floats] = field(default_factory=dict)
     count: int = 0
+    starts: Starts = field(default_factory=dict)
     _bound: dict[str, list[Bound]] = field(default_factory=dict)
 
     def begin(self, trial: Trial) -> dict[str, Stream]:
-        """Take a trial for the one that others are compared with; its innovations by topic."""
-        [found] = self._innovations([trial])
-        self.count = sum(map(len, found.values()))
+        """Take a trial for the one that others are compared with; its innovations by topic.
+
+        From the likeliest part of broad starts, where the log does not state one. Raises BadInput where
+        the estimator cannot begin.
+        """
+        self.starts = broad_starts(trial.source, bind(self.label, [trial.source], trial.settings))
+        [parts] = self._innovations([trial])
+        self.count = max(sum(map(len, part.values())) for part in parts)
+        found = max(parts, key=_stated)
         self.volumes = {topic: _extents(stream) for topic, stream in found.items()}
         return found
 
@@ -73,37 +82,49 @@ class Likelihood:
                 found[place] = self._total(of_run)
         return found
 
-    def _innovations(self, trials: Sequence[Trial]) -> list[dict[str, Stream]]:
-        """The innovations of trials of equal settings, by topic; none where the estimator fails."""
-        key, sources = _key(trials[0]), [trial.source for trial in trials]
+    def _innovations(self, trials: Sequence[Trial]) -> list[list[dict[str, Stream]]]:
+        """The innovations of trials of equal settings, of each part by topic; none where it fails."""
+        key, count = _key(trials[0]), part_count(self.starts)
+        sources = [trial.source for trial in trials for _ in range(count)]
         try:
             if key not in self._bound:
-                self._bound[key] = bind(self.label, sources[:1], trials[0].settings)
+                bound = bind(self.label, sources[:1], trials[0].settings)
+                self._bound[key] = [begun_at(each, self.starts) for each in bound]
             outputs = collect(replay(Ensemble(sources), self._bound[key], is_part=True))
         except BadInput:  # no run can be followed with these
-            return [{} for _ in trials]
+            return [[{}] * count for _ in trials]
         told = {
             topic: rows
             for topic, rows in outputs.items()
             if rows.stream.schema.full_name == schemas.INNOVATION.full_name
         }
-        return [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(trials))]
+        runs = [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(sources))]
+        return [runs[first : first + count] for first in range(0, len(runs), count)]
 
-    def _total(self, innovations: Mapping[str, Stream]) -> float:
+    def _total(self, parts: Sequence[Mapping[str, Stream]]) -> float:
+        found = [self._of_part(part) for part in parts]
+        total = sum(mean_likelihood(found).values()) if any(found) else -np.inf
+        return total if np.isfinite(total) else -np.inf
+
+    def _of_part(self, innovations: Mapping[str, Stream]) -> dict[str, float]:
+        """The log-likelihood of what is seen of each thing, by topic; nothing where messages lack."""
         if sum(map(len, innovations.values())) != self.count:
-            return -np.inf
-        kept_out = 0
-        total = 0.0
+            return {}
+        found = {}
         for topic, stream in innovations.items():
             is_in = stream["accepted"] != 0
-            total += float(np.sum(stream["log_likelihood"][is_in]))
+            found[topic] = float(np.sum(stream["log_likelihood"][is_in]))
             missing = np.isnan(stream["innovation"][~is_in])
-            total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
-            kept_out += len(missing)
-        share = kept_out / self.count if self.count else 0.0
-        if 0.0 < share < 1.0:
-            total += kept_out * np.log(share) + (self.count - kept_out) * np.log(1.0 - share)
-        return total if np.isfinite(total) else -np.inf
+            found[topic] -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
+            share = len(missing) / len(stream) if len(stream) else 0.0
+            if 0.0 < share < 1.0:
+                found[topic] += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
+        return found
+
+
+def _stated(innovations: Mapping[str, Stream]) -> float:
+    """The log-likelihood of a part, as its innovations state it."""
+    return sum(float(np.nansum(stream["log_likelihood"])) for stream in innovations.values())
 
 
 def _key(trial: Trial) -> str:

@@ -15,13 +15,22 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runs.broad_starts import (
+    Starts,
+    begun_at,
+    broad_starts,
+    initialization_of,
+    mean_likelihood,
+    part_count,
+    with_find,
+)
 from pipeline.runs.executors import WorkerPool, threads
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
-from replay.engine.replaying.estimator import Bound, Initialization, Initialized, Recursive, bind
+from replay.engine.replaying.estimator import Bound, Initialized, bind
 from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Ensemble, MemorySource, Source
 from replay.judging.consistency.whiteness import whitened
@@ -41,11 +50,15 @@ class Run(NamedTuple):
         name: what it is called.
         begun: by the name of what is estimated how it begins, where the log does not say so. Where it
             began depended on the values, the likelihoods of different measurements would be compared.
+        starts: from where likelihoods are compared, in place of `begun`, and the log once for each part
+            of these.
     """
 
     ensemble: Ensemble[MemorySource]
     name: str
     begun: Mapping[str, Initialized] = {}
+    starts: Starts = {}
+    parts: Ensemble[MemorySource] = Ensemble([])
 
 
 def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
@@ -71,8 +84,7 @@ def innovations_in(outputs: Mapping[str, Ragged]) -> Iterator[tuple[str, Stream]
 
 
 def _likelihood(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  # noqa: ARG001
-    told = [float(stream["log_likelihood"].sum()) for _, stream in innovations_in(outputs)]
-    return {"log_likelihood": sum(told)} if told else {}
+    return {topic: float(stream["log_likelihood"].sum()) for topic, stream in innovations_in(outputs)}
 
 
 def _nis(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:  # noqa: ARG001
@@ -104,7 +116,7 @@ def _rmse(run: Run, outputs: Mapping[str, Ragged], gap_limit_s: float) -> Sums:
 
 
 def _cost_of_likelihood(sums: Sums) -> float:
-    return -float(sums["log_likelihood"])
+    return -float(sum(sums.values()))
 
 
 def _cost_of_ratios(sums: Sums) -> float:
@@ -248,26 +260,35 @@ class Objective:
                     f"{run.name}: {self.label} fails at the values that the search starts from "
                     f"({failures[0]}); give others with --set"
                 )
-            cost = self._cost([self._measured(run, outputs)])
+            parts = self._parts(start, run)
+            told = max(map(_count, parts))
+            cost = self._cost([self._total(parts, run, told)])
             if not np.isfinite(cost):
                 raise BadInput(
                     f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
                     f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
                 )
-            self._told.append(_count(outputs))
+            self._told.append(told)
 
     def begins_alike(self, values: Floats) -> bool:
         """Tell whether filters would begin at the same stamps with these values (k,)."""
-        return all(_stamps(run) == _stamps(self.begun(values, run)) for run in self.runs)
+        return self.by == "likelihood" or all(
+            _stamps(run) == _stamps(self.begun(values, run)) for run in self.runs
+        )
 
     def begun(self, values: Floats, run: Run) -> Run:
         """The log, with how the estimator begins with these values (k,); BadInput as `replay`."""
         begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
-        if any(_initialization(each) for each in bound):
-            noting = [_with_find(each, partial(_note, begun, each)) for each in bound]
+        if any(initialization_of(each) for each in bound):
+            noting = [with_find(each, partial(_note, begun, each)) for each in bound]
             next(replay(run.ensemble, noting), None)
-        return run._replace(begun=begun)
+        if self.by != "likelihood" or not begun:
+            return run._replace(begun=begun)
+        starts = broad_starts(run.ensemble[0], bound)
+        return run._replace(
+            begun=begun, starts=starts, parts=Ensemble(list(run.ensemble) * part_count(starts))
+        )
 
     def _bound(self, values: Floats, run: Run) -> list[Bound]:
         return bind(self.label, run.ensemble, with_values(self.settings, self.names, values))
@@ -275,9 +296,7 @@ class Objective:
     def outputs(self, values: Floats, run: Run) -> dict[str, Ragged]:
         """Replay a log with these values (k,): outputs by topic; BadInput as `replay`."""
         bound = [
-            _with_find(each, partial(_as_noted, run.begun[each.name]))
-            if each.name in run.begun
-            else each
+            with_find(each, partial(_as_noted, run.begun[each.name])) if each.name in run.begun else each
             for each in self._bound(values, run)
         ]
         return collect(replay(run.ensemble, bound))
@@ -288,12 +307,32 @@ class Objective:
 
     def _sums(self, values: Floats, run: Run, told: int) -> Sums | None:
         try:
-            outputs = self.outputs(values, run)
+            parts = self._parts(values, run)
         except BadInput:  # as of a batch that does not converge
             return None
-        if _failures(outputs) or _count(outputs) != told:
+        return self._total(parts, run, told)
+
+    def _parts(self, values: Floats, run: Run) -> list[dict[str, Ragged]]:
+        """The outputs that are compared: from each part of broad starts, where the log has none."""
+        if not run.starts:
+            return [self.outputs(values, run)]
+        bound = [begun_at(each, run.starts) for each in self._bound(values, run)]
+        outputs = collect(replay(run.parts, bound)).items()
+        return [
+            {topic: gather([rows.of_run(part)]) for topic, rows in outputs}
+            for part in range(len(run.parts))
+        ]
+
+    def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, told: int) -> Sums | None:
+        """What all parts tell; None where all of them fail or gave another number of messages."""
+        is_used = [not _failures(outputs) and _count(outputs) == told for outputs in parts]
+        if not any(is_used):
             return None
-        return self._measured(run, outputs)
+        found = [
+            self._measured(run, outputs) if used else {}
+            for outputs, used in zip(parts, is_used, strict=True)
+        ]
+        return found[0] if len(parts) == 1 else dict(mean_likelihood(found))
 
     def _measured(self, run: Run, outputs: Mapping[str, Ragged]) -> Sums:
         return CRITERIA[self.by].sums(run, outputs, self.gap_limit_s)
@@ -307,17 +346,6 @@ class Objective:
         return cost if np.isfinite(cost) else np.inf
 
 
-def _initialization(bound: Bound) -> Initialization | None:
-    return bound.initialization if isinstance(bound, Recursive) else None
-
-
-def _with_find(bound: Bound, find: Callable[..., Initialized]) -> Bound:
-    """An estimator that finds its beginning in another way, if it has to find one."""
-    if isinstance(bound, Recursive) and bound.initialization is not None:
-        return replace(bound, initialization=replace(bound.initialization, find=find))
-    return bound
-
-
 def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
     """When a log's filters begin, by what is estimated and by topic."""
     return {
@@ -328,7 +356,7 @@ def _stamps(run: Run) -> dict[tuple[str, str], list[int]]:
 
 
 def _note(begun: dict[str, Initialized], bound: Bound, *first: Any) -> Initialized:
-    initialization = _initialization(bound)
+    initialization = initialization_of(bound)
     assert initialization is not None
     begun[bound.name] = initialization.find(*first)
     return begun[bound.name]

@@ -241,7 +241,11 @@ class Judge:
 
     @property
     def bounds(self) -> dict[str, tuple[float, float]]:
-        """Compute where metrics of NEES and NIS lie with 95 % for consistent estimators, by key.
+        """Compute where metrics of NEES and NIS lie with 95 % for consistent estimators, by key."""
+        return self.intervals(0.95)
+
+    def intervals(self, probability: float) -> dict[str, tuple[float, float]]:
+        """Compute where metrics of NEES and NIS lie with a probability if all is well, by key.
 
         Errors of a run's steps hang together, so that NEES has the interval of one step's mean over the
         runs; innovations do not, and NIS has that of them all.
@@ -254,10 +258,10 @@ class Judge:
             for name, size in sizes.items():
                 if runs and size:
                     key = metric_key(errors.estimator, name, errors.case)
-                    found[key] = chi_square_interval(size, runs)
+                    found[key] = chi_square_interval(size, runs, probability)
         for topic, degrees in self._degrees.items():
             if degrees:
-                low, high = chi_square_interval(degrees, 1)
+                low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
                 found[key] = low / degrees, high / degrees

@@ -622,6 +622,10 @@ def test_files_that_do_not_fit(imported: Callable[..., Any], tmp_path: Path) -> 
     for name, since in (("imu_left", 1756402240), ("imu_right", 1756402241)):
         (folder / f"{name}.csv").write_text(ROWS.replace("1756402240", str(since)))
     (folder / "readme.txt").write_text("x")
+    part = folder / ".drive.mcap.x1.part"  # as where the log is written beside the tables
+    part.mkdir()
+    for name in ("fuselog.lock", "new.mcap"):
+        (part / name).touch()
     mapping = INERTIAL.replace("[[tables]]", '[[tables]]\nfiles = "imu_{side}.csv"')
     mapping = mapping.replace('"/inertial"', '"/{side}/inertial"')
     streams, notes = imported(folder, mapping)

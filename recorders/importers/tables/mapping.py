@@ -20,6 +20,7 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_validator
 
+from recorders.atomic import is_being_written
 from recorders.errors import BadInput, choices, some_of
 from recorders.importers.mapping import OneOrMore, Source, StreamMapping, schema_of
 from recorders.importers.tables.files import Format
@@ -287,13 +288,17 @@ class FileMatch(NamedTuple):
 def find_files(mapping: LogMapping, paths: list[Path]) -> tuple[list[FileMatch], list[Path]]:
     """The files of a mapping among files and folders, and those of the folders that are none of them.
 
-    A file of a folder is that of the first table whose pattern it fits. Raises BadInput where a table
+    A file of a folder is that of the first table whose pattern it fits; what this import or another one
+    is writing there is no file yet. Raises BadInput where a table
     has no file, or a file that is given has no table.
     """
     found: list[FileMatch] = []
     others: list[Path] = []
     for path in paths:
-        inside = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+        inside = [path]
+        if path.is_dir():
+            files = (each for each in path.rglob("*") if each.is_file() and not is_being_written(each))
+            inside = sorted(files)
         for file in inside:
             name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             own = next(_matches(mapping, file, name, is_alone=len(paths) == 1 == len(inside)), None)

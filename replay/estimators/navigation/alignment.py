@@ -33,7 +33,7 @@ from replay.estimators.navigation.samples import (
 )
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.start import Started
-from replay.inference.run.initialization import WIDER
+from replay.inference.run.first_messages import WIDER
 
 LEAP_SECONDS, LEAP_MARGIN_S = 18, 2.0  # between UTC and GPS time since 2017; how exactly it shows
 SMALLEST_CHANGE_MPS2 = 0.2  # of the specific force: the body sets off

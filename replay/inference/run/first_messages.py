@@ -9,7 +9,10 @@ from recorders.log import Clock, Stream
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from replay.inference.model.stage import Stage
 from replay.inference.model.start import Start
+
+WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
 
 
 class Begun(NamedTuple):
@@ -49,6 +52,28 @@ def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floa
             mean[columns.start] = 1.0
     names = [name for name, _ in tangent_components(list(state), kinds)]
     return mean, np.array([sigmas.get(name, np.nan) for name in names])
+
+
+def state_by_message(stage: Stage, number: int, data: Floats) -> tuple[Floats, Floats]:
+    """Compute the mean (n,) and the much wider sigmas (t,) of a state that one message measures.
+
+    Args:
+        stage: the model, with its sensors.
+        number: of the sensor.
+        data: what the message measures, and its noise, as a row of `sensor_table`.
+    """
+    model, sensor = stage.model, stage.sensors[number]
+    mean, sigma = unknown(model.state, model.start)
+    components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
+    size = len(sensor.measured)
+    for place, (name, variance) in enumerate(
+        zip(sensor.measured, data[size + diagonal_places(size)], strict=True)
+    ):
+        if not np.isnan(data[place]):
+            mean[list(model.state).index(name)] = data[place]
+            row = components.index(name)
+            sigma[row] = min(WIDER * np.sqrt(variance), sigma[row])
+    return mean, sigma
 
 
 def first_of_runs(

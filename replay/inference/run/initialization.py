@@ -21,25 +21,24 @@ from replay.engine.streams.blocks import Block, Ragged, merge_events
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.results import gaussian_stream, named
-from replay.engine.vectors.tangent import tangent_components
 from replay.inference.model.binding import Found, measures_state
 from replay.inference.model.model import Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
+from replay.inference.run.broad_start import broad_priors
 from replay.inference.run.events import Context, data_columns, filter_events, sensor_table
 from replay.inference.run.first_messages import (
     Begun,
     Fact,
-    diagonal_places,
     first_of_runs,
     of_runs,
     run_count,
+    state_by_message,
     unknown,
 )
 from replay.inference.run.recursion import CONTROL, FilterEvents
 
-WIDER = 30.0  # of a message's standard deviations: a prior that is worth a thousandth beside it
 FOREVER_NS = np.iinfo(np.int64).max
 CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
 
@@ -69,7 +68,7 @@ class Initializer:
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        return Initialization(topics, self.find) if topics else None
+        return Initialization(topics, self.find, self.find_broad) if topics else None
 
     @property
     def _prior_check(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
@@ -133,6 +132,31 @@ class Initializer:
         elif self._prior_check is not None:
             facts += self._checked_prior(self._prior_check, first, static, origins)
         return Initialized(found, [*told, *self._told(facts)])
+
+    def find_broad(
+        self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock, time_ns: int
+    ) -> list[Initialized]:
+        """Find one run's equally likely starts at a stamp; see `broad_priors`, else `find`."""
+        found = self.find(first, static, clock)
+        if self.found.has_prior or self.stage.model.finds_start or not self._measuring:
+            return [found]
+        origins = None if self.found.origin is None else self.found.origin[None]
+        for topic in self.found.geodetic if origins is None else ():
+            origins = origins_of(found.static[topic.name])
+        references = []
+        for number, sensor, topic in self._measuring:
+            ragged = first[topic.name]
+            table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
+            _, [has_one], [row] = first_of_runs(ragged, clock, table.source >= 0)
+            if has_one:
+                references.append(
+                    (sensor.measured, *state_by_message(self.stage, number, table.data[row]))
+                )
+        priors = broad_priors(self.stage.model, self.found.prior.name, time_ns, references)
+        return [
+            found._replace(static={**found.static, prior.topic: of_runs(prior, np.ones(1, np.bool_))})
+            for prior in priors
+        ]
 
     def _prior(
         self,
@@ -273,7 +297,7 @@ class Initializer:
             found_ns, has_one, rows = first_of_runs(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_one & (found_ns < begun.time_ns)).tolist():
                 begun.time_ns[run], chosen[run] = found_ns[run], number
-                begun.mean[run], sigma = self._reference(number, table.data[rows[run]])
+                begun.mean[run], sigma = state_by_message(self.stage, number, table.data[rows[run]])
                 begun.covariance[run] = sigma**2 * np.eye(len(sigma))
         if (chosen < 0).all():
             raise BadInput(f"estimator {self.name}: {self._without} nowhere: {self._complaints()}")
@@ -283,21 +307,6 @@ class Initializer:
             )
             for number, _, topic in self._measuring
         ]
-
-    def _reference(self, number: int, data: Floats) -> tuple[Floats, Floats]:
-        """Compute the mean and the much wider sigmas of a state that one message measures."""
-        model, sensor = self.stage.model, self.stage.sensors[number]
-        mean, sigma = unknown(model.state, model.start)
-        components = [name for name, _ in tangent_components(list(model.state), model.kinds)]
-        size = len(sensor.measured)
-        for place, (name, variance) in enumerate(
-            zip(sensor.measured, data[size + diagonal_places(size)], strict=True)
-        ):
-            if not np.isnan(data[place]):
-                mean[list(model.state).index(name)] = data[place]
-                row = components.index(name)
-                sigma[row] = min(WIDER * np.sqrt(variance), sigma[row])
-        return mean, sigma
 
     def _aligned(
         self, first: Mapping[str, Ragged], clock: Clock, origins: Floats | None, begun: "Begun"

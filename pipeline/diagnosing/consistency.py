@@ -1,0 +1,95 @@
+"""Whether NIS and NEES are those of a consistent filter, whatever the cause."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from pipeline.api.replays import Replay
+from pipeline.diagnosing.findings import Finding
+from pipeline.output.results import MetricValue, split_metric
+from recorders.log import Stream
+from replay.judging.consistency.whiteness import whitened
+from replay.judging.errors.evaluation import chi_square_interval, split_topic
+from replay.judging.metrics.measuring import metric_key
+
+SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
+CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval
+
+
+def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
+    """Find errors that innovations do not see."""
+    metrics = done.judge.metrics
+    for key, (_, high) in done.judge.bounds.items():
+        _, quantity, case = split_metric(key)
+        nis = metrics.get(metric_key(label, "nis_per_component", case), np.inf)
+        value = metrics[key]
+        if quantity == "nees" and isinstance(value, float) and value > high and nis < SEEN:
+            yield Finding(
+                "unseen error",
+                _truth(case),
+                f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
+                f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
+                "the state follows; let a bias be estimated, or see fuselog observability LOG",
+            )
+
+
+def unnamed(done: Replay, innovations: Mapping[str, Stream], tried: int) -> Iterator[Finding]:
+    """Find NIS and NEES outside of where a consistent filter has them in CONSISTENT of all logs.
+
+    NIS is of all innovations, those that a gate keeps out too. Errors hang together over a run, so that
+    the mean of NEES has the interval of a single step.
+    """
+    faults = f"none of {tried} faults that were tried explains it" if tried else "no fault was tried"
+    for topic, stream in innovations.items():
+        case = split_topic(topic)[1]
+        normalised = whitened(stream)
+        squares, counts = np.nansum(normalised**2, axis=0), np.isfinite(normalised).sum(axis=0)
+        low, high = chi_square_interval(int(counts.sum()), 1, CONSISTENT)
+        if counts.any() and not low <= squares.sum() <= high:
+            of_each = ", ".join(
+                f"{square / count:.3g} of {name}"
+                for name, square, count in zip(stream.components, squares, counts, strict=True)
+                if count
+            )
+            evidence = (
+                f"NIS per component is {squares.sum() / counts.sum():.3g} ({of_each}), where a "
+                f"consistent filter is within {low / counts.sum():.3g} and {high / counts.sum():.3g}"
+            )
+            yield _unnamed(topic, case, evidence, faults)
+    metrics = done.judge.metrics
+    for key, (low, high) in done.judge.intervals(CONSISTENT).items():
+        _, quantity, case = split_metric(key)
+        value = metrics[key]
+        if quantity == "nees" and not low <= value <= high:
+            evidence = (
+                f"NEES is {value:.3g}, where a consistent filter is within {low:.3g} and {high:.3g}"
+            )
+            yield _unnamed(_truth(case), case, evidence, faults)
+
+
+def comparable(metrics: Mapping[str, MetricValue], log_likelihood: float) -> dict[str, MetricValue]:
+    """Return metrics, with that of all measurements in place of likelihoods of those that a gate let in.
+
+    What a gate keeps out costs nothing, so that the likelihood of the rest is larger the more that is.
+    """
+    found = dict(metrics)
+    for key in metrics:
+        label, quantity, case = split_metric(key)
+        if quantity == "log_likelihood" and metrics.get(metric_key(label, "gated_share", case)):
+            del found[key]
+            if np.isfinite(log_likelihood):
+                found[metric_key(label, "open_gate_log_likelihood", "")] = log_likelihood
+    return found
+
+
+def _unnamed(topic: str, case: str, evidence: str, faults: str) -> Finding:
+    return Finding(
+        "unnamed",
+        topic,
+        f"{case or 'the estimate'}: something is wrong that I cannot name: {evidence} in 999 of 1,000 "
+        f"logs, and {faults}",
+    )
+
+
+def _truth(case: str) -> str:
+    return f"/{case}/truth" if case else "/truth"

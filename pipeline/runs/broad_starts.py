@@ -1,0 +1,87 @@
+"""Replays from broad starts, for likelihoods with other parameters, or of an altered log, to compare.
+
+A log without a prior begins where its first messages say, and by how much they are trusted. So that all
+trials score the same measurements from the same start, they begin at the log's first stamp, in equally
+likely parts; the likelihood is the mean of those of the parts.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.special import logsumexp
+
+from recorders.log import Clock
+from replay.engine.replaying.estimator import Bound, Initialization, Initialized, Recursive
+from replay.engine.replaying.replaying import replay
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.sources import Ensemble, MemorySource
+
+Starts = Mapping[str, Sequence[Initialized]]  # by the name of what is estimated; parts of one number
+
+
+def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
+    """Find the equally likely starts of a run whose log does not state them; BadInput as `replay`."""
+    stamps = [source.streams[topic].publish_time_ns[:1] for each in bound for topic in each.streams]
+    first_ns = int(np.min(np.concatenate(stamps), initial=np.iinfo(np.int64).max))
+    found: dict[str, list[Initialized]] = {}
+
+    def note(
+        bound: Bound, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock
+    ) -> Initialized:
+        initialization = initialization_of(bound)
+        assert initialization is not None
+        if initialization.find_broad is None:
+            found[bound.name] = [initialization.find(first, static, clock)]
+        else:
+            found[bound.name] = initialization.find_broad(first, static, clock, first_ns)
+        return found[bound.name][0]
+
+    if any(map(initialization_of, bound)):
+        noting = [with_find(each, partial(note, each)) for each in bound]
+        next(replay(Ensemble([source]), noting, is_part=True), None)
+    most = max(map(len, found.values()), default=1)
+    return {name: (list(parts) * most)[:most] for name, parts in found.items()}
+
+
+def part_count(starts: Starts) -> int:
+    """Count the replays that a trial is."""
+    return max(map(len, starts.values()), default=1)
+
+
+def begun_at(bound: Bound, starts: Starts) -> Bound:
+    """Make an estimator of runs that stand there once for each part, one part after another."""
+    parts = starts.get(bound.name)
+    return bound if parts is None else with_find(bound, partial(_part_of_runs, parts))
+
+
+def _part_of_runs(parts: Sequence[Initialized], first: Mapping[str, Ragged], *_: Any) -> Initialized:
+    count = next(iter(first.values())).runs
+    of_run = [parts[run % len(parts)] for run in range(count)]
+    topics = parts[0].static
+    return Initialized(
+        {name: gather([each.static[name].stream for each in of_run]) for name in topics}, []
+    )
+
+
+def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Compute the log of the mean of likelihoods, by what is estimated; a part that failed has none."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {
+        name: float(logsumexp([part.get(name, -np.inf) for part in parts]) - np.log(len(parts)))
+        for name in names
+    }
+
+
+def initialization_of(bound: Bound) -> Initialization | None:
+    """Return how an estimator finds its beginning, if it has to find one."""
+    return bound.initialization if isinstance(bound, Recursive) else None
+
+
+def with_find(bound: Bound, find: Callable[..., Initialized]) -> Bound:
+    """Make an estimator that finds its beginning in another way, if it has to find one."""
+    if isinstance(bound, Recursive) and bound.initialization is not None:
+        return replace(bound, initialization=replace(bound.initialization, find=find))
+    return bound

@@ -1,0 +1,123 @@
+"""Diagnosing and tuning on a log without a prior: the sheet of sensors, section 3, principle 1."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.diagnosing.causes import find_causes
+from pipeline.diagnosing.hypotheses import Hypothesis, hypotheses
+from pipeline.diagnosing.likelihood import Likelihood, Trial
+from replay.engine.replaying.estimator import bind
+from tests.pipeline.car import car
+from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
+
+OPEN = {"kind": "ekf", "gate_probability": 1.0}
+
+
+def likelihood(source: fl.MemorySource, stated: float = 1.0) -> float:
+    """Of the car as it is, over the starts of a log whose fixes state so many times the variance."""
+    told = Likelihood("ekf")
+    told.begin(Trial(car(2000, stated), OPEN) if stated != 1.0 else Trial(source, OPEN))
+    [found] = told([Trial(source, OPEN)])
+    return found
+
+
+def test_the_likelihood_over_broad_starts_is_that_of_the_sheet() -> None:
+    """All 201 fixes count; where the log is begun does not."""
+    assert likelihood(car(1)) == pytest.approx(-372.645841, abs=1e-3)
+    right = likelihood(car(2000))
+    assert likelihood(car(2000), 16.0) == pytest.approx(right, abs=1e-6)
+
+
+@pytest.mark.parametrize(("stated", "factor", "size"), [(4.0, 1.99, "large"), (1 / 16, 4.02, "small")])
+def test_a_covariance_stated_wrongly_is_named_with_its_factor(
+    stated: float, factor: float, size: str
+) -> None:
+    """The factor is told to .036, the sheet's standard deviation of its logarithm."""
+    found = fl.diagnose(car(2000, stated), "ekf").sentences[0]
+    assert (found.kind, found.topic) == ("measurement noise", "/car/fix")
+    assert found.words.endswith("where the log is written")
+    assert f"so that R is too {size}" in found.words
+    assert found.cause is not None
+    low, high = np.exp(np.abs(found.cause.ends))
+    assert min(low, high) < factor < max(low, high)
+
+
+def test_tuning_agrees_that_the_process_noise_is_right() -> None:
+    found = fl.tune(car(2000, 4.0), "ekf", "turn_noise_density").parameters.iloc[0]
+    assert found["low"] < 0.01 < found["high"]
+
+
+def test_nothing_is_found_where_nothing_is_wrong() -> None:
+    assert fl.diagnose(car(2000), "ekf").sentences == []
+
+
+class Kept(fl.ModelParameters):
+    """What is kept in a step; the noises are numbers in the model, which no fault is of."""
+
+    kept: float = 0.9
+
+
+def test_what_is_inconsistent_and_has_no_name_is_said_to_be() -> None:
+    """Innovations of half their size are no consistent filter's; there is nothing to blame for it."""
+    measured = replace(VALUE, noise=lambda _: (0.49,))
+    motion = replace(SCALAR.motion, noise=lambda *_: (0.25,))
+    model = replace(SCALAR, parameters=Kept, sensors=(measured,), motion=motion)
+    values = np.concatenate([simulate(seed) for seed in range(4)])
+    [found] = fl.diagnose(source(0.5 * values), {"level": fl.modelled(model, "ekf")}).sentences
+    assert found.kind == "unnamed"
+    assert found.words.startswith(
+        "the estimate: something is wrong that I cannot name: NIS per component"
+    )
+    assert "in 999 of 1,000 logs, and none of" in found.words
+    well = fl.diagnose(source(values), {"level": fl.modelled(model, "ekf")})
+    assert well.sentences == []
+
+
+def test_a_number_at_the_end_of_its_search_is_no_cause() -> None:
+    """A parabola about 5 that is searched up to 1, and up to 10."""
+
+    def causes(limit: float) -> list[float]:
+        tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), limit, lambda _, at: at, *[str, str])  # type: ignore[arg-type,return-value]
+        found = find_causes(
+            lambda at: [1000.0 - 10.0 * (each - 5.0) ** 2 for each in at], 0.0, [tried], 1
+        )  # type: ignore[arg-type,union-attr]
+        return [each.value for each in found]
+
+    assert causes(1.0) == []
+    assert causes(10.0) == pytest.approx([5.0], abs=0.02)
+
+
+def test_a_gate_that_is_set_is_no_advice() -> None:
+    for probability, mend in ((1.0, "--set gate_probability=0.999"), (0.999, "")):
+        given = {"kind": "ekf", "gate_probability": probability}
+        base = Trial(car(2000), given)
+        tried = hypotheses("ekf", bind("ekf", [base.source], given), base, {})
+        [outliers] = [each for each in tried if each.kind == "outliers"]
+        assert outliers.mend(1.0) == mend
+
+
+def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
+    tmp_path: Path, fuselog: Callable[..., Any]
+) -> None:
+    """A gate that locks a filter out is one sentence; the likelihood is not of what it let in."""
+    log = tmp_path / "car.mcap"
+    fl.write(log, car(2000))
+    found = fuselog("diagnose", log, "-e", "ekf", "--json").json
+    assert found["found"] == [
+        f"nothing found: of {found['hypotheses']} faults none gains {found['least_gain']:.3g} in "
+        "log-likelihood"
+    ]
+    fl.write(log, car(2000, 1 / 256))
+    wrong = fuselog("diagnose", log, "-e", "ekf", "--json").json
+    assert sum(each["kind"] == "gate" for each in wrong["sentences"]) == 1
+    assert "ekf.log_likelihood.car" not in wrong["metrics"]
+    told = Likelihood("ekf")
+    told.begin(base := Trial(car(2000, 1 / 256), OPEN))
+    assert wrong["metrics"]["ekf.open_gate_log_likelihood"] == pytest.approx(told([base])[0])
+    assert "16" in wrong["sentences"][0]["sentence"]
