@@ -99,7 +99,7 @@ class Experiment(Parameters):
             parse_late(self.late, arrival_order=bool(self.arrival_order))
         if (self.arrival_order or self.alterations) and self.study != "localization":
             raise ValueError(
-                f"study {self.study} replays by the stamps; leave out arrival_order, late and alterations"
+                f"study {self.study} replays by stamps; leave out arrival_order, late and alterations"
             )
         return self
 
