@@ -98,10 +98,8 @@ class Experiment(Parameters):
         if self.late is not None:
             parse_late(self.late, arrival_order=bool(self.arrival_order))
         if (self.arrival_order or self.alterations) and self.study != "localization":
-            raise ValueError(
-                f"study {self.study} replays by the stamps; leave out "
-                "arrival_order, late and alterations"
-            )
+            which = "arrival_order, late and settings of topics"
+            raise ValueError(f"study {self.study} replays in the order of the stamps; leave out {which}")
         return self
 
     @property
