@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
-from pipeline.runs.broad_starts import Starts, begun_at, broad_starts, mean_likelihood, part_count
+from pipeline.tuning.broad_starts import Starts, begun_at, broad_starts, mean_likelihood, part_count
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.engine.replaying.estimator import Bound, bind

@@ -15,7 +15,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runs.broad_starts import (
+from pipeline.runs.executors import WorkerPool, threads
+from pipeline.tuning.broad_starts import (
     Starts,
     begun_at,
     broad_starts,
@@ -24,7 +25,6 @@ from pipeline.runs.broad_starts import (
     part_count,
     with_find,
 )
-from pipeline.runs.executors import WorkerPool, threads
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.parameters import merge, nested
