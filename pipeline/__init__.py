@@ -1,1 +1,1 @@
-"""The command line, experiments, Monte Carlo execution and reports."""
+"""The command line, experiments, Monte Carlo execution and reports; begin with `api`, then `runs`."""

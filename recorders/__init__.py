@@ -1,1 +1,4 @@
-"""The log contract, the sensor and motion models, the simulators and the importers of real data."""
+"""The log, the sensor and motion models, the simulators and the importers of real data.
+
+Begin with `recording`, which says what a recorder is, and `log`.
+"""

@@ -16,6 +16,8 @@ from pydantic_core import CoreSchema
 from recorders.errors import BadInput, choices
 from recorders.parsing import DEEPEST, parse_toml
 
+_POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers that TOML does not take
+
 
 class Parameters(BaseModel):
     """Base of all parameter types: immutable, no unknown names, no NaN and no infinity.
@@ -298,15 +300,16 @@ def nested(name: str, value: Any) -> dict[str, Any]:
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     """Turn `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
 
-    A right side that is no TOML value is taken as text. Raises BadInput where there is no `=`.
+    A right side that is no TOML value is taken as text; a key that begins with a slash (of a
+    topic) stays whole. Raises BadInput where there is no `=`.
 
-    >>> parse_settings(["duration_s=30", "range.rate_hz=5.0", "name=walk"])
-    {'duration_s': 30, 'range': {'rate_hz': 5.0}, 'name': 'walk'}
+    >>> parse_settings(["duration_s=30", "range.rate_hz=.5", "name=walk", "/fix.delay_s=.3"])
+    {'duration_s': 30, 'range': {'rate_hz': 0.5}, 'name': 'walk', '/fix.delay_s': 0.3}
     """
     values: dict[str, Any] = {}
     for setting in settings:
         key, equals, text = setting.partition("=")
-        parts = key.strip().split(".")
+        parts = [key.strip()] if key.strip().startswith("/") else key.strip().split(".")
         if not equals or not all(parts):
             raise BadInput(f"--set {setting}: expected key=value, such as duration_s=30")
         if len(parts) > DEEPEST:
@@ -316,7 +319,7 @@ def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
         try:
             value = parse_toml(f"value = {text}")["value"]
         except TOMLDecodeError:
-            value = text
+            value = float(text) if _POINTED.fullmatch(text) else text
         except ValueError as error:
             raise BadInput(f"--set {key}: the value cannot be used: {error}") from None
         target = values

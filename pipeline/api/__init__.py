@@ -1,1 +1,1 @@
-"""Offers what `import fuselog` gives, on which the commands rest; begin with `api`."""
+"""Offers what `import fuselog` gives, on which the commands rest; begin with `replays` and `api`."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.changes import WHATS, is_of_topic
 from pipeline.api.catalog import Entry, rows_of, stated_of
 from pipeline.logs.constraints import ConstraintParameters
 from pipeline.output.terminal import print_table
@@ -40,10 +41,21 @@ def show_meanings(texts: Sequence[str], takes: str, options: Mapping[str, Any]) 
         takes: a key of `TAKERS`.
         options: the command's.
     """
-    takers = list(TAKERS[takes](options))
     names = [text.removesuffix(ASKED).strip() for text in texts if text.endswith(ASKED)]
-    table = [row for name in names for row in _answer(name, takers)]
+    of_topics = [row for name in names if is_of_topic(name) for row in _of_topic(name)]
+    others = [name for name in names if not is_of_topic(name)]
+    takers = list(TAKERS[takes](options)) if others else []
+    table = [*of_topics, *(row for name in others for row in _answer(name, takers))]
     print_table(["parameter", "of", "default", "unit", "accepts", "meaning"], table)
+
+
+def _of_topic(name: str) -> Iterator[list[object]]:
+    """Rows of what can be set of a topic: of one thing, or of all where none is named."""
+    topic, _, asked = name.rpartition(".")
+    ending = asked.rpartition("_")[2]
+    whole = [what for what in WHATS if what == asked]
+    for what in whole or [each for each in WHATS if each == f"FIELD_{ending}"] or WHATS:
+        yield [f"{topic or name}.{what}", "topic", "", "", "", WHATS[what]]
 
 
 def _answer(name: str, takers: Sequence[Entries]) -> list[list[object]]:

@@ -12,7 +12,7 @@ from pipeline.output.outputs import check_folder
 from pipeline.output.results import ErrorTables, result_folder, write_outcome
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import hash_files, log_of_estimates, stated_estimators
+from pipeline.runs.estimates import hash_files, log_of_estimates, source_of_estimates, stated_estimators
 from pipeline.runs.initial_states import check_same_run
 from recorders.errors import BadInput
 from recorders.log import NotMcap, open_log
@@ -76,7 +76,10 @@ def judge_estimates(
     places = logs or [log_of_estimates(each.log) for each in opened]
     if out is not None:
         check_folder(out, {"input": [*estimates, *places]})
-    sources = [LogSource(open_log(path, recover=recover)) for path in places]
+    sources = [
+        source_of_estimates(each.log, place, recover=recover)
+        for each, place in zip(opened, places, strict=True)
+    ]
     for each, source in zip(opened, sources, strict=True):
         check_same_run(each, source)
     wanted = find_metrics(metrics)

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.sources import alter, split_settings
 from pipeline.runs.ensemble import Pass, Progress, Settings, cut_in_parts, no_progress, replay_parts
 from pipeline.runs.initial_states import Origin, order_of, origins_of, span_of
+from pipeline.runs.settings import with_settings
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, RunMetadata, open_log
 from recorders.recording import Recording
@@ -91,6 +93,7 @@ def plan_replay(
     gap_limit_s: float = 0.2,
     arrival_order: bool = False,
     late: str | None = None,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
     metrics: str | Sequence[str] = (),
 ) -> Plan:
     """Check what a replay is asked for, and open its logs; see `pipeline.api.replays.replay`.
@@ -102,10 +105,13 @@ def plan_replay(
             raise BadInput(f"{name} is {value}; give seconds, such as 0.5")
     from_ = [start_from] if isinstance(start_from, str | Path) else start_from
     order, policy = order_of(arrival_order=arrival_order, late=late, origins=from_)
+    alterations, given = split_settings(set or {})
     settings = settings_of(estimators)
+    if given:
+        settings = with_settings(settings, given)
     wanted = [metrics] if isinstance(metrics, str) else list(metrics)
     find_metrics(wanted)
-    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs)]
+    sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs, alterations)]
     origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
     return Plan(sources, settings, origins, order, policy, gap_limit_s, wanted)
 
@@ -133,12 +139,17 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
     return LogSource(log)
 
 
-def sources_of(logs: Log | Iterable[Log]) -> list[LogSource | MemorySource]:
-    """One log or several as sources; raises BadInput where there is none, or one is no log."""
+def sources_of(
+    logs: Log | Iterable[Log], alterations: Mapping[str, Any] | None = None
+) -> list[LogSource | MemorySource]:
+    """One log or several as sources, with topics altered where that is asked for.
+
+    Raises BadInput where there is none, or one is no log, or cannot be altered so.
+    """
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
         raise BadInput("there are no logs to replay; give at least one")
-    return [_source(log) for log in found]
+    return [alter(_source(log), alterations or {}) for log in found]
 
 
 def _source(log: Log) -> LogSource | MemorySource:

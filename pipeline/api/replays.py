@@ -12,11 +12,12 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Kind as Kind
 from pipeline.api.planning import Log as Log
@@ -54,6 +55,7 @@ def replay(
     gap_limit_s: float = 0.2,
     arrival_order: bool = False,
     late: str | None = None,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
     metrics: str | Sequence[str] = (),
 ) -> "Replay":
     """Replay estimators over logs, and judge them where there is truth.
@@ -72,6 +74,8 @@ def replay(
         arrival_order: go by log time, as the messages arrived.
         late: what is done about messages that then come late, by their stamps: "drop", "wait:0.5" (in
             seconds), "rewind:0.5"; by default they count as measured when they arrived.
+        set: parameters of all estimators that have them, and how topics are altered before they are
+            replayed: `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
         metrics: which ones; none stands for all.
 
     Raises BadInput where no run can be replayed by one of the estimators.
@@ -91,6 +95,7 @@ def replay(
         gap_limit_s=gap_limit_s,
         arrival_order=arrival_order,
         late=late,
+        set=set,
         metrics=metrics,
     )
     sources = plan.sources
@@ -257,6 +262,7 @@ class Replay:
             "title": f"replay of {self.logs[0].name}",
             "logs": [log.name for log in self.logs],
             "estimators": json.loads(json.dumps(self.settings, default=str)),
+            **setting_of(self.logs[0]),
             "parameters": self.done.parameters,
             "gap_limit_s": self.gap_limit_s,
         }

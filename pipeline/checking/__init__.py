@@ -1,1 +1,1 @@
-"""Checking: estimators against stored replays, field by field."""
+"""Checking: estimators against stored replays, field by field; begin with `checking`."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.sources import NOTE, alter
 from pipeline.checking.discrepancies import Discrepancy, discrepancies, first_of
 from pipeline.checking.golden import Replayed, Tolerances, make
 from pipeline.checking.stored import SUFFIX, Golden, read, write
@@ -71,15 +72,17 @@ def runs_of(path: Path) -> Runs:
 
     Raises BadInput where there are none.
     """
+    applied: dict[str, Any] = {}
     if (path / RESULT_FILE).is_file():
-        given = read_result(path).settings.get("logs", {})
+        settings = read_result(path).settings
+        given, applied = settings.get("logs", {}), settings.get(NOTE) or {}
         stated = given.get("files", []) if isinstance(given, dict) else given
         files = [Path(each) for each in stated] or sorted((path / "logs").glob("*.mcap"))
     else:
         files = logs_in(path)
     if not files:
         raise BadInput(f"{path}: has no logs to replay; give a log, or a result that keeps its logs")
-    runs = {file.name: LogSource(open_log(file)) for file in files}
+    runs = {file.name: alter(LogSource(open_log(file)), applied) for file in files}
     if len(runs) < len(files):
         raise BadInput(f"{path}: two of its logs have the same name; check them one by one")
     return runs

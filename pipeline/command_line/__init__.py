@@ -1,4 +1,7 @@
-"""The command `fuselog`. Commands import what they need when they run: `--help` answers at once."""
+"""The command `fuselog`: its commands and their options, and what they do.
+
+Commands import what they need when they run, so that `--help` answers at once. Begin with `group`.
+"""
 
 from pipeline.command_line.group import fuselog as fuselog
 from pipeline.command_line.process import main as main

@@ -27,9 +27,9 @@ from pipeline.output.terminal import (
     warn,
 )
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import log_of_estimates
+from pipeline.runs.estimates import source_of_estimates
 from pipeline.runs.initial_states import span_of
-from pipeline.runs.settings import settings_of_estimators, sigmas_of
+from pipeline.runs.settings import settings_of_estimators, sigmas_of, split_texts
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
 from recorders.log import Companions, Log, open_log
@@ -64,13 +64,11 @@ def replay_logs(
     """Replay, write the estimates logs, judge them where there is truth, print the metrics."""
     paths = _estimate_paths(logs, out)
     timelines = [] if save is None else [(save, TIMELINE)]
-    inputs = {
-        "log": logs,
-        "start": [Path(origin) for origin in origins],
-        "settings": [settings_file] if settings_file else [],
-    }
+    given = [settings_file] if settings_file else []
+    inputs = {"log": logs, "start": [Path(origin) for origin in origins], "settings": given}
     check_files([*((path, ESTIMATES) for path in paths), *timelines], inputs)
-    estimators = settings_of_estimators(names, settings, settings_file, model=model, every_s=every_s)
+    alterations, own = split_texts(settings)
+    estimators = settings_of_estimators(names, own, settings_file, model=model, every_s=every_s)
     plan = plan_replay(
         (LogSource(open_log(path, recover=recover)) for path in logs),
         estimators,
@@ -81,6 +79,7 @@ def replay_logs(
         gap_limit_s=gap_limit_s,
         arrival_order=arrival_order,
         late=late,
+        set=alterations,
     )
     done = plan.replay(
         list(zip(paths, logs, strict=True)),
@@ -318,7 +317,7 @@ def _draw_log(
     estimates = source = LogSource(log)
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
-        source = LogSource(open_log(log_of_estimates(log), recover=recover))
+        source = source_of_estimates(log, recover=recover)
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:

@@ -84,7 +84,8 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
     """Replay estimators over LOGS, the runs of one ensemble, and write their estimates.
 
     --set gate_probability=1 sets a parameter of all estimators that have it, --set
-    ekf.gate_probability=1 of one.
+    ekf.gate_probability=1 of one. --set /fix.delay_s=0.3 alters the topic /fix as it is read, here as in
+    run, tune, diagnose and compare; --set /fix=? says what can be set.
     """
     from pipeline.command_line.commands import replay_logs
 

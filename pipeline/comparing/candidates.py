@@ -19,7 +19,7 @@ from pipeline.comparing.renamed import Renamed
 from pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
 from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
 from pipeline.runs.ensemble import Progress, judge_logs, parts_of
-from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.runs.estimates import source_of_estimates, stated_estimators
 from pipeline.runs.experiment import Experiment, Setting, load_scenario
 from pipeline.runs.initial_states import check_same_run
 from pipeline.runs.runner import Runner
@@ -41,7 +41,7 @@ from replay.judging.tables import joined
 # Rows of a result are those of a replay where they agree so well: CPUs differ in the last digits.
 SAME = 1e-6
 # Entries of an experiment that decide about its results.
-DECIDING = ("record", "import", "logs", "gap_limit_s", "arrival_order", "late")
+DECIDING = ("record", "import", "logs", "alterations", "gap_limit_s", "arrival_order", "late")
 
 
 Pairs = Mapping[str, tuple[Source, Source]]
@@ -209,14 +209,14 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
             f"{path}: has no estimates logs (*.mcap), and is not a result of fuselog run; give one of "
             "these"
         )
-    pairs: dict[str, tuple[LogSource, LogSource]] = {}
+    pairs: dict[str, tuple[Source, LogSource]] = {}
     for file in files:
         log = open_log(file, recover=recover)
         if not labels_of(LogSource(log)):
             raise BadInput(
                 f"{file}: has no estimates; name the estimators to replay it with, such as -e ekf -e ukf"
             )
-        source = LogSource(open_log(log_of_estimates(log), recover=recover))
+        source = source_of_estimates(log, recover=recover)
         check_same_run(LogSource(log), source)
         run = key_of(source)
         if run in pairs:
@@ -344,6 +344,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
             gap_limit_s=experiment.gap_limit_s,
             arrival_order=bool(experiment.arrival_order),
             late=experiment.late,
+            set=experiment.alterations,
         )
         runs = [_run_of_result(result, number) for number in range(now.start, now.stop)]
         pairs = dict(zip(runs, zip(done.logs, done.estimates, strict=True), strict=True))

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.comparing.comparing import compare
 from pipeline.output.outputs import check_outputs
 from pipeline.output.terminal import print_json, print_table, progress, say, warn
-from pipeline.runs.settings import settings_of_estimators
+from pipeline.runs.settings import settings_of_estimators, split_texts
 
 COLUMNS = {
     "quantity": "metric",
@@ -41,7 +41,8 @@ def compare_candidates(
 ) -> None:
     """Compare, print a table for each pair and case and the verdicts, write folder and timeline."""
     check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
-    chosen = settings_of_estimators(labels, settings, settings_file)
+    alterations, own = split_texts(settings)
+    chosen = settings_of_estimators(labels, own, settings_file)
     found = compare(
         *candidates,
         estimators=[{label: values} for label, values in chosen.items()],
@@ -49,6 +50,7 @@ def compare_candidates(
         case=case,
         margin=margin,
         gap_limit_s=gap_limit_s,
+        set=alterations,
         recover=recover,
         progress=progress,
     )

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -238,6 +238,7 @@ def compare(
     case: str | None = None,
     margin: float = MARGIN,
     gap_limit_s: float = 0.2,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
     recover: bool = False,
     progress: Progress = no_progress,
 ) -> Differences:
@@ -252,6 +253,8 @@ def compare(
         case: what trajectory files are of, such as `robot2`, where a log has several truths.
         margin: which share of a metric is no matter.
         gap_limit_s: the truth is not interpolated over longer gaps.
+        set: how topics are altered, and parameters of estimators, of logs that are replayed; as for
+            `replay`.
         recover: read what is whole of logs that were cut off or damaged.
         progress: is told how a replay of results goes.
 
@@ -269,7 +272,7 @@ def compare(
     if not paths:
         raise BadInput("nothing to compare; give result folders, estimates logs or trajectories")
     givens = inputs_of(
-        paths, estimators, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
+        paths, estimators, set or {}, truth, case, progress, gap_limit_s=gap_limit_s, recover=recover
     )
     groups = list(comparable_groups(givens, [label for each in estimators for label in _labels(each)]))
     notes = [note for group in groups for candidate in group for note in candidate.notes]

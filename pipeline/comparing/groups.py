@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from pipeline.api.planning import Kind
 from pipeline.api.replays import replay
@@ -34,6 +35,7 @@ def runs_of(count: int) -> str:
 def inputs_of(
     paths: Sequence[Path],
     estimators: Sequence[str | Mapping[str, Kind]],
+    set_: Mapping[str, Any],
     truth: str | Path | None,
     case: str | None,
     progress: Progress,
@@ -53,8 +55,13 @@ def inputs_of(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             estimators,
             gap_limit_s=gap_limit_s,
+            set=set_,
         )
         return [of_replay(name_of(logs[0]), done, gap_limit_s)]
+    if set_:
+        raise BadInput(
+            f"--set {next(iter(set_))}: is for logs that are replayed; {paths[0]} has estimates already"
+        )
     found: dict[int, Given] = {}
     for number, (path, kind) in enumerate(zip(paths, kinds, strict=True)):
         if kind == "result":

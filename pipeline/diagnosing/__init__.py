@@ -1,1 +1,4 @@
-"""Diagnosing: why an estimator is inconsistent, by the faults without which it would not be."""
+"""Diagnosing: why an estimator is inconsistent, by the faults without which it would not be.
+
+Begin with `diagnosis`; `hypotheses` has the faults.
+"""

@@ -10,7 +10,7 @@ from pipeline.diagnosing.diagnosis import diagnose
 from pipeline.output.outputs import check_outputs
 from pipeline.output.results import plain
 from pipeline.output.terminal import print_json, print_metrics, print_table, say, status
-from pipeline.runs.settings import settings_of_estimators
+from pipeline.runs.settings import settings_of_estimators, split_texts
 from recorders.errors import BadInput
 from recorders.log import open_log
 from recorders.parameters import parse_settings
@@ -38,16 +38,20 @@ def diagnose_log(
             "fuselog tune"
         )
     check_outputs(out, save, {"log": [log], "settings": list(filter(None, [settings_file]))})
+    alterations, own = split_texts(settings)
     if label is not None:
-        given = settings_of_estimators([label], settings, settings_file, model=model)[label]
+        given = settings_of_estimators([label], own, settings_file, model=model)[label]
     elif settings_file is not None:
         raise BadInput(f"--settings {settings_file}: is for one estimator; name it with -e")
     else:
-        given = parse_settings(settings) | ({} if model is None else {"model": model})
+        given = parse_settings(own) | ({} if model is None else {"model": model})
     with status() as show:
         show("replaying with one fault undone after another")
         found = diagnose(
-            LogSource(open_log(log, recover=recover)), label, set=given, gap_limit_s=gap_limit_s
+            LogSource(open_log(log, recover=recover)),
+            label,
+            set=given | alterations,
+            gap_limit_s=gap_limit_s,
         )
     written = [str(found.save(out).folder)] if out is not None else []
     if save is not None:

@@ -14,9 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.altering.sources import alterations_of, setting_of, split_settings
 from pipeline.api.api import ResultFolder
 from pipeline.api.replays import Kind as EstimatorKind
 from pipeline.api.replays import Log, Replay, replay, settings_of, sources_of
+from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
 from pipeline.diagnosing.consistency import unnamed, unseen_errors
 from pipeline.diagnosing.findings import (
@@ -34,12 +36,12 @@ from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import log_of_estimates, stated_estimators
+from pipeline.runs.estimates import source_of_estimates, stated_estimators
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.log.streams import concatenate
 from recorders.parameters import merge
-from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.evaluation import split_topic
@@ -54,7 +56,8 @@ PROFILE_BINS = 60
 class Sentence(NamedTuple):
     """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
 
-    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so.
+    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
+    and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.
     """
 
     kind: Kind
@@ -62,6 +65,7 @@ class Sentence(NamedTuple):
     words: str
     time_ns: int | None = None
     cause: Cause | None = None
+    setting: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,7 +104,7 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """A row per sentence: its kind, topic and component, number with its 95 % interval, and gain."""
+        """A row per sentence: its kind, topic and component, number with its interval, gain, setting."""
         rows = []
         for each in self.sentences:
             cause = each.cause
@@ -113,6 +117,7 @@ class Diagnosis:
                     "low": cause.ends[0] if cause else np.nan,
                     "high": cause.ends[1] if cause else np.nan,
                     "gain": cause.gain if cause else np.nan,
+                    "setting": each.setting,
                     "sentence": each.words,
                 }
             )
@@ -200,6 +205,7 @@ class Diagnosis:
             "title": f"{self.label} diagnosed over {self.replay.logs[0].name}",
             "logs": [log.name for log in self.replay.logs],
             "estimators": json.loads(json.dumps(self.replay.settings, default=str)),
+            **setting_of(self.replay.logs[0]),
             "notes": [*self.told, *self.notes],
             "gap_limit_s": self.replay.gap_limit_s,
         }
@@ -231,7 +237,7 @@ def diagnose(
             is of.
         estimator: a registered name, or a label of your own with what it stands for, see `replay`; of
             an estimates log one of its labels, by default its only one.
-        set: parameters of the estimator.
+        set: parameters of the estimator, and how topics are altered; see `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
 
     Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
@@ -242,7 +248,8 @@ def diagnose(
     >>> found.sentences[0].kind, found.sentences[0].topic
     ('measurement noise', 'sigma_range_m')
     """
-    sources = sources_of(log)
+    alterations, given = split_settings(set or {})
+    sources = sources_of(log, alterations)
     if len(sources) > 1:
         raise BadInput(
             f"{len(sources)} logs: one log is diagnosed at a time; give one, such as {sources[0].name}. "
@@ -250,7 +257,7 @@ def diagnose(
         )
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
-    settings = merge(own, set or {})
+    settings = merge(own, given)
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
@@ -272,7 +279,7 @@ def diagnose(
         part, note = _first_part(source, bound, streamed)
         notes += note
         base = Trial(part, opened)
-        alternatives = hypotheses(label, bound, base, likelihood.begin(base))
+        alternatives = hypotheses(bound, base, likelihood.begin(base))
         [likely] = likelihood([base])
         causes = find_causes(likelihood, base, alternatives, MOST_SENTENCES)
         tried, least = len(alternatives), least_gain(len(alternatives))
@@ -281,7 +288,8 @@ def diagnose(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
         )
-    sentences = [_sentence(each) for each in causes]
+    trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
+    sentences = [_sentence(each, trying) for each in causes]
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
@@ -317,7 +325,7 @@ def _asked(
         if len(labels) != 1:
             raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
-        return sources_of(log_of_estimates(source.log))[0], {labels[0]: own}
+        return source_of_estimates(source.log), {labels[0]: own}
     if estimator is None:
         raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)
@@ -357,11 +365,16 @@ def _first_part(
     return MemorySource(streams, run, source.name), notes
 
 
-def _sentence(cause: Cause) -> Sentence:
+def _sentence(cause: Cause, trying: Trying) -> Sentence:
     of = cause.hypothesis
     mend = of.mend(cause.value)
-    told = f"try {mend}" if mend else "the gate that is set keeps these out"
-    return Sentence(of.kind, of.topic, f"{cause.words}; {told}", None, cause)
+    if mend is None:
+        return Sentence(
+            of.kind, of.topic, f"{cause.words}; the gate that is set keeps these out", None, cause
+        )
+    advice = trying.over(mend)
+    words = f"{cause.words}; try {trying.words(advice)}"
+    return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
 
 
 def _notes(done: Replay, sentences: Sequence[Sentence]) -> list[str]:

@@ -14,7 +14,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.diagnosing import alterations as alter
+from pipeline.altering import alterations as alter
+from pipeline.altering.changes import bare, entry_of
+from pipeline.diagnosing.advice import Advice, precise, rounded
 from pipeline.diagnosing.likelihood import Trial
 from pipeline.diagnosing.numbers import number
 from pipeline.tuning.objective import with_values
@@ -72,7 +74,7 @@ class Hypothesis:
         limit: of the number's magnitude.
         without: the trial without the fault of this number.
         words: what is wrong, from the number and the ends of its 95 % interval.
-        mend: what to try.
+        mend: what to try against this number; None where it is done already.
     """
 
     kind: Kind
@@ -82,7 +84,7 @@ class Hypothesis:
     limit: float
     without: Callable[[Trial, float], Trial]
     words: Callable[[float, float, float], str]
-    mend: Callable[[float], str]
+    mend: Callable[[float], Advice | None]
 
     @property
     def has_end(self) -> bool:
@@ -91,18 +93,17 @@ class Hypothesis:
 
 
 def hypotheses(
-    label: str, bound: Sequence[Bound], base: Trial, innovations: Mapping[str, Stream]
+    bound: Sequence[Bound], base: Trial, innovations: Mapping[str, Stream]
 ) -> list[Hypothesis]:
     """All that may be wrong of a run and the estimator that is bound to it.
 
     `innovations` are those of the run as it is, without a gate.
     """
-    command = f"fuselog tune LOG -e {label}"
     source, parameters = base.source, bound[0].parameters
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     stated = (topic for each in bound for topic in each.priors if topic in source.streams)
     priors = list(dict.fromkeys(stated))
-    found = [*_noises(command, bound, source), *_outliers(parameters)]
+    found = [*_noises(bound, source), *_outliers(parameters)]
     stamps = [source.streams[topic].publish_time_ns for topic in streamed if len(source.streams[topic])]
     first_ns = min(int(each[0]) for each in stamps)
     last_ns = max(int(each[-1]) for each in stamps)
@@ -113,7 +114,7 @@ def hypotheses(
         stream = source.streams[topic]
         if len(stream) >= FEWEST:
             found += _spreads(stream)
-            found += _biases(stream, parameters, command)
+            found += _biases(stream, parameters)
             if len(streamed) > 1:
                 found += _clocks(stream, *timing, parameters)
     for topic in priors:
@@ -128,7 +129,7 @@ def _in_topic(topic: str, alteration: alter.Alteration) -> Callable[[Trial, floa
     )
 
 
-def _noises(command: str, bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
+def _noises(bound: Sequence[Bound], source: MemorySource) -> Iterator[Hypothesis]:
     """The noise that the estimator's parameters state, or channels for them."""
     parameters = bound[0].parameters
     if parameters is None:
@@ -148,8 +149,8 @@ def _noises(command: str, bound: Sequence[Bound], source: MemorySource) -> Itera
         def words(at: float, low: float, high: float, name: str = name, letter: str = letter) -> str:
             return f"{name}: {_times(at, low, high)}, so that {letter} is too {_size(at)}"
 
-        def mend(at: float, name: str = name, value: float = value) -> str:
-            return f"--set {name}={value * np.exp(at):.3g}, or {command} --free {name}"
+        def mend(at: float, name: str = name, value: float = value) -> Advice:
+            return Advice(name, rounded(value * np.exp(at)), free=name)
 
         yield Hypothesis(kind, name, "", SCALES, 12.0, without, words, mend)
 
@@ -186,8 +187,8 @@ def _spreads(stream: Stream) -> Iterator[Hypothesis]:
         def words(at: float, low: float, high: float, field: str = field) -> str:
             return f"{stream.topic}: of {field} {_times(at, low, high)}, so that R is too {_size(at)}"
 
-        def mend(at: float, field: str = field) -> str:
-            return f"multiplying its {field} by {np.exp(2.0 * at):.3g} where the log is written"
+        def mend(at: float) -> Advice:
+            return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
 
         def without(trial: Trial, logarithm: float, field: str = field) -> Trial:
             source = alter.altered(trial.source, stream.topic, alter.spread(field), logarithm)
@@ -196,22 +197,22 @@ def _spreads(stream: Stream) -> Iterator[Hypothesis]:
         yield Hypothesis("measurement noise", stream.topic, "", SCALES, 12.0, without, words, mend)
 
 
-def _biases(stream: Stream, parameters: Parameters | None, command: str) -> Iterator[Hypothesis]:
+def _biases(stream: Stream, parameters: Parameters | None) -> Iterator[Hypothesis]:
     """What is measured is too large, or its frame is turned; biases of inertial units are states."""
     for entry in stream.schema:
         column = stream.columns.get(entry.name)
         if column is None or entry.name.startswith("covariance"):
             continue
         if entry.kind == "real":
-            yield from _bias(stream, entry.name, None, parameters, command)
+            yield from _bias(stream, entry.name, None, parameters)
         elif entry.kind == "vector" and entry.name in ("position_m", "velocity_mps"):
             for place in range(column.shape[1]):
-                yield from _bias(stream, entry.name, place, parameters, command)
+                yield from _bias(stream, entry.name, place, parameters)
             yield _turn(stream, entry.name)
 
 
 def _bias(
-    stream: Stream, field: str, place: int | None, parameters: Parameters | None, command: str
+    stream: Stream, field: str, place: int | None, parameters: Parameters | None
 ) -> Iterator[Hypothesis]:
     column = stream[field] if place is None else stream[field][:, place]
     known = column[np.isfinite(column)]
@@ -219,8 +220,7 @@ def _bias(
         return
     name, varies = field, float(np.std(known)) or 1.0
     if place is not None:
-        stem, _, unit = field.rpartition("_")
-        name = f"{stem}_{'xyz'[place]}_{unit}"
+        name = entry_of(field, place)
     own = next(
         (each for each in (f"bias_{name}", name.replace("_", "_bias_", 1)) if _has(parameters, each)), ""
     )
@@ -232,11 +232,10 @@ def _bias(
             return size
         return f"{size}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
 
-    def mend(at: float) -> str:
+    def mend(at: float) -> Advice:
         if own:
-            value = at if own.startswith("bias_") else -at
-            return f"--set {own}={value:.3g}, or {command} --free {own}"
-        return f"subtracting {at:.3g} where the log is written"
+            return Advice(own, rounded(at if own.startswith("bias_") else -at), free=own)
+        return Advice(f"{stream.topic}.{bare(name)}_bias", precise(at))
 
     yield Hypothesis(
         "bias or turned frame",
@@ -260,8 +259,8 @@ def _turn(stream: Stream, field: str) -> Hypothesis:
         size = f"{at:.3g} ({low:.3g} to {high:.3g}) deg"
         return f"{stream.topic}: {field} is turned about the vertical by {size}"
 
-    def mend(at: float) -> str:
-        return f"turning it back by {np.degrees(at):.3g} deg where the log is written"
+    def mend(at: float) -> Advice:
+        return Advice(f"{stream.topic}.{bare(field)}_turn", precise(at))
 
     without = _in_topic(stream.topic, alter.turned(field))
     return Hypothesis(
@@ -282,19 +281,14 @@ def _clocks(
             "by its stamps"
         )
 
-    def mend_late(at: float) -> str:
-        if _has(parameters, own):
-            return f"--set {own}={at:.3g}"
-        return (
-            f"fuselog cut LOG --topics '{topic}' -o late.mcap, and fuselog merge with the other topics "
-            f"and --offset late.mcap={-at:.3g}"
-        )
+    def mend_late(at: float) -> Advice:
+        return Advice(own if _has(parameters, own) else f"{topic}.delay_s", precise(at))
 
     def gaining(at: float, low: float, high: float) -> str:
         return f"{topic}: its clock gains {at:.3g} s a second ({low:.3g} to {high:.3g})"
 
-    def mend_gaining(at: float) -> str:
-        return f"dividing the times of its stamps by {1.0 + at:.8g} where the log is written"
+    def mend_gaining(at: float) -> Advice:
+        return Advice(f"{topic}.clock_gain", precise(at))
 
     yield Hypothesis(
         "delay", topic, "", DELAYS_S, LONGEST_DELAY_S, _in_topic(topic, delay), late, mend_late
@@ -336,8 +330,9 @@ def _start(
             f"{topic}: {name} at the start is too large by {size}, {abs(at) / sigma:.2g} of its sigmas"
         )
 
-    def mend(at: float) -> str:
-        return f"another prior, or one whose sigma of {name} is at least {abs(at):.2g}"
+    def mend(at: float) -> Advice:
+        wider = f"a prior whose sigma of {name} is at least {abs(at):.2g}"
+        return Advice(f"{topic}.{bare(name)}_bias", precise(at), otherwise=wider)
 
     tried = tuple(sigma * each for each in SIGMAS if sigma * abs(each) < limit)
     return Hypothesis("start", topic, name, tried, limit, _in_topic(topic, alteration), words, mend)
@@ -361,7 +356,7 @@ def _outliers(parameters: Parameters | None) -> Iterator[Hypothesis]:
         1.0,
         without,
         lambda *_: "some measurements are outliers: of something else, or false",
-        lambda _: "" if is_closed else f"--set gate_probability={GATE:g}",
+        lambda _: None if is_closed else Advice("gate_probability", GATE),
     )
 
 
@@ -391,13 +386,16 @@ def _exchanges(
         for first, second in combinations(sorted(each for each in targets if each in known), 2):
             without = _in_topic(topic, alter.renumbered(field, first, second))
             words = f"{topic}: {field} {first} and {second} are exchanged"
-            yield _exchange(topic, f"{first} {second}", words, without)
+            advice = Advice(f"{topic}.exchanged", f"{first},{second}")
+            yield _exchange(topic, f"{first} {second}", words, advice, without)
     of_case = {split_topic(each.name + "/_")[1]: each.streams for each in bound}
     cases = _suspects((split_topic(topic)[1], stream) for topic, stream in innovations.items())
     for one, other in combinations(sorted(each for each in cases if each in of_case), 2):
         for here, there in zip(of_case[one], of_case[other], strict=False):
             if source.topics[here].schema_name == source.topics[there].schema_name:
-                yield _exchange(here, there, f"{here} and {there} are exchanged", _back(here, there))
+                words = f"{here} and {there} are exchanged"
+                advice = Advice(f"{here}.exchanged", there)
+                yield _exchange(here, there, words, advice, _back(here, there))
 
 
 def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
@@ -417,7 +415,9 @@ def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
     return worst if worst and means[worst[0]] > SUSPECT else []
 
 
-def _exchange(topic: str, part: str, words: str, without: Callable[[Trial, float], Trial]) -> Hypothesis:
+def _exchange(
+    topic: str, part: str, words: str, advice: Advice, without: Callable[[Trial, float], Trial]
+) -> Hypothesis:
     return Hypothesis(
         "exchanged numbers",
         topic,
@@ -426,5 +426,5 @@ def _exchange(topic: str, part: str, words: str, without: Callable[[Trial, float
         1.0,
         without,
         lambda *_: words,
-        lambda _: "exchanging them where the log is written",
+        lambda _: advice,
     )

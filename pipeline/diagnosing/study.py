@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.diagnosing import alterations as alter
+from pipeline.altering import alterations as alter
 from pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
 from pipeline.diagnosing.hypotheses import Kind
 from pipeline.diagnosing.likelihood import Likelihood, Trial

@@ -13,6 +13,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pipeline.altering.sources import note_of
 from pipeline.output.coverage import added, replayed_note, rows_of, untaken
 from pipeline.runs.initial_states import Origin, start_from
 from recorders.errors import BadInput
@@ -369,12 +370,12 @@ def judge_logs(
 def estimates_metadata(
     source: Source, estimators: Settings, path: Path, log: Path, order: Clock = "publish_time"
 ) -> RunMetadata:
-    """Describe the estimates log at `path`, for its metadata: its run, estimators, span, clock and log.
+    """Describe the estimates log at `path`: its run, estimators, alterations, span, clock and log.
 
     The log's place is stated relative to the estimates', so that both can be moved together.
     """
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
     place = os.path.relpath(log.resolve(), path.resolve().parent)
     settings = json.dumps({label: dict(values) for label, values in estimators.items()}, default=str)
-    notes = {"log": place, "estimators": settings, **replayed_note(source, order)}
+    notes = {"log": place, "estimators": settings, **note_of(source), **replayed_note(source, order)}
     return replace(run, notes=notes)

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.altering.sources import alter, stated_alterations
 from recorders.errors import BadInput
-from recorders.log import Log
+from recorders.log import Log, open_log
 from recorders.parsing import parse_json
-from replay.engine.streams.sources import MemorySource, Source
+from replay.engine.streams.sources import LogSource, MemorySource, Source
 
 
 def log_of_estimates(estimates: Log) -> Path:
@@ -26,6 +27,20 @@ def log_of_estimates(estimates: Log) -> Path:
             f"{estimates.path}: the log {path} that it was made from is missing; give it with --log"
         )
     return path
+
+
+def source_of_estimates(
+    estimates: Log, place: Path | None = None, *, recover: bool = False
+) -> LogSource:
+    """The log that an estimates log is of, altered as it was for the replay.
+
+    Args:
+        estimates: the estimates log.
+        place: where the log is, if not where the estimates state it.
+        recover: read the intact part of a damaged log.
+    """
+    log = open_log(place or log_of_estimates(estimates), recover=recover)
+    return alter(LogSource(log), stated_alterations(LogSource(estimates)))
 
 
 def stated_estimators(estimates: Log | Source) -> dict[str, Any]:

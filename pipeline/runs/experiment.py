@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple, Self
 
 from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
+from pipeline.altering.changes import is_of_topic
 from pipeline.output.claims import StatedClaim, decide, require_names
 from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
 from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
@@ -44,6 +45,7 @@ class Experiment(Parameters):
         logs: logs to replay.
         estimators: parameters by label; `kind` names the estimator where the label is not its name,
             `like` another label whose kind and parameters it has but for what it says itself.
+        alterations: how topics are altered before they are replayed, as `--set /TOPIC.WHAT` has it.
         metrics: names of the metrics; without any, all that are registered.
         gap_limit_s: longest gap over which truth is interpolated.
         arrival_order: whether messages are processed in the order in which they arrived.
@@ -61,6 +63,7 @@ class Experiment(Parameters):
     import_: Import | None = Field(None, alias="import")
     logs: Logs | None = None
     estimators: dict[str, dict[str, Any]] = {}
+    alterations: dict[str, Any] | None = None
     metrics: list[str] = []
     gap_limit_s: NonNegativeFloat = 0.2
     arrival_order: bool | None = None
@@ -94,11 +97,9 @@ class Experiment(Parameters):
     def _has_an_order(self) -> Self:
         if self.late is not None:
             parse_late(self.late, arrival_order=bool(self.arrival_order))
-        if self.arrival_order and self.study != "localization":
-            raise ValueError(
-                f"study {self.study} replays in the order of the stamps; leave out arrival_order and "
-                "late"
-            )
+        if (self.arrival_order or self.alterations) and self.study != "localization":
+            which = "arrival_order, late and settings of topics"
+            raise ValueError(f"study {self.study} replays in the order of the stamps; leave out {which}")
         return self
 
     @property
@@ -213,7 +214,7 @@ def load_experiment(
 
     A setting goes to the entry of the experiment or to the estimator that its first word names, else to
     the scenario's or importer's parameters, else to all estimators that have such a parameter:
-    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`.
+    `gap_limit_s=1`, `ekf.gate_probability=1`, `robots=2`, `gate_probability=1`, `/fix.delay_s=0.3`.
     """
     stated = read_experiment(name)
     return stated.name, stated.with_settings(settings, over)
@@ -269,6 +270,8 @@ def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any])
     for key, value in settings.items():
         if key in entries:
             place: dict[str, Any] = {key: value}
+        elif is_of_topic(key):
+            place = {"alterations": {key: value}}
         elif key in experiment.estimators:
             place = {"estimators": {key: value}}
         elif key in names:

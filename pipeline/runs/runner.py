@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.sources import alter
 from pipeline.output.results import ErrorTables
 from pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
 from pipeline.runs.estimates import hash_files, hash_streams
@@ -21,7 +22,7 @@ from recorders.log import LogWriter, RunMetadata, open_log
 from recorders.parameters import merge
 from recorders.recording import import_run
 from replay.engine.streams.blocks import Ragged, gather
-from replay.engine.streams.sources import LogSource, MemorySource, Source, is_sensed, memory_source
+from replay.engine.streams.sources import LogSource, MemorySource, is_sensed, memory_source
 from replay.judging.judge import Judge
 
 
@@ -139,7 +140,7 @@ class Runner:
         experiment, setting = self.experiment, self.setting
         order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
         places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]
-        sources: Sequence[Source]
+        sources: Sequence[LogSource | MemorySource]
         if experiment.logs:
             files = experiment.files[now]
             sources = [LogSource(open_log(file)) for file in files]
@@ -154,6 +155,7 @@ class Runner:
                 _write_log(source, log)
             sources, estimates = recorded, [(path, log) for log, path in places]
             input_sha256 = hash_streams(recorded)
+        sources = [alter(source, experiment.alterations or {}) for source in sources]
         part = Part(sources, now.start, len(sources) == experiment.runs, estimates)
         with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
             done = replay_parts(

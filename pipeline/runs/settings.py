@@ -5,11 +5,13 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.changes import is_of_topic
 from recorders.errors import BadInput, choices
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import read_toml
 from replay.engine.replaying.estimator import Estimator, find_estimator
 
+Settings = Mapping[str, Mapping[str, Any]]
 # Parameters of estimators that have an option of their own.
 OPTIONS = {"model": "--model", "every_s": "--every"}
 
@@ -30,6 +32,12 @@ def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[
     return tables
 
 
+def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """The settings of topics among KEY=VALUE, by `/TOPIC.WHAT`; and the texts of all others."""
+    of_topics = [text for text in texts if is_of_topic(text.strip())]
+    return parse_settings(of_topics), [text for text in texts if text not in of_topics]
+
+
 def settings_of_estimators(
     labels: Sequence[str], texts: Sequence[str], file: Path | None, **options: Any
 ) -> dict[str, dict[str, Any]]:
@@ -40,16 +48,25 @@ def settings_of_estimators(
     """
     base = read_settings(file, labels)
     given = {key: value for key, value in options.items() if value is not None}
-    settings = parse_settings(texts) | given
-    chosen: dict[str, dict[str, Any]] = {}
+    return with_settings({label: base.get(label, {}) for label in labels}, parse_settings(texts) | given)
+
+
+def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Parameters by estimator label with others over them, see `settings_of_estimators`.
+
+    Raises BadInput where no estimator has such a parameter.
+    """
+    labels, chosen = list(base), dict[str, dict[str, Any]]()
     for label in labels:
         own = settings.get(label, {})
         if not isinstance(own, dict):
             raise BadInput(f"--set {label}={own}: expected {label}.PARAMETER=VALUE")
         chosen[label] = dict(own)
-    known = parameters_by_label({label: {**base.get(label, {}), **chosen[label]} for label in labels})
+    known = parameters_by_label({label: {**base[label], **chosen[label]} for label in labels})
     for key in [each for each in settings if each not in chosen]:
         takers = [label for label in chosen if key in known[label]]
+        if is_of_topic(key):
+            raise BadInput(f"--set {key}: this command takes no settings of topics; leave it out")
         if not takers and key in OPTIONS:
             raise BadInput(f"{OPTIONS[key]}: is for methods such as ekf; {', '.join(labels)} takes none")
         if not takers:
@@ -57,7 +74,7 @@ def settings_of_estimators(
             raise BadInput(f"--set {key}: no such estimator or parameter; {choices(key, names)}")
         for label in takers:
             chosen[label].setdefault(key, settings[key])
-    return {label: merge(base.get(label, {}), own) for label, own in chosen.items()}
+    return {label: merge(base[label], own) for label, own in chosen.items()}
 
 
 def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.altering.changes import is_of_topic
 from pipeline.output.charts import Axis, Chart, Panel, band, curve
 from pipeline.output.results import (
     MetricValue,
@@ -153,7 +154,7 @@ def nested(point: Mapping[str, Any]) -> dict[str, Any]:
     """
     tables: dict[str, Any] = {}
     for key, value in point.items():
-        for name in reversed(key.split(".")):
+        for name in reversed([key] if is_of_topic(key) else key.split(".")):
             value = {name: value}
         tables = merge(tables, value)
     return tables

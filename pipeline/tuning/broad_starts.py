@@ -23,7 +23,7 @@ Starts = Mapping[str, Sequence[Initialized]]  # by the name of what is estimated
 
 
 def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
-    """Find the equally likely starts of a run, not stated by the log; BadInput as `replay`."""
+    """Find the equally likely starts of a run whose log does not state them; BadInput as `replay`."""
     stamps = [source.streams[topic].publish_time_ns[:1] for each in bound for topic in each.streams]
     first_ns = int(np.min(np.concatenate(stamps), initial=np.iinfo(np.int64).max))
     found: dict[str, list[Initialized]] = {}

@@ -9,7 +9,7 @@ from pipeline.logs.folders import logs_in
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import plain
 from pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
-from pipeline.runs.settings import settings_of_estimators
+from pipeline.runs.settings import settings_of_estimators, split_texts
 from pipeline.tuning.objective import Best, By
 from pipeline.tuning.outcome import SETTINGS
 from pipeline.tuning.tuning import tune
@@ -42,7 +42,8 @@ def tune_logs(
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
     check_folder(out, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))})
-    chosen = settings_of_estimators([label], settings, settings_file, model=model)
+    alterations, own = split_texts(settings)
+    chosen = settings_of_estimators([label], own, settings_file, model=model)
     if not as_json:
         say(f"tuned on {_in_words(logs)}; held out: {_in_words(held_out)}")
     with status() as show:
@@ -58,6 +59,7 @@ def tune_logs(
             chosen,
             free,
             by=by,
+            set=alterations,
             bounds=dict(map(_bound, bounds)),
             grid=grid,
             validate=[LogSource(open_log(path, recover=recover)) for path in held_out],

@@ -13,6 +13,7 @@ import pandas as pd
 import tomli_w
 from numpy.typing import NDArray
 
+from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
 from pipeline.api.replays import Replay, replay
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
@@ -361,6 +362,7 @@ class Tuning:
             "held_out": [log.name for log in self.held_out_logs],
             "by": self.objective.by,
             "estimators": json.loads(json.dumps(self.settings, default=str)),
+            **setting_of(self.logs[0]),
             "notes": list(self.notes),
             "gap_limit_s": self.objective.gap_limit_s,
         }

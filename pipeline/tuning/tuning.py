@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Kind, Log, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
@@ -74,6 +75,7 @@ def tune(
         by: "likelihood" of the measurements, which needs no truth; "nis", mean squares of the normalised
             innovations of one; "nees" of one; or the least "rmse".
         set: other parameters, and where the search starts; by default what the log's channels state.
+            And how topics are altered; see `replay`.
         bounds: between what values a parameter lies; where both are positive, so is the parameter.
         grid: the search starts from the best of so many values of each parameter between the bounds.
         validate: logs that are held out, to judge the values by.
@@ -95,7 +97,9 @@ def tune(
     """
     if by not in CRITERIA:
         raise BadInput(f"--by {by}: {choices(by, CRITERIA)}")
-    sources, held_out = sources_of(logs), sources_of(validate) if validate else []
+    alterations, given = split_settings(set or {})
+    sources = sources_of(logs, alterations)
+    held_out = sources_of(validate, alterations) if validate else []
     if folds and not 2 <= folds <= len(sources):
         raise BadInput(
             f"--folds {folds}: give two or more, and a log for each at least; there are {len(sources)}"
@@ -104,7 +108,7 @@ def tune(
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is tuned at a time; give one")
     [(label, own)] = chosen.items()
-    settings = {"kind": label, **merge(own, set or {})}
+    settings = {"kind": label, **merge(own, given)}
     bound = bind(label, sources, settings)
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
     start = np.array([each.start for each in searched])

@@ -1,1 +1,1 @@
-"""Importers of real data, one file per source."""
+"""Importers of real data, one file or room per source; begin with `mrclam`."""

@@ -1,4 +1,7 @@
-"""The log contract: schemas, columns, and the reading and writing of MCAP files."""
+"""The log contract: schemas, columns, and the reading and writing of MCAP files.
+
+Begin with `streams`, which is what a topic is in memory, then `reader` and `writer`.
+"""
 
 from recorders.log.companions import Companion
 from recorders.log.container.reading import NotMcap

@@ -1,7 +1,8 @@
 """Decodes the bytes of opened regions into the columns of one topic.
 
-How messages are laid out is believed only after a check: our fixed layout where every constant byte
-agrees, else the protobuf library reads them one by one. A foreign log is read slowly, never wrongly.
+How messages are laid out is believed only after a check. The fast path takes all messages of a region at
+once by our fixed layout, where every constant byte of each agrees (`Layout.parse`); on the slow path the
+protobuf library reads them one by one. A foreign log is read slowly, never wrongly.
 """
 
 from collections.abc import Sequence

@@ -1,1 +1,1 @@
-"""Simulators of sensor streams, one file per scenario family."""
+"""Simulators of sensor streams, one file per scenario family; begin with `landmarks`."""

@@ -1,1 +1,1 @@
-"""Estimators, one file per family, and what they share."""
+"""Estimators, one room per family, and models that any method estimates; begin with `models`."""

@@ -1,4 +1,7 @@
-"""Sample sets of N(0, I) for linear regression Kalman filters, and where they are kept."""
+"""Sample sets of N(0, I) for linear regression Kalman filters, and where they are kept.
+
+Begin with `samplers`.
+"""
 
 from replay.sampling.cache import SetName, cached_set
 from replay.sampling.distance import lcd_distance

@@ -27,7 +27,9 @@ def test_the_picture_of_the_house_is_what_is_checked() -> None:
     assert set(rooms) == {path.parent.name for path in ROOT.glob("replay/*/__init__.py")}
 
 
-@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md", ".pre-commit-config.yaml"])
+@pytest.mark.parametrize(
+    "name", ["README.md", "CONTRIBUTING.md", "docs/design.md", ".pre-commit-config.yaml"]
+)
 def test_what_is_named_is_there(name: str) -> None:
     """Targets of make, and files."""
     text = (ROOT / name).read_text(encoding="utf-8")
@@ -37,6 +39,20 @@ def test_what_is_named_is_there(name: str) -> None:
     assert named <= targets
     for path in re.findall(r"`((?:replay|recorders|pipeline|tests|data|docs|\.github)/[^` <]*)`", text):
         assert "gliders" in path or (ROOT / path).exists(), path
+
+
+def test_the_types_that_one_meets_are_where_it_says() -> None:
+    """And in the picture of the way of data, what makes them."""
+    design = (ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+    glossary = re.findall(r"^\| `(\w+)` \| .* \| `(\S+)` \|$", design, re.MULTILINE)
+    (picture,) = re.findall(r"```\n +what flows .*?\n(.*?)```", design, re.DOTALL)
+    assert len(glossary) >= 12
+    for name, path in glossary:
+        assert f"class {name}" in (ROOT / path).read_text(encoding="utf-8"), (name, path)
+    for line in picture.splitlines():
+        *_, makers, path = re.split(r"  +", line)
+        for name in re.findall(r"\w+", makers):
+            assert re.search(rf"\b{name}\b", (ROOT / path).read_text(encoding="utf-8")), (name, path)
 
 
 def test_the_lanes_run_every_test_once() -> None:

@@ -4,6 +4,7 @@ What is larger stands here by name, and has to be: the lists can only shrink.
 """
 
 import ast
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -96,8 +97,17 @@ def test_functions_have_few_parameters() -> None:
     assert wide == WIDER
 
 
-def test_packages_open_with_what_belongs_there() -> None:
+def test_packages_open_with_what_belongs_there_and_where_to_begin() -> None:
+    """What they name as the beginning is a file or a room in them."""
     for name, text in FILES.items():
-        if name.endswith("__init__.py"):
+        folder, _, file = name.rpartition("/")
+        if file == "__init__.py" and folder != "fuselog":
             opening = ast.get_docstring(ast.parse(text)) or ""
-            assert opening.partition("\n")[0].endswith((".", ",", ":")), name
+            assert opening.partition("\n\n")[0].endswith("."), name
+            begin = re.search(
+                r"\b[Bb]egin (?:reading in|here|with) ?((?:`[\w.]+`|, then | and )*)", opening
+            )
+            assert begin, f"{name}: says nothing of where to begin"
+            for first in re.findall(r"`([\w.]+)`", begin[1]):
+                place = ROOT / folder / first.replace(".", "/")
+                assert place.is_dir() or place.with_suffix(".py").exists(), f"{name}: {first}"

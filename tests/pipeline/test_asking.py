@@ -54,6 +54,8 @@ def test_every_parameter_says_what_it_means() -> None:
         ("check a.mcap --against a.golden.xz -e ekf --set topics=?", ["empty name"]),
         ("compare a b -e smoother:iterated -e ekf --set loss=?", ["square, huber, cauchy"]),
         ("diagnose a.mcap -e ekf --set bias_range_m=?", ["too long"]),
+        ("diagnose a.mcap -e ekf --set /fix.delay_s=?", ["/fix.delay_s", "so late"]),
+        ("replay a.mcap -e ekf --set /fix=?", ["/fix.FIELD_scale", "/fix.exchanged"]),
         ("observability a.mcap --set window_s=?", ["whole run"]),
         (
             "run landmarks --set runs=? --set robots=? --set kappa=?",

@@ -13,7 +13,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 import fuselog as fl
-from pipeline.diagnosing import alterations as alter
+from pipeline.altering import alterations as alter
 from pipeline.diagnosing import study
 from pipeline.diagnosing.causes import find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
@@ -31,7 +31,7 @@ def gains_of(source: fl.MemorySource, settings: dict[str, float]) -> dict[str, P
     """What scaling each noise alone gains, and by how much (logarithms)."""
     given = {"kind": "ekf", **settings, **OPEN}
     base, likelihood = Trial(source, given), Likelihood("ekf")
-    tried = hypotheses("ekf", bind("ekf", [source], given), base, likelihood.begin(base))
+    tried = hypotheses(bind("ekf", [source], given), base, likelihood.begin(base))
     [before] = likelihood([base])
     return {
         each.topic: peak(
@@ -141,7 +141,8 @@ def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     told = first(late)
     assert (told.kind, told.topic) == ("delay", SEEN)
     assert told.cause.ends[0] < 0.05 < told.cause.ends[1]
-    assert f"--offset late.mcap={-told.cause.value:.3g}" in told.words
+    assert told.setting == f"{SEEN}.delay_s={told.cause.value:.4g}"
+    assert told.words.endswith(f"try --set {told.setting}")
     wild = fl.record(
         "landmarks", seed=5, **scenario, range_bearing={**exact, "outlier_probability": 0.02}
     )
@@ -167,7 +168,7 @@ def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
     faulty = alter.altered(source, "/robot1/prior", alter.shifted("mean", 0), 2.0)
     given = {"kind": "ekf", **OPEN}
     base, likelihood = Trial(faulty, given), Likelihood("ekf")
-    tried = hypotheses("ekf", bind("ekf", [faulty], given), base, likelihood.begin(base))
+    tried = hypotheses(bind("ekf", [faulty], given), base, likelihood.begin(base))
     alike = [each for each in tried if each.part == "x_m"] * 2
     causes = find_causes(likelihood, base, alike, 5)
     assert [each.is_rival for each in causes] == [False, True]

@@ -1,5 +1,7 @@
 """The report: result folders as one HTML page that fetches nothing and runs only our scripts.
 
+Begin here; `verdict` has the sentences that a section opens with.
+
 Plotly draws the charts: its bundle of basic traces, which is small enough to be in every page, lies here
 as its publisher gives it (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
 """

@@ -80,8 +80,7 @@ def compile_over_runs(
     Returns `loop(runs, *arguments, scratch=None, per_run=None)`; its results do not depend on the number
     of runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
     `run_once`: arrays that one run after another may work in. Or that is `per_run[run]`, such as the
-        run's
-    generator of random numbers; a run for which that is None is left out.
+    run's generator of random numbers; a run for which that is None is left out.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
 
     For finding a fault: with FUSELOG_UNCOMPILED=1 the kernels are plain Python, and an index beyond an

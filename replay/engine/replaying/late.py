@@ -1,4 +1,4 @@
-"""Handles messages that arrive late: drops them, waits for them, or goes back for them.
+"""Handles late (out-of-sequence) messages: drops them, waits for them, or goes back for them.
 
 In the order of arrival (log time) the stamps at which things were measured (publish time) go back
 wherever a message was late. `taking_late` makes of an estimator one that is handed its messages as they
@@ -9,7 +9,8 @@ arrive and does one of three things about it:
     rewind:SECONDS  the estimator goes back, if not further than that; what is older still is left out
 
 What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
-was waited for on `waited`, as a `schemas.WAITED`; what was gone back for by the estimator itself.
+was waited for on `waited`, as a `schemas.WAITED`; what was gone back for by the estimator itself
+(`Recursive.out_of_sequence`; for filters of models, `replay.inference.run.out_of_sequence`).
 """
 
 from collections.abc import Mapping

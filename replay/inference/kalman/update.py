@@ -221,6 +221,9 @@ def writing_innovation(stage: Stage, number: int) -> Function:
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
+    The gain K itself is not formed. With S = L L' and W = C L^-T, K v is W L^-1 v, see
+    `gaussian.kalman_step`, and K S K' is W W', see `gaussian.downdate`.
+
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
     is where none is left. What the gate lets in may still count less, see `gaussian.inflation`.

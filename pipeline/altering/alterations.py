@@ -44,6 +44,20 @@ def _shifted(field: str, entry: int | None, stream: Stream, by: float) -> Stream
     return _with(stream, **{field: column})
 
 
+def scaled(field: str, entry: int | None = None) -> Alteration:
+    """A field, or one entry of it where that is a vector, is multiplied."""
+    return partial(_scaled, field, entry)
+
+
+def _scaled(field: str, entry: int | None, stream: Stream, factor: float) -> Stream:
+    column = stream[field].copy()
+    if entry is None:
+        column *= factor
+    else:
+        column[:, entry] *= factor
+    return _with(stream, **{field: column})
+
+
 def spread(field: str) -> Alteration:
     """A covariance is multiplied, that of standard deviations e^value times as large."""
     return partial(_spread, field)

@@ -1,0 +1,308 @@
+"""What `--set /TOPIC.WHAT=VALUE` does to a topic: which alteration, of which field, by how much."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.altering import alterations as alter
+from recorders.errors import BadInput, choices
+from recorders.importers.units import conversion, unit_of
+from recorders.log import Stream, Topic, schemas
+from replay.engine.streams.geodetic import ORIGIN
+from replay.engine.streams.sources import LogSource, MemorySource
+
+AXES = "xyz"
+# Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
+WHATS = {
+    "delay_s": "The stamps are so late, and are taken back by it.",
+    "clock_gain": "The clock of the stamps gains so many s a second from the run's begin on.",
+    "FIELD_scale": "The field is multiplied by it; covariance_scale is a factor of variances.",
+    "FIELD_bias": "The field is too large by it, and is reduced by it.",
+    "FIELD_turn": "The vector is turned about the vertical by this angle (rad), and is turned back.",
+    "heading_bias": "The heading of a Gaussian estimate, such as a prior, is too large by it (rad).",
+    "origin": "Of geodetic fixes the origin of the plane: latitude and longitude in deg, altitude in m. "
+    "Of positions where their zero lies in the plane, in m: it is added.",
+    "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",
+}
+_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
+
+
+class _Setting(NamedTuple):
+    """One setting of a topic: as it was written, and its parts."""
+
+    key: str
+    what: str
+    value: Any
+    empty: Stream
+
+    def refused(self, expected: str) -> BadInput:
+        """The sentence on a value that makes no sense."""
+        return BadInput(f"--set {self.key}={self.value}: expected {expected}")
+
+    def number(self, name: str, example: str) -> float:
+        """The value in the unit that `name` ends with, or in a unit of its own, as `300 ms`."""
+        found = _NUMBER.fullmatch(str(self.value))
+        if isinstance(self.value, bool) or found is None:
+            raise self.refused(example)
+        number = float(found[1])
+        try:
+            number *= conversion(found[2], name) if found[2] else 1.0
+        except BadInput as error:
+            raise BadInput(f"--set {self.key}={self.value}: {error}") from None
+        if not np.isfinite(number):
+            raise self.refused(example)
+        return number
+
+    def several(self, counts: Sequence[int], example: str) -> list[str]:
+        """The value as a list, which may be written with commas."""
+        is_list = isinstance(self.value, list | tuple)
+        parts = list(self.value) if is_list else str(self.value).strip("[] ").split(",")
+        if len(parts) not in counts:
+            raise self.refused(example)
+        return [str(each).strip() for each in parts]
+
+
+@dataclass(frozen=True)
+class Change:
+    """What is done to a topic.
+
+    Attributes:
+        topic: its name.
+        stored: the topic of the log that it is read from: its own, but of exchanged ones the other.
+        first_ns: where the run begins, from which a clock drifts.
+        columns: what is done to its columns, in turn.
+        metadata: what is stated of it beside what the log states.
+        gain, delay_ns: its stamps lose `delay_ns`, and `gain` of their time since `first_ns`.
+    """
+
+    topic: str
+    stored: str
+    first_ns: int = 0
+    columns: Sequence[Callable[[Stream], Stream]] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    gain: float = 0.0
+    delay_ns: float = 0.0
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether its stamps move."""
+        return self.gain != 0.0 or self.delay_ns != 0.0
+
+    def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The stamps (n,) in ns, moved: as `alterations.drifted` and `delayed` undo clock and delay."""
+        lost = self.gain * (stamps_ns - self.first_ns) + self.delay_ns
+        return stamps_ns - np.rint(lost).astype(np.int64)
+
+    def before(self, stamp_ns: int) -> int:
+        """A stamp that is moved to this one, but for rounding."""
+        since_ns = (stamp_ns - self.first_ns + self.delay_ns) / (1.0 - self.gain)
+        return self.first_ns + round(since_ns)
+
+    def stated(self, topic: Topic) -> Topic:
+        """The topic as it is altered, from the one that is stored."""
+        return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
+
+    def altered(self, stream: Stream) -> Stream:
+        """The topic's messages altered, from those of the one that is stored."""
+        stamps_ns = self.moved(stream.publish_time_ns) if self.is_moving else stream.publish_time_ns
+        if len(stamps_ns) and stamps_ns.min() < 0:
+            raise BadInput(
+                f"--set {self.topic}: its stamps would be before 1970, the first by "
+                f"{-1e-9 * stamps_ns.min():g} s; give a smaller delay_s or clock_gain"
+            )
+        metadata = {**stream.metadata, **self.metadata}
+        stream = replace(stream, topic=self.topic, publish_time_ns=stamps_ns, metadata=metadata)
+        for alteration in self.columns:
+            stream = alteration(stream)
+        return stream
+
+
+def is_of_topic(key: str) -> bool:
+    """Whether a setting is of a topic, and not of an estimator or experiment."""
+    return key.startswith("/")
+
+
+def bare(name: str) -> str:
+    """The name of a field or component without its unit: `x` of `x_m`."""
+    return name.rpartition("_")[0] if unit_of(name) else name
+
+
+def entry_of(field_: str, place: int) -> str:
+    """What an entry of a vector is called: `position_x_m` of `position_m`."""
+    stem, _, unit = field_.rpartition("_")
+    return f"{stem}_{AXES[place]}_{unit}"
+
+
+def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
+    """What settings of topics do to a run, by topic; several of one topic in their order.
+
+    What can be set is in `WHATS`. A field is named in full, or without its unit, or by its beginning
+    where that is clear; an entry of a vector with its axis, as `position_x_bias`; one of a state by its
+    component. A number may have a unit, as `300 ms` or `4.5 deg`.
+
+    Raises BadInput where there is no such topic or field, or a value makes no sense.
+    """
+    changes: dict[str, Change] = {}
+    for key, value in settings.items():
+        topic, dot, what = key.rpartition(".")
+        if not dot or not what:
+            raise BadInput(
+                f"--set {key}={value}: expected /TOPIC.WHAT=VALUE, such as /fix.delay_s=0.3; of a topic "
+                f"can be set: {', '.join(WHATS)}"
+            )
+        if topic not in source.topics:
+            raise BadInput(
+                f"--set {key}: {source.name} has no topic {topic}; {choices(topic, source.topics)}"
+            )
+        before = changes.get(topic) or Change(topic, topic, source.extent("publish_time")[0])
+        given = _Setting(key, what, value, source.empty(before.stored))
+        changes[topic] = _with(before, given)
+        if changes[topic].stored != before.stored:
+            other = changes[topic].stored
+            _check_exchange(source, given, other, changes)
+            changes[other] = Change(other, topic, before.first_ns)
+    return changes
+
+
+def _with(change: Change, given: _Setting) -> Change:
+    """A change with one more setting of its topic."""
+    what = given.what
+    if what in ("delay_s", "delay"):
+        delay_ns = 1e9 * given.number("delay_s", "seconds, such as 0.3 or 300 ms")
+        return replace(change, delay_ns=change.delay_ns + delay_ns)
+    if what == "clock_gain":
+        gain = given.number("clock_gain", "seconds that the clock gains a second, such as 1e-4")
+        if not gain < 1.0:
+            raise given.refused("seconds that the clock gains a second, less than 1, such as 1e-4")
+        return replace(change, gain=change.gain + gain)
+    if what == "origin":
+        return _origin(change, given)
+    if what == "exchanged":
+        return _exchange(change, given)
+    return replace(change, columns=(*change.columns, _of_column(given)))
+
+
+def _of_column(given: _Setting) -> Callable[[Stream], Stream]:
+    """What is done to a field."""
+    name, _, what = given.what.rpartition("_")
+    if given.what == "heading_bias" and "quaternion" in given.empty.metadata.get("kinds", ""):
+        angle = given.number("heading_rad", "an angle in rad, such as 0.1 or 5 deg")
+        return partial(alter.heading_turned, angle=-angle)
+    if not name or what not in ("scale", "bias", "turn"):
+        known = f"of a topic can be set {', '.join(WHATS)}"
+        raise BadInput(f"--set {given.key}: {known}; {choices(given.what, list(WHATS))}")
+    full, (field_, entry) = _field(given, name)
+    if what == "scale":
+        factor = given.number("scale", "a factor, such as -1 or 3.6")
+        if field_.startswith("covariance") and factor <= 0.0:
+            raise given.refused("a positive factor of variances, such as 4")
+        return partial(_by, alter.scaled(field_, entry), factor)
+    if what == "bias":
+        unit = f" in {unit_of(full)}" if unit_of(full) else ""
+        return partial(_by, alter.shifted(field_, entry), -given.number(full, f"a number{unit}"))
+    if entry is not None or not field_.startswith(("position", "velocity")):
+        raise BadInput(f"--set {given.key}: only positions and velocities are turned, as position_turn")
+    angle = given.number("turn_rad", "an angle in rad, such as 0.1 or 5 deg")
+    return partial(_by, alter.turned(field_), -angle)
+
+
+def _by(alteration: alter.Alteration, value: float, stream: Stream) -> Stream:
+    return alteration(stream, value)
+
+
+def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
+    """The one field, or entry of one, that a name means; raises BadInput where that is not one."""
+    fields: dict[str, tuple[str, int | None]] = {}
+    for each in given.empty.schema:
+        if each.kind not in ("real", "vector") or each.name not in given.empty.columns:
+            continue
+        if each.name in ("mean", "state"):
+            entries = enumerate(given.empty.components)
+            fields |= {component: (each.name, place) for place, component in entries}
+            continue
+        fields[each.name] = each.name, None
+        if each.kind == "vector" and not each.name.startswith("covariance"):
+            fields |= {entry_of(each.name, place): (each.name, place) for place in range(len(AXES))}
+    for fits in (
+        [each for each in fields if each == name],
+        [each for each in fields if bare(each) == name],
+        [each for each in fields if each.startswith(f"{name}_") and fields[each][1] is None],
+        [each for each in fields if each.startswith(f"{name}_")],
+    ):
+        if len(fits) == 1:
+            return fits[0], fields[fits[0]]
+        if fits:
+            raise BadInput(
+                f"--set {given.key}: {name} may be {' or '.join(fits)}; write one of them in full"
+            )
+    topic = given.key.rpartition(".")[0]
+    raise BadInput(f"--set {given.key}: {topic} has no field {name}; {choices(name, list(fields))}")
+
+
+def _origin(change: Change, given: _Setting) -> Change:
+    if given.empty.schema.full_name == schemas.GEODETIC_FIX.full_name:
+        example = "latitude and longitude in deg, and altitude in m, such as 49.01,8.4,115"
+        texts = given.several((2, 3), example)
+        place = [_plain(given, text, example) for text in texts]
+        if not (abs(place[0]) <= 90.0 and abs(place[1]) <= 360.0):
+            raise given.refused(example)
+        stated = dict(zip(ORIGIN, map(repr, place), strict=False))
+        return replace(change, metadata={**change.metadata, **stated})
+    if "position_m" not in given.empty.columns:
+        raise BadInput(
+            f"--set {given.key}: only positions and geodetic fixes have an origin; leave it out"
+        )
+    example = "a place in m, such as -0.65,0.3"
+    place = [_plain(given, text, example) for text in given.several((2, 3), example)]
+    added = [
+        partial(_by, alter.shifted("position_m", entry), value) for entry, value in enumerate(place)
+    ]
+    return replace(change, columns=(*change.columns, *added))
+
+
+def _plain(given: _Setting, text: str, example: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = np.nan
+    if not np.isfinite(number):
+        raise given.refused(example)
+    return number
+
+
+def _exchange(change: Change, given: _Setting) -> Change:
+    text = str(given.value)
+    if is_of_topic(text):
+        return replace(change, stored=text)
+    example = "two numbers, such as 3,9, or another topic"
+    first, second = given.several((2,), example)
+    fields = [each.name for each in given.empty.schema if each.kind == "identifier"]
+    if len(fields) != 1 or not (first.isdigit() and second.isdigit()):
+        raise given.refused(example if fields else "another topic: this one has no numbers")
+    renumber = alter.renumbered(fields[0], int(first), int(second))
+    return replace(change, columns=(*change.columns, partial(_by, renumber, 0.0)))
+
+
+def _check_exchange(
+    source: LogSource | MemorySource, given: _Setting, other: str, changes: Mapping[str, Change]
+) -> None:
+    """Refuse an exchange with a topic that is not there, of another type, or altered already."""
+    if other not in source.topics:
+        raise BadInput(
+            f"--set {given.key}={other}: {source.name} has no topic {other}; "
+            f"{choices(other, source.topics)}"
+        )
+    if source.topics[other].schema_name != given.empty.schema.full_name:
+        raise BadInput(
+            f"--set {given.key}={other}: one is {given.empty.schema.full_name}, the other "
+            f"{source.topics[other].schema_name}; only topics of one type are exchanged"
+        )
+    if other in changes:
+        raise BadInput(
+            f"--set {given.key}={other}: {other} is altered too; set its exchange alone, once"
+        )

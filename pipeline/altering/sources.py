@@ -1,0 +1,237 @@
+"""Runs with some of their topics altered, as `--set /fix.delay_s=0.3` says; the files stay as they are.
+
+A log is altered block by block. A topic whose stamps move is read for itself, and merged with the others
+by its new stamps: memory holds a block of each, however far the stamps move.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, overload
+
+import numpy as np
+
+from pipeline.altering.changes import Change, changes_of, is_of_topic
+from recorders.errors import BadInput
+from recorders.log import Clock, Stream, Topic
+from recorders.parsing import parse_json
+from replay.engine.streams.sources import LogSource, MemorySource, Source
+
+NOTE = "alterations"  # in the metadata of an estimates log
+Settings = Mapping[str, Any]
+
+
+@overload
+def alter(source: LogSource, settings: Settings) -> LogSource: ...
+@overload
+def alter(source: MemorySource, settings: Settings) -> MemorySource: ...
+@overload
+def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource: ...
+def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
+    """A run with topics altered; of one that is altered already, more so.
+
+    Args:
+        source: the run.
+        settings: values by `/TOPIC.WHAT`, such as `{"/fix.delay_s": 0.3}`; see `changes_of`.
+
+    Raises BadInput where the run has no such topic, the topic no such field, or a value makes no sense.
+    """
+    if not settings:
+        return source
+    if isinstance(source, AlteredLog):
+        made = replace(source, alterations={**source.alterations, **settings})
+        made.changes  # noqa: B018, where a setting is wrong this says so, before anything is read
+        return made
+    if isinstance(source, AlteredRecording):
+        return _altered(source.before, {**source.alterations, **settings})
+    if isinstance(source, MemorySource):
+        return _altered(source, settings)
+    return alter(AlteredLog(source.log, source.start_ns, source.end_ns), settings)
+
+
+def alterations_of(source: Source) -> dict[str, Any]:
+    """How a run was altered, by `/TOPIC.WHAT`."""
+    return dict(source.alterations) if isinstance(source, AlteredLog | AlteredRecording) else {}
+
+
+def note_of(source: Source) -> dict[str, str]:
+    """What the metadata of an estimates log says of the alterations; nothing where there are none."""
+    return {name: json.dumps(applied) for name, applied in setting_of(source).items()}
+
+
+def setting_of(source: Source) -> dict[str, dict[str, Any]]:
+    """What the settings of a result say of the alterations; nothing where there are none."""
+    applied = alterations_of(source)
+    return {NOTE: applied} if applied else {}
+
+
+def stated_alterations(estimates: Source) -> dict[str, Any]:
+    """How the run was altered that an estimates log is of; raises BadInput where that is garbled."""
+    notes = estimates.run.notes if estimates.run else {}
+    try:
+        stated = parse_json(notes.get(NOTE, "{}"))
+    except ValueError:
+        stated = None
+    if not isinstance(stated, dict):
+        raise BadInput(
+            f"{estimates.name}: its metadata does not say how its log was altered; replay it again"
+        )
+    return stated
+
+
+def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Settings of topics, and all others.
+
+    >>> split_settings({"/fix.delay_s": 0.3, "gate_probability": 1})
+    ({'/fix.delay_s': 0.3}, {'gate_probability': 1})
+    """
+    of_topics = {key: value for key, value in settings.items() if is_of_topic(key)}
+    return of_topics, {key: value for key, value in settings.items() if key not in of_topics}
+
+
+@dataclass(frozen=True, repr=False)
+class AlteredRecording(MemorySource):
+    """A recording in memory whose streams are altered; `before` is what it was."""
+
+    before: MemorySource = field(kw_only=True)
+    alterations: Settings = field(kw_only=True)
+
+
+def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
+    changes = changes_of(source, settings)
+    streams = {
+        topic: changes[topic].altered(source.streams[changes[topic].stored]) if topic in changes else own
+        for topic, own in source.streams.items()
+    }
+    return AlteredRecording(
+        streams,
+        source.run,
+        source.name,
+        source.start_ns,
+        source.end_ns,
+        before=source,
+        alterations=settings,
+    )
+
+
+@dataclass(frozen=True, repr=False)
+class AlteredLog(LogSource):
+    """A log file whose topics are altered as they are read."""
+
+    alterations: Settings = field(default_factory=dict)
+
+    @cached_property
+    def changes(self) -> dict[str, Change]:
+        """What is done to topics."""
+        return changes_of(LogSource(self.log), self.alterations)
+
+    @cached_property
+    def topics(self) -> Mapping[str, Topic]:
+        """The log's topics as they are altered."""
+        of_log = self.log.topics
+        return {
+            name: self.changes[name].stated(of_log[self.changes[name].stored])
+            if name in self.changes
+            else own
+            for name, own in of_log.items()
+        }
+
+    def extent(self, clock: Clock) -> tuple[int, int]:
+        """A span in ns that holds all stamps by one of the clocks, before they are altered and after."""
+        ends = np.array(super().extent(clock))
+        moved = [ends, *(each.moved(ends) for each in self.changes.values() if clock == "publish_time")]
+        return int(np.min(moved)), int(np.max(moved))
+
+    def read(self, topics: Sequence[str]) -> dict[str, Stream]:
+        """Return whole topics, in publish-time order, whatever the source's span."""
+        return self._altered(super().read([self._stored(topic) for topic in topics]), topics)
+
+    def empty(self, topic: str) -> Stream:
+        """Return the topic without its messages."""
+        stream = super().empty(self._stored(topic))
+        return replace(stream, topic=topic, metadata=self.topics[topic].metadata)
+
+    def whole(self) -> "AlteredLog":
+        """Return the whole log."""
+        return replace(self, start_ns=None, end_ns=None)
+
+    def blocks(
+        self, topics: Sequence[str], order: Clock, block_messages: int
+    ) -> Iterator[dict[str, Stream]]:
+        """Blocks of the source's span, by the altered stamps."""
+        moving = [
+            topic
+            for topic in dict.fromkeys(topics)
+            if order == "publish_time" and topic in self.changes and self.changes[topic].is_moving
+        ]
+        others = [topic for topic in topics if topic not in moving]
+        parts = [self._moved_blocks(topic, block_messages) for topic in moving]
+        if others:
+            stored = super().blocks([self._stored(topic) for topic in others], order, block_messages)
+            parts.append(self._altered(block, others) for block in stored)
+        return parts[0] if len(parts) == 1 else in_turn(parts, order)
+
+    def _stored(self, topic: str) -> str:
+        return self.changes[topic].stored if topic in self.changes else topic
+
+    def _altered(self, block: Mapping[str, Stream], topics: Sequence[str]) -> dict[str, Stream]:
+        found = {}
+        for topic in topics:
+            stream = block.get(self._stored(topic))
+            if stream is not None:
+                found[topic] = self.changes[topic].altered(stream) if topic in self.changes else stream
+        return found
+
+    def _moved_blocks(self, topic: str, block_messages: int) -> Iterator[dict[str, Stream]]:
+        """Blocks of a topic whose stamps move."""
+        change = self.changes[topic]
+        start_ns, end_ns = (
+            None if at_ns is None else max(0, change.before(at_ns) + slack_ns)
+            for at_ns, slack_ns in ((self.start_ns, -1), (self.end_ns, 1))  # it was rounded
+        )
+        log = LogSource(self.log, start_ns, end_ns)
+        for block in log.blocks([change.stored], "publish_time", block_messages):
+            stream = change.altered(block[change.stored])
+            is_in = np.ones(len(stream), bool)
+            if self.start_ns is not None:
+                is_in &= stream.publish_time_ns >= self.start_ns
+            if self.end_ns is not None:
+                is_in &= stream.publish_time_ns < self.end_ns
+            if is_in.any():
+                yield {topic: stream.take(is_in)}
+
+
+def in_turn(parts: Iterable[Iterator[dict[str, Stream]]], order: Clock) -> Iterator[dict[str, Stream]]:
+    """Blocks of several topics, each in blocks that follow one another in time, as one such sequence.
+
+    Nothing is handed on before every part has come as far.
+    """
+    running, waiting = dict(enumerate(parts)), dict[int, dict[str, Stream]]()
+    while running or waiting:
+        for number in [each for each in running if each not in waiting]:
+            block = next(running[number], None)
+            if block is None:
+                del running[number]
+            elif block:
+                waiting[number] = block
+        if any(number not in waiting for number in running):
+            continue  # an empty block
+        if not waiting:
+            return
+        limit_ns = min(
+            max(int(stream.times(order)[-1]) for stream in block.values()) for block in waiting.values()
+        )
+        now: dict[str, Stream] = {}
+        for number, block in list(waiting.items()):
+            later: dict[str, Stream] = {}
+            for topic, stream in block.items():
+                cut = int(np.searchsorted(stream.times(order), limit_ns, side="right"))
+                for rows, kept in ((slice(0, cut), now), (slice(cut, None), later)):
+                    if len(part := stream.take(rows)):
+                        kept[topic] = part
+            if later:
+                waiting[number] = later
+            else:
+                del waiting[number]
+        yield now

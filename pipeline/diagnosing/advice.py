@@ -1,0 +1,72 @@
+"""What a diagnosis says to try: a setting that undoes a fault, for the command line or for Python."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+
+class Advice(NamedTuple):
+    """What undoes a fault.
+
+    Attributes:
+        key: of the setting, a parameter or `/TOPIC.WHAT`.
+        value: of the setting.
+        free: the parameter that may be tuned instead.
+        otherwise: what may be done instead, in words.
+    """
+
+    key: str
+    value: float | str
+    free: str = ""
+    otherwise: str = ""
+
+    @property
+    def setting(self) -> str:
+        """The setting as `--set` takes it."""
+        return f"{self.key}={self.value}"
+
+
+@dataclass(frozen=True)
+class Trying:
+    """How advice is followed.
+
+    Attributes:
+        label: the estimator's.
+        applied: how the log is altered already.
+        is_own: whether the estimator is a program's own, which no command can name.
+    """
+
+    label: str
+    applied: Mapping[str, Any]
+    is_own: bool
+
+    def over(self, advice: Advice) -> Advice:
+        """The advice with what is set already, which it would replace."""
+        before, now = self.applied.get(advice.key), advice.value
+        if isinstance(before, bool) or not isinstance(before, int | float) or isinstance(now, str):
+            return advice
+        is_factor = advice.key.endswith("_scale")
+        return advice._replace(value=precise(before * now if is_factor else before + now))
+
+    def words(self, advice: Advice) -> str:
+        """What to type."""
+        if self.is_own:
+            line = f"set={json.dumps({advice.key: advice.value})}"
+            tuning = f'fl.tune(LOG, {{"{self.label}": ...}}, "{advice.free}")'
+        else:
+            quoted = f"'{advice.setting}'" if set(advice.setting) & set(" $&;()") else advice.setting
+            line = f"--set {quoted}"
+            tuning = f"fuselog tune LOG -e {self.label} --free {advice.free}"
+        instead = tuning if advice.free else advice.otherwise
+        return f"{line}, or {instead}" if instead else line
+
+
+def rounded(value: float) -> float:
+    """A number in three digits, as a setting states it."""
+    return float(f"{value:.3g}")
+
+
+def precise(value: float) -> float:
+    """A number in four digits, as a setting of a topic states it."""
+    return float(f"{value:.4g}")

@@ -1,0 +1,211 @@
+"""Altering: advice that can be run, on any log, the same everywhere; what makes no sense is refused."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.altering import alterations as put
+from pipeline.altering.sources import alter
+from recorders.log.streams import concatenate
+from recorders.parameters import parse_settings
+from tests.pipeline.test_python import robot
+
+Fuselog = Callable[..., Any]
+ODOMETRY, PRIOR, SEEN = "/robot1/odometry", "/robot1/prior", "/robot1/range_bearing"
+OPEN = {"gate_probability": 1.0}
+
+
+@pytest.fixture(scope="module")
+def run() -> fl.MemorySource:
+    """A robot for half a minute, without a fault; its odometry is so good that stamps matter."""
+    exact = {"rate_hz": 5.0, "maximum_range_m": 60.0}
+    noise = {"forward_noise_density": 0.002, "turn_noise_density": 0.001}
+    return fl.record("landmarks", seed=5, duration_s=60.0, speed_mps=2.0, **noise, range_bearing=exact)
+
+
+def nis(log: fl.MemorySource, **settings: Any) -> tuple[float, float, float]:
+    """NIS per component, and the interval of a consistent filter."""
+    metrics = fl.replay(log, "ekf", set={**OPEN, **settings}, metrics="innovation").metrics
+    [row] = metrics.query("quantity == 'nis_per_component'").to_dict("records")
+    return row["value"], row["low"], row["high"]
+
+
+def drifting(stream: fl.Stream, rate: float) -> fl.Stream:
+    first_ns = int(stream.publish_time_ns[0])
+    return put.drifted(first_ns, 2**62)(stream, rate)
+
+
+@pytest.mark.parametrize(
+    ("topic", "fault", "by", "undone"),
+    [
+        (SEEN, put.shifted("range_m"), 0.2, "bias_range_m"),
+        (SEEN, put.delayed(0, 2**62), 0.3, f"{SEEN}.delay_s"),
+        (SEEN, drifting, 2e-3, f"{SEEN}.clock_gain"),
+        ("/landmarks", put.renumbered("landmark_id", 3, 9), 0.0, "/landmarks.exchanged"),
+        (PRIOR, put.shifted("mean", 2), 2.0, f"{PRIOR}.heading_bias"),
+    ],
+)
+def test_what_a_diagnosis_says_to_set_makes_the_filter_consistent(
+    run: fl.MemorySource, topic: str, fault: put.Alteration, by: float, undone: str
+) -> None:
+    faulty = put.altered(run, topic, fault, by)
+    value, _, high = nis(faulty)
+    assert value > high
+    told = fl.diagnose(faulty, "ekf", set=OPEN).sentences[0]
+    assert told.setting.partition("=")[0] == undone
+    assert f"; try --set {told.setting}" in told.words
+    value, low, high = nis(faulty, **parse_settings([told.setting]))
+    assert low < value < high
+
+
+@pytest.mark.parametrize(
+    ("topic", "fault", "by", "setting", "undoes"),
+    [
+        (ODOMETRY, put.scaled("turn_radps"), -1.0, "turn_scale", -1),
+        (ODOMETRY, put.scaled("turn_radps"), 180.0 / np.pi, "turn_radps_scale", "0.0174532925"),
+        (ODOMETRY, put.scaled("forward_mps"), 3.6, "forward_scale", 0.27777778),
+        (SEEN, put.shifted("bearing_rad"), np.pi / 40, "bearing_bias", "4.5 deg"),
+        (SEEN, put.delayed(0, 2**62), 18.0, "delay_s", "18000 ms"),
+        ("/landmarks", put.turned("position_m"), np.pi / 2, "position_turn", "90 deg"),
+        ("/landmarks", put.shifted("position_m", 0), 7.0, "position_x_bias", "700 cm"),
+        ("/landmarks", put.shifted("position_m", 1), 7.0, "origin", "0, -7"),
+    ],
+)
+def test_units_signs_axes_and_clocks_are_mended_as_people_write_them(
+    run: fl.MemorySource, topic: str, fault: put.Alteration, by: float, setting: str, undoes: object
+) -> None:
+    faulty = put.altered(run, topic, fault, by)
+    assert nis(faulty)[0] > nis(run)[2]
+    assert nis(faulty, **{f"{topic}.{setting}": undoes}) == pytest.approx(nis(run), rel=1e-5)
+
+
+def test_covariances_of_fixes_are_scaled() -> None:
+    """Stated 4 times too large, and mended by what the diagnosis says."""
+    run = fl.record("landmarks", seed=3, duration_s=120.0, fix={"rate_hz": 5.0})
+    fix = "/robot1/fix"
+    faulty = put.altered(run, fix, put.spread("covariance_m2"), np.log(2.0))
+    told = fl.diagnose(faulty, "ekf", set=OPEN).sentences[0]
+    key, _, advised = told.setting.partition("=")
+    assert key == f"{fix}.covariance_scale"
+    assert float(advised) == pytest.approx(0.25, rel=0.15)
+    value, low, _ = nis(faulty)
+    assert value < low
+    value, low, high = nis(faulty, **{key: advised})
+    assert low < value < high
+
+
+def test_a_log_is_altered_block_by_block_as_a_recording_is(tmp_path: Path, run: fl.MemorySource) -> None:
+    """Stamps that move by more than a block, in spans: no message is lost, twice or out of turn."""
+    fl.write(tmp_path / "run.mcap", run)
+    settings = {f"{SEEN}.delay_s": "7.25 s", f"{ODOMETRY}.clock_gain": 0.05, f"{SEEN}.range_bias": 0.2}
+    topics = [SEEN, ODOMETRY, "/robot1/truth"]
+    log, memory = alter(fl.open(tmp_path / "run.mcap"), settings), alter(run, settings)
+    for span_s in ((None, None), (5.0, None), (10.0, 20.0)):
+        begin_ns, end_ns = (
+            None if time_s is None else run.epoch_ns + round(time_s * 1e9) for time_s in span_s
+        )
+        blocks = list(replace(log, start_ns=begin_ns, end_ns=end_ns).blocks(topics, "publish_time", 50))
+        spans = [
+            (
+                min(stream.publish_time_ns[0] for stream in block.values()),
+                max(stream.publish_time_ns[-1] for stream in block.values()),
+            )
+            for block in blocks
+        ]
+        assert all(before[1] < after[0] for before, after in pairwise(spans))
+        [whole] = replace(memory, start_ns=begin_ns, end_ns=end_ns).blocks(topics, "publish_time", 50)
+        for topic in topics:
+            found = concatenate([block[topic] for block in blocks if topic in block])
+            assert np.array_equal(found.publish_time_ns, whole[topic].publish_time_ns)
+            for name, column in whole[topic].columns.items():
+                assert np.array_equal(found[name], column, equal_nan=True)
+
+
+def test_every_command_alters_alike_and_says_so(
+    tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog
+) -> None:
+    log, estimates = tmp_path / "run.mcap", tmp_path / "est.mcap"
+    fl.write(log, put.altered(run, SEEN, put.shifted("range_m"), 0.2))
+    key = f"{SEEN}.range_bias"
+    mend = ["-e", "ekf", "--set", f"{key}=.2"]
+    told = fuselog("replay", log, *mend, "-o", estimates, "--json").json["metrics"]
+    stated = fl.open(estimates).run.notes["alterations"]  # type: ignore[union-attr]
+    assert json.loads(stated) == {key: 0.2}
+    in_python = fl.replay(log, "ekf", set={key: 0.2})
+    clean = fl.replay(run, "ekf").metrics.query("quantity == 'nis_per_component'")["value"].tolist()
+    assert clean == pytest.approx([told["ekf.nis_per_component.robot1"]], rel=1e-9)
+    rows = in_python.metrics.query("quantity == 'nis_per_component'")["value"].tolist()
+    assert rows == [told["ekf.nis_per_component.robot1"]]
+    judged = fuselog("evaluate", estimates, "--out", tmp_path / "judged", "--json").json["metrics"]
+    same = [name for name in judged if judged[name] == pytest.approx(told.get(name), rel=1e-9)]
+    assert "ekf.nees.robot1" in same
+    tuned = ["--free", "sigma_range_m", "--out", tmp_path / "tuned"]
+    for command in (
+        ["run", log, *mend, "--out", tmp_path / "ran"],
+        ["tune", log, *mend, *tuned],
+        ["diagnose", log, *mend, "--out", tmp_path / "diagnosed"],
+        ["compare", log, *mend, "-e", "ukf"],
+    ):
+        assert fuselog(*command).code == 0
+    for folder in ("ran", "tuned", "diagnosed", "judged"):
+        stated = json.loads((tmp_path / folder / "result.json").read_text(encoding="utf-8"))
+        assert stated["settings"]["alterations"] == {key: 0.2}
+    ran = json.loads((tmp_path / "ran" / "result.json").read_text(encoding="utf-8"))["metrics"]
+    assert ran["ekf.nis_per_component.robot1"] == told["ekf.nis_per_component.robot1"]
+    assert "nothing found" in fuselog("diagnose", estimates).out
+    golden = tmp_path / "ran.golden.xz"
+    assert fuselog("check", tmp_path / "ran", "--against", golden, "--update").code == 0
+    notes = fuselog("compare", tmp_path / "ran", tmp_path / "ran", "--json").json["notes"]
+    assert not any("without other metrics" in note for note in notes)  # it was replayed as it ran
+    swept = ["--over", f"{key}=0,.2", "--out", tmp_path / "swept"]
+    at = fuselog("sweep", log, "-e", "ekf", *swept, "--json").json["metrics"]
+    assert at["ekf.nis_per_component.robot1"][1] == told["ekf.nis_per_component.robot1"]
+
+
+def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySource) -> None:
+    """No command knows its name; and what is set already is counted in."""
+    faulty = put.altered(run, SEEN, put.delayed(0, 2**62), 0.3)
+    mine = {"mine": fl.modelled(robot(), "ekf")}
+    before = {f"{SEEN}.delay_s": 0.1}
+    told = fl.diagnose(faulty, mine, set={**OPEN, **before}).sentences[0]
+    found = re.search(r"try set=(\{.*\})", told.words)
+    assert found is not None
+    settings = json.loads(found[1])
+    assert settings == {f"{SEEN}.delay_s": pytest.approx(0.3, abs=0.01)}
+    assert fl.diagnose(faulty, mine, set={**OPEN, **settings}).sentences == []
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("/robot1/fix.delay_s=1", "has no topic /robot1/fix; did you mean"),
+        (f"{SEEN}=1", "expected /TOPIC.WHAT=VALUE, such as /fix.delay_s=0.3"),
+        (f"{SEEN}.delay=soon", "expected seconds, such as 0.3 or 300 ms"),
+        (f"{SEEN}.delay_s=3 kg", "no unit 'kg'"),
+        (f"{SEEN}.delay_s=3 m", "the unit 'm' does not fit"),
+        (f"{SEEN}.speed_scale=2", "has no field speed; there are: range_m, bearing_rad"),
+        (f"{SEEN}.range_scale=inf", "expected a factor, such as -1 or 3.6"),
+        (f"{SEEN}.range_sign=2", "of a topic can be set"),
+        (f"{SEEN}.origin=1,2", "only positions and geodetic fixes have an origin"),
+        (f"{SEEN}.exchanged={ODOMETRY}", "only topics of one type are exchanged"),
+        ("/landmarks.exchanged=3", "expected two numbers, such as 3,9, or another topic"),
+        ("/landmarks.origin=here", "expected a place in m, such as -0.65,0.3"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_a_sentence(
+    tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog, setting: str, said: str
+) -> None:
+    log = tmp_path / "run.mcap"
+    fl.write(log, run)
+    told = fuselog("replay", log, "-e", "ekf", "--set", setting)
+    assert told.code == 2
+    assert said in " ".join(told.err.split())
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
