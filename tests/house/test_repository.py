@@ -19,7 +19,7 @@ def test_the_picture_of_the_house_is_what_is_checked() -> None:
     """Rooms in the order of import-linter's contracts, and every room that there is."""
     (picture,) = re.findall(r"```\n(fuselog .*?)```", CONTRIBUTING, re.DOTALL)
     shown = re.findall(r"^ *(\w+)", picture, re.MULTILINE)
-    outer, inner, _ = PYPROJECT["tool"]["importlinter"]["contracts"]
+    outer, inner, *_ = PYPROJECT["tool"]["importlinter"]["contracts"]
     rooms = [room for layer in inner["layers"] for room in layer.split(" | ")]
     assert shown == [
         each for top in outer["layers"] for each in [top, *(rooms if top == "replay" else [])]
