@@ -1,1 +1,4 @@
-"""Altering: topics of a run with a fault undone, or put in, at the source of any replay."""
+"""Alters topics of a run at the source of any replay: a fault is undone, or put in.
+
+Begin with `sources`.
+"""

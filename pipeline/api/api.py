@@ -24,11 +24,11 @@ from pipeline.runs.executors import PoolFactory, pool_for
 from pipeline.runs.experiment import (
     Experiment,
     Stated,
-    load_scenario,
     read_experiment,
     require_campaign,
     run_experiment,
 )
+from pipeline.runs.inputs import load_scenario
 from pipeline.runs.sweeps import Over, Sampling, nested, over_of, points_of, run_sweep
 from recorders.errors import BadInput, UnknownName, choices
 from recorders.log import Stream, write_log

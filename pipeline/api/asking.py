@@ -12,13 +12,8 @@ from pipeline.altering.changes import WHATS, is_of_topic
 from pipeline.api.catalog import Entry, rows_of, stated_of
 from pipeline.logs.constraints import ConstraintParameters
 from pipeline.output.terminal import print_table
-from pipeline.runs.experiment import (
-    Experiment,
-    Study,
-    experiment_of_logs,
-    load_scenario,
-    read_experiment,
-)
+from pipeline.runs.experiment import Experiment, Study, experiment_of_logs, read_experiment
+from pipeline.runs.inputs import load_scenario
 from pipeline.runs.settings import read_settings
 from recorders.errors import BadInput, choices
 from recorders.log import open_log

@@ -9,7 +9,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.output.terminal import print_json, print_table, say
-from pipeline.runs.experiment import Experiment, Study, load_scenario, shipped
+from pipeline.runs.experiment import Experiment, Study
+from pipeline.runs.inputs import load_scenario, shipped
 from recorders.errors import BadInput, choices
 from recorders.parameters import build, describe, explain
 from recorders.parsing import read_toml

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from pipeline.api.replays import replay
 from pipeline.output.terminal import print_json, print_table, say
 from pipeline.runs.executors import inline_pool, processes
-from pipeline.runs.experiment import load_scenario, shipped
+from pipeline.runs.inputs import load_scenario, shipped
 from recorders.errors import BadInput, choices
 from recorders.recording import Importer, Recorder, record_run
 from recorders.registry import available, load

@@ -19,11 +19,7 @@ import pandas as pd
 
 from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Kind as Kind
-from pipeline.api.planning import Log as Log
-from pipeline.api.planning import plan_replay
-from pipeline.api.planning import settings_of as settings_of
-from pipeline.api.planning import sources_of as sources_of
+from pipeline.api.planning import Kind, Log, plan_replay
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder

@@ -43,7 +43,7 @@ def record(
     """Simulate SCENARIO, a name or a TOML file, and write its log."""
     from pipeline.command_line.commands import companions_if
     from pipeline.output.outputs import RECORDED, check_files
-    from pipeline.runs.experiment import load_scenario
+    from pipeline.runs.inputs import load_scenario
     from recorders.log import open_log, write_log
     from recorders.parameters import merge, parse_settings
     from recorders.recording import record_run

@@ -20,8 +20,9 @@ from pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
 from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
 from pipeline.runs.ensemble import Progress, judge_logs, parts_of
 from pipeline.runs.estimates import source_of_estimates, stated_estimators
-from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.initial_states import check_same_run
+from pipeline.runs.inputs import load_scenario
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log

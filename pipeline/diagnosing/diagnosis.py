@@ -16,8 +16,9 @@ import pandas as pd
 
 from pipeline.altering.sources import alterations_of, setting_of, split_settings
 from pipeline.api.api import ResultFolder
-from pipeline.api.replays import Kind as EstimatorKind
-from pipeline.api.replays import Log, Replay, replay, settings_of, sources_of
+from pipeline.api.planning import Kind as EstimatorKind
+from pipeline.api.planning import Log, settings_of, sources_of
+from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
 from pipeline.diagnosing.consistency import unnamed, unseen_errors

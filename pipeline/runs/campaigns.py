@@ -24,8 +24,8 @@ from typing import Any, NamedTuple
 from pipeline.runs.checkpoints import Checkpoints
 from pipeline.runs.ensemble import Pass, parts_of
 from pipeline.runs.executors import PoolFactory, WorkerPool, inline_pool, states_of, version_of_code
-from pipeline.runs.experiment import Experiment, Setting, load_scenario
-from pipeline.runs.inputs import Logs, Record
+from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.inputs import Logs, Record, load_scenario
 from pipeline.runs.recorded import KEPT_BYTES, require_memory
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput

@@ -4,7 +4,6 @@ import os
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
 
@@ -16,18 +15,16 @@ from pipeline.output.results import Outcome, Result, plain, result_folder, write
 from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import PoolFactory
-from pipeline.runs.inputs import Import, Logs, Record
+from pipeline.runs.inputs import Import, Logs, Record, load_scenario, shipped
 from pipeline.runs.settings import parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
 from recorders.parsing import read_toml
 from recorders.recording import Recorder
-from recorders.registry import available, foreign_code, load
+from recorders.registry import foreign_code, load
 from replay.engine.replaying.estimator import configure
 from replay.engine.replaying.late import parse_late
 from replay.judging.metrics.measuring import find_metrics
-
-SHIPPED = resources.files("fuselog_data")
 
 
 class Experiment(Parameters):
@@ -165,12 +162,6 @@ class Study:
     is_campaign: bool = False
 
 
-def shipped(kind: str) -> dict[str, Path]:
-    """The TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
-    with resources.as_file(SHIPPED / kind) as folder:
-        return {path.stem: path for path in sorted(folder.glob("*.toml"))}
-
-
 class Stated(NamedTuple):
     """Holds what an experiment is before settings go over it.
 
@@ -300,27 +291,6 @@ def _parameters_of_source(experiment: Experiment) -> tuple[str, set[str]]:
         return "", set()
     fields = load("recorders", recorder, Recorder).parameters.model_fields
     return part, {field.alias or name for name, field in fields.items()}
-
-
-def load_scenario(name: str) -> tuple[str, dict[str, Any], str]:
-    """A scenario by its registered name, its shipped file or a TOML file: recorder, parameters, label.
-
-    A scenario file has `recorder` and a table `parameters`.
-    """
-    files, recorders = shipped("scenarios"), available("recorders")
-    if name in recorders:
-        return name, {}, name
-    if not name.endswith(".toml") and name not in files:
-        known = [*recorders, *files]
-        raise BadInput(f"no scenario '{name}', nor is it a .toml file; {choices(name, known)}")
-    path = files.get(name, Path(name))
-    values = read_toml(path)
-    recorder, parameters = values.get("recorder"), values.get("parameters", {})
-    if not isinstance(recorder, str) or not isinstance(parameters, dict):
-        raise BadInput(
-            f'{path}: a scenario file needs recorder = "NAME" and a [parameters] table; add them'
-        )
-    return recorder, parameters, path.stem
 
 
 def numbers_of(experiment: Experiment, options: Parameters) -> dict[str, float]:

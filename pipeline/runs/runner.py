@@ -14,8 +14,9 @@ from pipeline.altering.sources import alter
 from pipeline.output.results import ErrorTables
 from pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
 from pipeline.runs.estimates import hash_files, hash_streams
-from pipeline.runs.experiment import Experiment, Setting, load_scenario
+from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.initial_states import order_of
+from pipeline.runs.inputs import load_scenario
 from pipeline.runs.recorded import Replayed, record_ensemble, replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, open_log

@@ -6,7 +6,8 @@ from pathlib import Path
 import click
 
 from pipeline.command_line import main as fuselog
-from pipeline.runs.experiment import load_experiment, shipped
+from pipeline.runs.experiment import load_experiment
+from pipeline.runs.inputs import shipped
 from recorders.errors import choices
 from tests.claims import pages
 from tests.goldens.recipes import DATA, data_option, importer_of, unpack

@@ -26,7 +26,8 @@ from typing import Any, get_args
 from pipeline.api.catalog import scenarios
 from pipeline.output.claims import Verdict
 from pipeline.output.results import MetricValue, Result, read_result
-from pipeline.runs.experiment import load_experiment, shipped
+from pipeline.runs.experiment import load_experiment
+from pipeline.runs.inputs import shipped
 from recorders.importers.tables.mapping import read_mapping
 from recorders.importers.tables.mapping import shipped as shipped_mappings
 

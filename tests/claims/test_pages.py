@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.output.claims import Claim, decide, known
 from pipeline.output.results import Outcome, result_folder, write_outcome
-from pipeline.runs.experiment import Study, load_experiment, numbers_of, shipped
+from pipeline.runs.experiment import Study, load_experiment, numbers_of
+from pipeline.runs.inputs import shipped
 from recorders.importers.tables.mapping import shipped as shipped_mappings
 from recorders.parameters import build
 from recorders.registry import load

@@ -13,7 +13,7 @@ from PIL import Image
 from pipeline.api.api import record
 from pipeline.api.replays import replay
 from pipeline.diagnosing.diagnosis import diagnose
-from pipeline.runs.experiment import shipped
+from pipeline.runs.inputs import shipped
 from recorders.errors import choices
 from replay.timeline.viewer import screenshot
 from tests.docs.gallery import DOCS

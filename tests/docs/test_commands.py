@@ -9,7 +9,7 @@ import click
 import pytest
 
 from pipeline.command_line import fuselog
-from pipeline.runs.experiment import shipped
+from pipeline.runs.inputs import shipped
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

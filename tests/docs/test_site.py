@@ -12,7 +12,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from pipeline.runs.experiment import shipped
+from pipeline.runs.inputs import shipped
 from tests.docs import gallery, hooks, notebooks, reference
 
 ROOT = Path(__file__).parents[2]

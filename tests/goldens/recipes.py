@@ -14,7 +14,8 @@ from typing import Any
 import click
 import numpy as np
 
-from pipeline.runs.experiment import Experiment, load_experiment, load_scenario, shipped
+from pipeline.runs.experiment import Experiment, load_experiment
+from pipeline.runs.inputs import load_scenario, shipped
 from pipeline.studies.optical.moving import unknowns
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run

@@ -256,7 +256,7 @@ def test_models_are_listed_with_the_methods_that_estimate_them(fuselog: Fuselog)
         }
         for row in fuselog("models", "--json").json
     }
-    methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "smoother", "imm", "particles", "bound")
+    methods = ("ekf", "iekf", "ukf", "lrkf", "analytic", "sqrt", "smoother", "imm", "particles", "bound")
     no_angle = "no: it lacks an angle or an orientation in its state, across which to cut its prior"
     assert listed["vehicle"] == {**dict.fromkeys(methods, "yes"), "bank": no_angle}
     assert listed["robot"]["bank"] == "yes"

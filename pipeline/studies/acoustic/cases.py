@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field, PositiveFloat, model_validator
 
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, load_scenario
-from pipeline.runs.inputs import Record
+from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.inputs import Record, load_scenario
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import Floats, by_repetition, errors_named, root_mean_square
 from recorders.models.acoustic import local_estimate_covariances, range_from_time_difference

@@ -16,7 +16,8 @@ from pydantic import PositiveInt
 
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
-from pipeline.runs.experiment import Experiment, Setting, Study, load_scenario
+from pipeline.runs.experiment import Experiment, Setting, Study
+from pipeline.runs.inputs import load_scenario
 from pipeline.runs.recorded import Replayed
 from pipeline.runs.runner import Runner
 from pipeline.studies.toolkit.repetitions import mean_interval, require_spread, rmse_of_runs
