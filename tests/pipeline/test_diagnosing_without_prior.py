@@ -41,7 +41,7 @@ def test_a_covariance_stated_wrongly_is_named_with_its_factor(
     """The factor is told to .036, the sheet's standard deviation of its logarithm."""
     found = fl.diagnose(car(2000, stated), "ekf").sentences[0]
     assert (found.kind, found.topic) == ("measurement noise", "/car/fix")
-    assert found.words.endswith("where the log is written")
+    assert found.setting.startswith("/car/fix.covariance_scale=")
     assert f"so that R is too {size}" in found.words
     assert found.cause is not None
     low, high = np.exp(np.abs(found.cause.ends))
@@ -94,12 +94,13 @@ def test_a_number_at_the_end_of_its_search_is_no_cause() -> None:
 
 
 def test_a_gate_that_is_set_is_no_advice() -> None:
-    for probability, mend in ((1.0, "--set gate_probability=0.999"), (0.999, "")):
+    for probability, setting in ((1.0, "gate_probability=0.999"), (0.999, None)):
         given = {"kind": "ekf", "gate_probability": probability}
         base = Trial(car(2000), given)
-        tried = hypotheses("ekf", bind("ekf", [base.source], given), base, {})
+        tried = hypotheses(bind("ekf", [base.source], given), base, {})
         [outliers] = [each for each in tried if each.kind == "outliers"]
-        assert outliers.mend(1.0) == mend
+        mend = outliers.mend(1.0)
+        assert (mend.setting if mend else None) == setting
 
 
 def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
