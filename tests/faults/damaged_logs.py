@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import LogWriter, RunMetadata, Stream, open_log, read_streams
+from recorders.log import LogWriter, RunMetadata, Stream, loops, open_log, read_streams
 from tests.faults import Tally
 from tests.recorders.log_samples import some_streams
 
@@ -45,6 +45,7 @@ def tally(
     with tempfile.TemporaryDirectory(prefix="fuselog-faults-") as folder:
         path = Path(folder, "run.mcap")
         samples = {each: sample(path, each, int(rng.integers(1 << 32))) for each in COMPRESSIONS}
+        _read_once(path, samples["zstd"])
         while time.monotonic() < end and tried != most:
             compression = COMPRESSIONS[tried % len(COMPRESSIONS)]
             whole = samples[compression]
@@ -57,6 +58,14 @@ def tally(
                     break
             tried += 1
     return Tally(tried, tried - len(notes), notes)
+
+
+def _read_once(path: Path, whole: Sample) -> None:
+    """Read with numba's loops, which a megabyte brings in, so that their import counts for no log."""
+    loops._left["plain"] = 0
+    path.write_bytes(whole.raw[:-100])
+    log = open_log(path, recover=True)
+    read_streams(log, list(log.topics), order="log_time")
 
 
 def sample(path: Path, compression: str, seed: int) -> Sample:
