@@ -66,7 +66,7 @@ def test_from_the_bag_to_a_picture(
     bag = str(real_data / "nav2_turtlebot.mcap")
     assert fuselog("import", "ros", bag, "-o", str(log)).code == 0
     said = fuselog("info", str(log), "--all").out
-    assert "robot: -e ekf iekf ukf lrkf smoother bank particles; from /odometry, /pose" in said
+    assert "robot: -e ekf iekf ukf lrkf sqrt smoother bank particles; from /odometry, /pose" in said
     assert "vehicle: needs prior (fuselog.GaussianEstimate) of x_m, vx_mps, y_m, vy_mps; fix" in said
     shorter = fuselog("info", str(log)).out
     assert "robot: -e" in shorter
