@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.sources import setting_of
 from pipeline.api.trajectories import ComparedLogs, compare_logs
 from pipeline.output.coverage import recounted
 from pipeline.output.outputs import check_folder
@@ -108,6 +109,7 @@ def judge_estimates(
                 "estimators": estimators,
                 "gap_limit_s": gap_limit_s,
                 "metrics": list(metrics),
+                **setting_of(sources[0]),
                 **comparison,
             }
             outcome = summarise(judge, coverage)

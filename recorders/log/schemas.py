@@ -85,7 +85,7 @@ class Schema:
                 declared.oneof_decl.add(name=f"_{field.name}")
         return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
 
-    @cached_property
+    @property
     def message_class(self) -> type[message.Message]:
         """The protobuf class of this message, as any other program would build it from a file."""
         return message_class(self.descriptor_set, self.full_name)

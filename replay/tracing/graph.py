@@ -8,6 +8,7 @@ something costs nothing.
 import math
 import operator
 from collections.abc import Iterable, Iterator
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -185,11 +186,14 @@ def needed(outputs: Iterable[Node]) -> list[Node]:
 
 
 def described(outputs: Iterable[Node]) -> Iterator[str]:
-    """Words that are the same for the same graph, whatever else was traced with it."""
+    """Yield words that are the same for the same graph, whatever else was traced before or with it."""
     outputs = list(outputs)
-    places: dict[Node, int] = {}
+    words: dict[Node, str] = {}
     for node in needed(outputs):
-        places[node] = len(places)
         name = node.operation if isinstance(node.operation, str) else node.operation.__name__
-        yield f"{name} {[places[each] for each in node.arguments]} {node.value!r}"
-    yield str([places[each] for each in outputs])
+        parts = [words[each] for each in node.arguments]
+        if node.operation in _COMMUTATIVE:
+            parts.sort()
+        said = f"{name} {' '.join(parts)} {node.value!r}"
+        words[node] = blake2b(said.encode(), digest_size=16).hexdigest()
+    yield from (words[each] for each in outputs)

@@ -26,7 +26,7 @@ from radio import BeaconsParameters, LocateParameters, SIGNAL_STRENGTH, locate, 
 def make(solve):
     return batch(
         "raises", parameters=LocateParameters, streams={"signal_strength": SIGNAL_STRENGTH},
-        whole={"/landmarks": schemas.LANDMARK}, components={"x_m": "linear", "y_m": "linear"},
+        static={"/landmarks": schemas.LANDMARK}, components={"x_m": "linear", "y_m": "linear"},
         truth="truth", solve=each_run(solve),
     )
 
@@ -59,10 +59,10 @@ def _blocks(language: str) -> list[str]:
 def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page's package as pip would install it, in a folder to work in."""
     folder = tmp_path_factory.mktemp("radio")
-    project, experiment = _blocks("toml")
+    project, *experiment = _blocks("toml")
     stated = tomllib.loads(project)["project"]
     (folder / "radio.py").write_text("\n\n".join(_blocks("python")))
-    (folder / "radio.toml").write_text(experiment)
+    (folder / "radio.toml").write_text("\n".join(experiment))
     (folder / "broken.py").write_text(BROKEN)
     groups = stated["entry-points"]
     groups["fuselog.estimators"] |= {

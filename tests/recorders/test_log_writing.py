@@ -1,5 +1,6 @@
 """A log appears whole or not at all, and what cannot be kept is refused with a sentence."""
 
+import pickle
 import signal
 import subprocess
 import sys
@@ -258,3 +259,9 @@ def test_two_schemas_of_one_name_keep_their_own_fields(tmp_path):
     found = read_streams(open_log(tmp_path / "run.mcap"), ["/one", "/two"])
     for stream in written:
         assert_same(found[stream.topic], stream)
+
+
+def test_a_schema_goes_to_workers_also_after_its_messages_were_decoded() -> None:
+    """Its protobuf class is no part of what is pickled, for no other process could find that by name."""
+    assert schemas.LANDMARK.message_class().DESCRIPTOR.full_name == "fuselog.Landmark"
+    assert pickle.loads(pickle.dumps(schemas.LANDMARK)) == schemas.LANDMARK
