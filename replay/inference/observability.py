@@ -26,7 +26,15 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import Method, MethodParameters
 from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.steps import NOTHING_MEASURED, InnovationRecord, Steps, Workspace, workspace
+from replay.inference.kalman.steps import (
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Interval,
+    Measurement,
+    Steps,
+    Workspace,
+    workspace,
+)
 from replay.inference.kalman.update import (
     innovation_components,
     reading,
@@ -102,15 +110,8 @@ def _carried_by_motion(stage: Stage) -> Function:
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     subtract, flat, carry = boxminus(model.kinds), is_flat(model.kinds), carrying(model.kinds)
 
-    def predict(
-        run: int,
-        belief: Gramian,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        event: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(run: int, belief: Gramian, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, event = interval
         trajectory, transition = work.samples[0], belief.transition[run]
         node = trajectory.node[event]
         linearise(
@@ -132,15 +133,9 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
     linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
 
     def update(
-        run: int,
-        belief: Gramian,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        event: int,
-        work: Workspace,
-        record: InnovationRecord,
+        run: int, belief: Gramian, measurement: Measurement, work: Workspace, record: InnovationRecord
     ) -> int:
+        data, parameters, _, event = measurement
         trajectory, innovation = work.samples[0], work.innovations[number]
         cross = innovation.cross_covariance
         linearise(

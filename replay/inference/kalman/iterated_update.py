@@ -10,6 +10,7 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Measurement,
     Workspace,
 )
 from replay.inference.kalman.update import (
@@ -70,13 +71,11 @@ def iterated_update(stage: Stage, number: int) -> Function:
     def update(
         mean: Floats,
         covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         work: Workspace,
         record: InnovationRecord,
     ) -> int:
+        data, parameters, gate, _ = measurement
         present = 0
         for i in range(m):
             present += not np.isnan(data[i])

@@ -11,6 +11,7 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Measurement,
 )
 from replay.inference.kalman.update import reading, sensor_noise, write_numbers, writing_innovation
 from replay.inference.linear_algebra.gaussian import (
@@ -46,13 +47,11 @@ def weighing(stage: Stage, number: int) -> Function:
     def update(
         run: int,
         cloud: Cloud,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         memory: ParticleMemory,
         record: InnovationRecord,
     ) -> int:
+        data, parameters, gate, _ = measurement
         present = 0
         for j in range(m):
             present += not np.isnan(data[j])

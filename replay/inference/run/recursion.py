@@ -22,6 +22,8 @@ from replay.inference.kalman.steps import (
     NOTHING_MEASURED,
     UNKNOWN,
     InnovationRecord,
+    Interval,
+    Measurement,
     Steps,
 )
 from replay.inference.linear_algebra.tuples import range_of
@@ -191,8 +193,8 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
             for k in range(controls):
                 control[k] = 0.5 * (control[k] + events.data[event, first + k])
-        parameters = settings_of(settings, 0)
-        return predict(run, carried.belief, control, duration_s, parameters, event, memory)
+        interval = Interval(control, duration_s, settings_of(settings, 0), event)
+        return predict(run, carried.belief, interval, memory)
 
     def process(
         run: int,
@@ -229,7 +231,8 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             parameters = settings_of(settings, source + 1)
             waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
-            outcome = update(source, run, carried.belief, data, parameters, gate, event, memory, record)
+            measurement = Measurement(data, parameters, gate, event)
+            outcome = update(source, run, carried.belief, measurement, memory, record)
             if outcome >= 0:
                 return outcome
             if outcome == ALL_WELL:

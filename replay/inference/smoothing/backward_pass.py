@@ -20,7 +20,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.kalman.steps import InnovationRecord, Steps
+from replay.inference.kalman.steps import InnovationRecord, Interval, Measurement, Steps
 from replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
     multiply,
@@ -92,21 +92,13 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
     retrace, to_covariance = steps.form.retrace, steps.form.to_covariance
     find_slope = sloping(model.kinds, model.correct, steps.form)
 
-    def predict(
-        run: int,
-        belief: Chain,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memory: ForwardMemory,
-    ) -> bool:
+    def predict(run: int, belief: Chain, interval: Interval, memory: ForwardMemory) -> bool:
         rest, turned, product = memory.rest, memory.turned, memory.product
         mean, covariance = belief.mean[run], belief.covariance[run]
         for row in range(t):
             for column in range(t):
                 rest[row, column] = covariance[row, column]
-        if not predict_filter(run, belief, control, duration_s, parameters, sample_index, memory.filter):
+        if not predict_filter(run, belief, interval, memory.filter):
             return False
         if not retrace(rest, covariance, memory.filter, turned, memory.factor):
             return False
@@ -144,14 +136,11 @@ def _with_memory(update: Function) -> Function:
     def update_filter(
         run: int,
         belief: Chain,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         memory: ForwardMemory,
         record: InnovationRecord,
     ) -> int:
-        return update(run, belief, data, parameters, gate, sample_index, memory.filter, record)
+        return update(run, belief, measurement, memory.filter, record)
 
     return update_filter
 
