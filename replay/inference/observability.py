@@ -49,7 +49,14 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
 from replay.inference.run.filtering import FilterState
-from replay.inference.run.recursion import Estimates, filled, no_results, recursion
+from replay.inference.run.recursion import (
+    Estimates,
+    RunInputs,
+    RunResults,
+    filled,
+    no_results,
+    recursion,
+)
 from replay.inference.smoothing.affine import carrying
 from replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
 
@@ -260,7 +267,8 @@ class Observability(IteratedSmoother):
         def memory() -> Any:
             return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))
 
-        loop(runs, events, settings, self.gates, carried, found, innovations, scratch=memory)
+        inputs, results = RunInputs(events, settings, self.gates), RunResults(found, innovations)
+        loop(runs, inputs, carried, results, scratch=memory)
         return filled(found, due)
 
 

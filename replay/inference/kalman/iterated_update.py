@@ -14,6 +14,7 @@ from replay.inference.kalman.steps import (
     Workspace,
 )
 from replay.inference.kalman.update import (
+    is_unmeasured,
     linear_innovation,
     reading,
     sensor_derivative,
@@ -76,10 +77,7 @@ def iterated_update(stage: Stage, number: int) -> Function:
         record: InnovationRecord,
     ) -> int:
         data, parameters, gate, _ = measurement
-        present = 0
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         innovation, step, factor = work.innovations[number], work.step, 1.0
         find_slope(mean, covariance, work.slope)

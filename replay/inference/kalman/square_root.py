@@ -32,6 +32,7 @@ from replay.inference.kalman.steps import (
     Workspace,
 )
 from replay.inference.kalman.update import (
+    is_unmeasured,
     reading,
     sensor_derivative,
     sensor_noise,
@@ -187,11 +188,9 @@ def _updating(
         count = len(work.samples[samples].offsets) if samples >= 0 else t
         rows, weights = np.zeros((m + t, count + m)), np.zeros(count + m)
         noise, found = np.zeros((m, m)), np.zeros((m + t, m + t))
-        innovation, size, present = work.innovations[number], 0, 0
+        innovation, size = work.innovations[number], 0
         difference, own_spread, _ = innovation
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         state, given = read_state(mean), (read_reference(data), parameters)
         spread(state, factor, given, event, work, (rows, weights))

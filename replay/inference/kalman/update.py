@@ -213,6 +213,14 @@ def writing_innovation(stage: Stage, number: int) -> Function:
     return write_innovation
 
 
+def is_unmeasured(data: Floats, components: int) -> bool:
+    """Tell whether a message has none of these components, which stand first in its data."""
+    measured = 0
+    for i in range(components):
+        measured += not np.isnan(data[i])
+    return measured == 0
+
+
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
@@ -248,10 +256,7 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
         record: InnovationRecord,
     ) -> int:
         data, parameters, gate, _ = measurement
-        present = 0
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         innovation = work.innovations[number]
         if not innovate(mean, covariance, measurement, work):

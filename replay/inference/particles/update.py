@@ -13,7 +13,13 @@ from replay.inference.kalman.steps import (
     InnovationRecord,
     Measurement,
 )
-from replay.inference.kalman.update import reading, sensor_noise, write_numbers, writing_innovation
+from replay.inference.kalman.update import (
+    is_unmeasured,
+    reading,
+    sensor_noise,
+    write_numbers,
+    writing_innovation,
+)
 from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     cholesky,
@@ -52,10 +58,7 @@ def weighing(stage: Stage, number: int) -> Function:
         record: InnovationRecord,
     ) -> int:
         data, parameters, gate, _ = measurement
-        present = 0
-        for j in range(m):
-            present += not np.isnan(data[j])
-        if present == 0:
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         weight, own = cloud.weight[run], memory.sensors[number]
         compare(cloud.states[run], data, parameters, memory)

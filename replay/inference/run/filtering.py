@@ -31,6 +31,8 @@ from replay.inference.run.recursion import (
     FilterEvents,
     Innovations,
     RecursionState,
+    RunInputs,
+    RunResults,
     filled,
     no_results,
     recursion,
@@ -309,12 +311,16 @@ class Filter:
         for part, sets in self.sets(generators, events):
             loop(
                 part.stop - part.start,
-                events._replace(offsets=events.offsets[part.start : part.stop + 1]),
-                settings[part],
-                self.gates,
+                RunInputs(
+                    events._replace(offsets=events.offsets[part.start : part.stop + 1]),
+                    settings[part],
+                    self.gates,
+                ),
                 of_runs(carried, part),
-                estimates._replace(end=estimates.end[part]),
-                innovations._replace(end=innovations.end[part]),
+                RunResults(
+                    estimates._replace(end=estimates.end[part]),
+                    innovations._replace(end=innovations.end[part]),
+                ),
                 scratch=partial(steps.memory, sets),
             )
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []

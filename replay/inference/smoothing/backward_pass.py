@@ -71,6 +71,13 @@ class Nodes(NamedTuple):
     rest: Floats
 
 
+class Piece(NamedTuple):
+    """Holds nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+
+    nodes: Nodes
+    offsets: Integers
+
+
 class ForwardMemory(NamedTuple):
     """Holds what the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
 
@@ -183,6 +190,18 @@ class Later(NamedTuple):
     nodes: Nodes
 
 
+class Smoothed(NamedTuple):
+    """Holds what smoothing fills in: the nodes of run r before row stop[r], from row start[r] on.
+
+    Each comes back from the last node within the lag.
+    """
+
+    stop: Integers
+    start: Integers
+    lag_ns: int
+    estimates: Estimates
+
+
 class BackMemory(NamedTuple):
     """Holds what the backward pass of one core works in: a Gaussian, its gain, and a step's vectors."""
 
@@ -235,21 +254,10 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
             work.mean[row] = mean[row]
         move(work.mean, work.covariance, work)
 
-    def smooth(
-        run: int,
-        nodes: Nodes,
-        offsets: Integers,
-        stop: Integers,
-        lag_ns: int,
-        later: Later,
-        start: Integers,
-        smoothed: Estimates,
-        work: BackMemory,
-    ) -> None:
-        """Smooth the nodes of a piece that lie before row stop[run], into the rows from start[run] on.
-
-        Each comes back from the last node within the lag; `later` then holds the first of them.
-        """
+    def smooth(run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory) -> None:
+        """Smooth the nodes of a piece; `later` then holds the first of them."""
+        nodes, offsets = piece
+        stop, start, lag_ns, estimates = smoothed
         begin, through, reached = offsets[run], offsets[run + 1] - 1, -1
         at = through
         for row in range(stop[run] - 1, begin - 1, -1):
@@ -266,8 +274,8 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
                 go_back(nodes.mean[at - 1], nodes.covariance[at - 1], nodes, at, work)
                 at -= 1
             place = start[run] + row - begin
-            smoothed.time_ns[place] = nodes.time_ns[row]
-            copy_gaussian(work.mean, work.covariance, smoothed.mean[place], smoothed.covariance[place])
+            estimates.time_ns[place] = nodes.time_ns[row]
+            copy_gaussian(work.mean, work.covariance, estimates.mean[place], estimates.covariance[place])
         if stop[run] > begin:
             later.is_there[run] = True
             first = later.nodes
