@@ -16,7 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.output.claims import Claim
+from pipeline.output.claims import NO_VERDICT, Claim
 from pipeline.output.results import Bounds, Measured, MetricValue, metric_tables
 from recorders.errors import printable
 
@@ -177,7 +177,13 @@ def print_parameters(
 
 
 def print_claims(claims: Sequence[Claim]) -> None:
-    """Claims, each with what the paper says and what we found."""
+    """Claims, each with what the paper says and what we found; before them those that go undecided."""
+    elsewhere = sum(claim.verdict == NO_VERDICT for claim in claims)
+    if elsewhere:
+        say(
+            f"{elsewhere} of {len(claims)} claims are made of another recording than these data: their "
+            "numbers follow, and no verdict"
+        )
     for claim in claims:
         say(f"{claim.verdict}: {claim.claim}")
         say(f"  paper: {claim.paper}; ours: {claim.ours}" + (f"; {claim.why}" if claim.why else ""))
