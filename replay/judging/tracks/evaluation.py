@@ -18,7 +18,6 @@ from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import split_topic
 from replay.judging.metrics.measuring import Metric
-from replay.judging.tracks.distances import hota, idf1
 from replay.judging.tracks.errors import (
     BURN_IN_S,
     CUTOFF_M,
@@ -130,6 +129,8 @@ class Followed:
     @property
     def figures(self) -> dict[str, float]:
         """What the tracks are worth, at the instants told of; {} where there are none, or no target."""
+        from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
+
         begin = self.first or 0
         truths = self.targets.truths[:, begin : begin + len(self.told)]
         if not self.told or not np.isfinite(truths).any():
