@@ -42,10 +42,13 @@ from replay.judging.metrics.metrics import covered, estimated_share
 from replay.judging.metrics.quantities import Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
+from replay.judging.tracks.errors import Judged as Targets
+from replay.judging.tracks.evaluation import targets_of, track_blocks
 
 if TYPE_CHECKING:
     import pandas as pd
 
+TRACK = schemas.TRACK_ESTIMATE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
@@ -118,6 +121,7 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
+        self._targets: list[Targets | None] | None = None
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
         self._burn_in_s = burn_in_s
@@ -157,6 +161,11 @@ class Judge:
         for topic, sets in found.items():
             judged.sets.append(sets)
             self._measured.add(topic, sets)
+        if any(rows.stream.schema.full_name == TRACK for rows in outputs.values()):
+            if self._targets is None:
+                self._targets = [targets_of(source) for source in self._sources]
+            for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
+                self._measured.add(topic, tracks)
         return judged
 
     def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
@@ -210,7 +219,7 @@ class Judge:
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._on_errors = (), [], None
+        self._sources, self._truths, self._targets, self._on_errors = (), [], None, None
         self._steps.clear()
         for each in self._quantities.values():
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
