@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from pipeline.command_line.help import command
-from pipeline.command_line.options import ANY_PATH, COUNT, LOG, foxglove_option, set_option
+from pipeline.command_line.options import ANY_PATH, COUNT, LOG, PLACE, foxglove_option, set_option
 from recorders.errors import BadInput, printable
 
 
@@ -89,6 +89,12 @@ def record(
     "without it, import table lists these.",
 )
 @click.option(
+    "--origin",
+    type=PLACE,
+    metavar="LATITUDE,LONGITUDE[,HEIGHT]",
+    help="For ROS and tables: the origin of the plane that positions are in, in deg and m.",
+)
+@click.option(
     "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
 )
 @set_option("recorder")
@@ -98,6 +104,7 @@ def import_(
     out: Path | None,
     clock: str | None,
     mapping: str | None,
+    origin: list[float] | None,
     guess: bool,
     settings: tuple[str, ...],
 ) -> None:
@@ -122,7 +129,7 @@ def import_(
     target = out or Path(f"{source}.mcap")
     check_files([(target, imported(source))], {"data": paths})
     more = [str(path) for path in paths[1:]]
-    chosen = {"clock": clock, "mapping": mapping, "more": more or None}
+    chosen = {"clock": clock, "mapping": mapping, "origin": origin, "more": more or None}
     given = {name: value for name, value in chosen.items() if value is not None}
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
     for subject, fact in metadata.notes.items():
