@@ -10,8 +10,10 @@ from pipeline.output.terminal import (
     print_claims,
     print_json,
     print_metrics,
+    print_others,
     print_parameters,
     print_table,
+    print_worst,
     progress,
     say,
 )
@@ -64,7 +66,9 @@ def run_named(
         print_parameters(result.settings["parameters"])
         say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
     runs = done.folder / RUNS
+    print_worst(result.alarms)
     print_metrics(result.metrics, result.bounds, read_table(runs) if runs.is_file() else None)
+    print_others(result.alarms)
     print_claims(result.claims)
     say(f"{done.folder}: {', '.join(result.contents)}")
 
