@@ -11,8 +11,10 @@ from pipeline.output.terminal import (
     print_claims,
     print_json,
     print_metrics,
+    print_others,
     print_parameters,
     print_table,
+    print_worst,
     progress,
     say,
 )
@@ -72,8 +74,10 @@ def run_named(
     details = done.folder / (
         "tables/summary.csv" if "tables/summary.csv" in result.files else RESULT_FILE
     )
+    print_worst(result.alarms)
     table = read_table(runs) if runs.is_file() else None
     print_metrics(result.metrics, result.bounds, table, str(details))
+    print_others(result.alarms)
     print_claims(result.claims)
     say(f"{done.folder}: {', '.join(result.contents)}")
 
