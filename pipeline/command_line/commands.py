@@ -98,7 +98,9 @@ def replay_logs(
         "coverage": [row._asdict() for row in done.coverage],
     }
     unused = sentences(done.coverage)
-    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told, unused=unused)
+    _print_outcome(
+        done.judge, list(estimators), as_json=as_json, written=paths, told=told, unused=unused
+    )
 
 
 def companions_if(foxglove: bool) -> Companions | None:
