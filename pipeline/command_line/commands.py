@@ -102,7 +102,15 @@ def replay_logs(
     }
     alarms = alarms_of(done.judge, done.parameters, done.coverage)
     unused = sentences(done.coverage)
-    _print_outcome(done.judge, names, alarms, as_json=as_json, written=paths, told=told, unused=unused)
+    _print_outcome(
+        done.judge,
+        list(estimators),
+        alarms,
+        as_json=as_json,
+        written=paths,
+        told=told,
+        unused=unused,
+    )
 
 
 def companions_if(foxglove: bool) -> Companions | None:

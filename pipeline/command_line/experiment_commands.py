@@ -23,6 +23,7 @@ from pipeline.runs.settings import read_settings
 from pipeline.runs.sweeps import DRAWN, Sampling, parse_over
 from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
+from replay.foreign.naming import allowed
 
 
 def run_named(
@@ -96,7 +97,7 @@ def _stated_experiment(
     if not files and (len(named) > 1 or labels):
         raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
     stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
-    values = merge(read_settings(settings_file, stated.labels), parse_settings(settings))
+    values = merge(read_settings(settings_file, stated.labels), allowed(parse_settings(settings)))
     files = [*stated.files, *filter(None, [settings_file])]
     return stated._replace(files=files), {**values, **over}
 
