@@ -1,4 +1,4 @@
-"""What a filter breaks, it breaks for its own run: the others are judged, and nothing is left running."""
+"""What a filter breaks it breaks for its own run: the others are judged, and nothing is left running."""
 
 import os
 import time
