@@ -18,6 +18,7 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
     Errors,
     Innovations,
@@ -40,7 +41,7 @@ from replay.judging.metrics.measuring import (
     metric_key,
     plus,
 )
-from replay.judging.metrics.metrics import covered, estimated_share
+from replay.judging.metrics.metrics import covered, estimated_share, innovation_sums
 from replay.judging.metrics.quantities import Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
@@ -107,6 +108,8 @@ class Judge:
         first_run: the number of the first run in the whole ensemble.
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
+
+    `innovations` are their sums by topic, see `innovation_sums`.
     """
 
     def __init__(
@@ -134,7 +137,7 @@ class Judge:
         self._diagnostics: dict[str, StreamDiagnostics] = {}
         self._unjudged: dict[str, str] = {}
         self._first_fixes: dict[str, list[Origin | None]] = {}
-        self._degrees: Counter[str] = Counter()
+        self.innovations: dict[str, Sums] = {}
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -150,7 +153,9 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
-                self._degrees[topic] += int(innovations.degrees.sum())
+                self.innovations[topic] = plus(
+                    self.innovations.get(topic, {}), innovation_sums(innovations)
+                )
                 self._measured.add(topic, innovations)
             self._listen(topic, rows)
             named = (*split_topic(topic), topic.rpartition("/")[2])
@@ -202,6 +207,7 @@ class Judge:
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
         kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
+        kept.constant.add(errors)
 
     def _listen(self, topic: str, rows: Ragged) -> None:
         """Take in what a stream says of the replay itself."""
@@ -242,7 +248,8 @@ class Judge:
         self._doubts = other.doubts | self.doubts
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
-        self._degrees.update(other._degrees)
+        for topic, sums in other.innovations.items():
+            self.innovations[topic] = plus(self.innovations.get(topic, {}), sums)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -279,13 +286,19 @@ class Judge:
                 if runs and size:
                     key = metric_key(errors.estimator, name, errors.case)
                     found[key] = chi_square_interval(size, runs, probability)
-        for topic, degrees in self._degrees.items():
-            if degrees:
+        for topic, sums in self.innovations.items():
+            if degrees := sums["degrees"]:
                 low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
                 found[key] = low / degrees, high / degrees
         return {key: found[key] for key in self.metrics if key in found}
+
+    @property
+    def constants(self) -> dict[tuple[str, str], Constant]:
+        """Return by estimator and case the errors that stay, see `ConstantSums`."""
+        found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
+        return {what: each for what, each in found.items() if each is not None}
 
     @property
     def has_numbers(self) -> bool:
