@@ -28,6 +28,7 @@ from pipeline.diagnosing.findings import (
     of_estimates,
     of_innovations,
     of_messages,
+    of_plausibility,
 )
 from pipeline.diagnosing.hypotheses import Kind, hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
@@ -293,16 +294,20 @@ def diagnose(
         )
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
     sentences = [_sentence(each, trying) for each in causes]
+    implausible = list(of_plausibility(source, streamed, [each.setting for each in sentences]))
+    known = [(each.kind, each.topic) for each in implausible]
+    of_log = of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns)
     has_outliers = any(each.kind == "outliers" for each in sentences)
+    sentences = [*(Sentence(*each[:4], None, each.setting) for each in implausible), *sentences]
     findings: list[Finding] = [
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
-        *of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns),
+        *(each for each in of_log if (each.kind, each.topic) not in known),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(unseen_errors(done, label) if not causes else []),
     ]
-    if not causes and not findings:
+    if not sentences and not findings:
         findings += unnamed(done, innovations, tried)
-    sentences += [Sentence(*each) for each in findings]
+    sentences += [Sentence(*each[:4], None, each.setting) for each in findings]
     return Diagnosis(
         label,
         done,
