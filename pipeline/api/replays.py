@@ -20,7 +20,8 @@ import pandas as pd
 from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Kind, Log, plan_replay
-from pipeline.output.alarms import Alarm, alarms_of
+from pipeline.output.alarm import Alarm
+from pipeline.output.alarms import alarms_of
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder

@@ -5,11 +5,11 @@ limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error tha
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from pipeline.output.alarm import Alarm
 from replay.distributions import chi2
 from replay.engine.replaying.usage import SILENT, UNTAKEN, Row
 from replay.judging.consistency.consistency import CONSISTENT
@@ -22,25 +22,6 @@ USUAL_GATE = 0.99  # where it is not known
 RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
 LARGEST = 1e300  # as JSON has no infinity
 UNUSED = 0.05  # of a topic's messages
-Kind = Literal["innovations", "errors", "origin", "lever arm", "minimum", "unused", "gates"]
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """One of them.
-
-    Attributes:
-        kind: what it is about.
-        estimator, case: whose; empty where it is of several.
-        excess: how many times a number is beyond what a consistent filter leaves; worse ones are larger.
-        words: the sentence.
-    """
-
-    kind: Kind
-    estimator: str
-    case: str
-    excess: float
-    words: str
 
 
 def alarms_of(
