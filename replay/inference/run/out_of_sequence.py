@@ -54,7 +54,7 @@ from replay.sampling.sets import sets_by_runs
 class Repeats(NamedTuple):
     """Holds how many updates each event had repeated (n,), and the row that each run is at (runs,)."""
 
-    count: Integers
+    updates: Integers
     row: Integers
 
 
@@ -173,7 +173,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
                 break
             begin = insert(run, event, events, history, capacity)
             last = run * capacity + history.first[run] + history.counts[run] - 1
-            repeats.count[event] = last - begin
+            repeats.updates[event] = last - begin
             restore(kept.after, begin - 1, carried, run)
             failure = ALL_WELL
             for row in range(begin, last + 1):

@@ -29,13 +29,14 @@ from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
+    Piece,
     Smoothed,
     back_memory,
     no_later,
     smoothing_steps,
 )
 from replay.inference.smoothing.gauss_newton import Ended, Plan, SearchState, searching
-from replay.inference.smoothing.smoothers import Piece, Smoother, SmootherParameters
+from replay.inference.smoothing.smoothers import Smoother, SmootherParameters
 
 
 class IteratedParameters(SmootherParameters):
