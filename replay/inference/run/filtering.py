@@ -1,13 +1,14 @@
 """Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.log import Topic, schemas
+from recorders.log.planes import FRAME
 from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
@@ -374,6 +375,8 @@ class Filter:
             estimates.mean,
             estimates.covariance,
         )
+        if self.found.frame:
+            stream = replace(stream, metadata={**stream.metadata, FRAME: self.found.frame})
         return Ragged(stream, offsets)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
