@@ -33,16 +33,19 @@ from replay.estimators.models.landmarks import LANDMARKS, POSE
 from replay.estimators.networks.covariance_intersection import Criterion
 from replay.estimators.networks.encounters import (
     RobotEvents,
+    RobotInputs,
     RobotMemory,
     RobotResults,
     RobotSettings,
     RobotStates,
     SightingFusion,
     cooperate,
+    write_pose,
 )
 from replay.inference.kalman.steps import FAILURES
 from replay.inference.linear_algebra.small_matrices import update_memory
 from replay.inference.run.events import Points, points_of
+from replay.inference.run.loops import over_events
 
 Mode = Literal["alone", "naive", "ci", "joint"]
 
@@ -110,7 +113,7 @@ def memory(states: int) -> RobotMemory:
 
 @cache
 def _compiled() -> Function:
-    return compile_over_runs(cooperate, allocates=False)
+    return compile_over_runs(over_events(cooperate, write_pose), allocates=False)
 
 
 Cooperating = Given[CooperativeParameters]
@@ -160,7 +163,8 @@ def advance(
     results = RobotResults(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
     fusion = SightingFusion(mode == "joint", mode == "ci", given.parameters.criterion == "trace")
     scratch = partial(memory, robots.mean.shape[1])
-    _compiled()(len(robots.mean), events, settings, fusion, robots, results, scratch=scratch)
+    inputs = RobotInputs(events, settings, fusion)
+    _compiled()(given.runs, inputs, robots, results, scratch=scratch)
     is_estimated = np.isfinite(results.mean[:, 0])
     made = [
         states_in(

@@ -30,9 +30,10 @@ from replay.estimators.networks.covariance_intersection import rule_number
 from replay.estimators.networks.nodes import (
     Activities,
     NodeFusion,
+    NodeInputs,
     NodeResults,
     Sensing,
-    follow,
+    following,
     node_memory,
 )
 
@@ -82,7 +83,7 @@ class NetworkParameters(Parameters):
 
 @cache
 def _compiled() -> Function:
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(following(), allocates=False)
 
 
 def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> NodeFusion:
@@ -138,14 +139,16 @@ def solve(given: Given[NetworkParameters]) -> list[Ragged]:
     most = 1 + int(np.diff(activities.received).max(initial=0))
     _compiled()(
         runs,
-        activities,
-        sensing,
-        prior_mean,
-        prior_covariance,
-        prior_ns,
-        _fusion(parameters, sensors, size),
-        results,
+        NodeInputs(
+            activities,
+            sensing,
+            _fusion(parameters, sensors, size),
+            prior_ns,
+            prior_mean,
+            prior_covariance,
+        ),
         failed_ns,
+        results,
         scratch=partial(node_memory, len(sensing.density), most, size),
     )
     well = np.full_like(failed_ns, ALL_WELL)

@@ -30,15 +30,18 @@ from replay.engine.vectors.components import Components
 from replay.estimators.tracking.phd_recursion import (
     STATES,
     Mixture,
+    PhdInputs,
     PhdMemory,
     PhdSettings,
     Scans,
     Sets,
-    follow,
+    extract,
+    process,
 )
 from replay.estimators.tracking.scans import by_scan
 from replay.inference.kalman.steps import FAILURES
 from replay.inference.linear_algebra.gaussian import no_innovation
+from replay.inference.run.loops import over_events
 
 Probability = Annotated[float, Field(gt=0, le=1)]
 
@@ -77,7 +80,7 @@ class PhdParameters(Parameters):
 
 @lru_cache(maxsize=1)
 def _compiled() -> Callable[..., None]:
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(over_events(process, extract), allocates=False)
 
 
 Filtering = Given[PhdParameters]
@@ -123,7 +126,8 @@ def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[
     runs, most = mixture.weight.shape
     sets = _no_sets(scans, mixture, settings)
     largest = int((scans.end - scans.first).max(initial=0))
-    _compiled()(runs, scans, mixture, settings, sets, scratch=partial(_work, most, largest))
+    inputs = PhdInputs(scans, settings)
+    _compiled()(runs, inputs, mixture, sets, scratch=partial(_work, most, largest))
     return mixture, sets
 
 

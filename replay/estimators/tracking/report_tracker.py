@@ -33,6 +33,7 @@ from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.estimators.tracking.report_association import (
     LEVELS,
+    ReportInputs,
     ReportMemory,
     ReportResults,
     Reports,
@@ -41,6 +42,7 @@ from replay.estimators.tracking.report_association import (
     track,
 )
 from replay.inference.association.clusters import Weights, memory_for
+from replay.inference.run.loops import over_stamps
 
 FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=LEVELS)]
 
@@ -79,7 +81,7 @@ class ReportTrackerParameters(Parameters):
 
 @lru_cache(maxsize=1)
 def _compiled() -> Callable[..., None]:
-    return compile_over_runs(track, allocates=False)
+    return compile_over_runs(over_stamps(track), allocates=False)
 
 
 Reporting = Given[ReportTrackerParameters]
@@ -100,7 +102,7 @@ def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, lis
     ends = np.flatnonzero(reports.is_last)
     together = int(np.diff(ends, prepend=-1).max(initial=1))
     memory = partial(_memory, together, tracks.number.shape[1])
-    _compiled()(given.runs, reports, tracks, settings, results, scratch=memory)
+    _compiled()(given.runs, ReportInputs(reports, settings), tracks, results, scratch=memory)
     stream = make_stream(
         f"/estimates/{given.name}/track",
         schemas.TRACK_ESTIMATE,
