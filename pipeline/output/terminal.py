@@ -18,6 +18,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from pipeline.output.alarms import Alarm
 from pipeline.output.claims import NO_VERDICT, Claim
 from pipeline.output.results import (
     Bounds,
@@ -46,6 +47,7 @@ def _console(*, stderr: bool) -> Console:
     return console
 
 
+MOST_ALARMS = 5  # that are printed
 out = _console(stderr=False)
 err = _console(stderr=True)
 
@@ -250,6 +252,20 @@ def print_parameters(
     print_table(["parameter", *parameters], rows)
     if stated and any(stated.values()):
         print_parameters({f"{label}, from the log": values for label, values in stated.items()})
+
+
+def print_worst(alarms: Sequence[Alarm]) -> None:
+    """The worst of what makes the numbers below doubtful."""
+    for alarm in alarms[:1]:
+        say(f"doubtful: {alarm.words}")
+
+
+def print_others(alarms: Sequence[Alarm]) -> None:
+    """A few of the others."""
+    for alarm in alarms[1:MOST_ALARMS]:
+        say(f"also doubtful: {alarm.words}")
+    if len(alarms) > MOST_ALARMS:
+        say(f"and {len(alarms) - MOST_ALARMS} more, which --json lists")
 
 
 def print_claims(claims: Sequence[Claim]) -> None:

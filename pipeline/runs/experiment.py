@@ -16,7 +16,7 @@ from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import PoolFactory
 from pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
-from pipeline.runs.settings import parameters_by_label
+from pipeline.runs.settings import named_by, parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
 from recorders.parsing import read_toml
@@ -24,6 +24,7 @@ from recorders.recording import Recorder
 from recorders.registry import foreign_code, load
 from replay.engine.replaying.estimator import configure
 from replay.engine.replaying.late import parse_late
+from replay.foreign.naming import allowed_in
 from replay.judging.metrics.measuring import find_metrics
 
 
@@ -192,11 +193,20 @@ class Stated(NamedTuple):
         """The labels of its estimators."""
         return self.with_settings({}, {}).estimators
 
+    @property
+    def _values(self) -> dict[str, Any]:
+        """Its entries; the programs that it names may be run."""
+        estimators = self.values.get("estimators")
+        if not isinstance(estimators, Mapping):
+            return dict(self.values)
+        return {**self.values, "estimators": allowed_in(estimators, self.folder)}
+
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
         """The experiment with settings and then `over` over it; see `load_experiment`."""
         where = f"experiment {self.source}"
-        own = _settings_of_experiment(build(Experiment, self.values, where), settings)
-        experiment = build(Experiment, {**merge(self.values, own), **over}, where)
+        values = self._values
+        own = _settings_of_experiment(build(Experiment, values, where), settings)
+        experiment = build(Experiment, {**merge(values, own), **over}, where)
         if experiment.claims_of:
             shared = read_experiment(experiment.claims_of).with_settings({}, {}).claims
             experiment = experiment.model_copy(update={"claims": [*shared, *experiment.claims]})
@@ -239,7 +249,7 @@ def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
     values = {
         "title": title,
         "logs": {"files": [str(log) for log in logs]},
-        "estimators": {label: {} for label in labels},
+        "estimators": named_by(labels),
     }
     return Stated(title, str(logs[0]), values, Path())
 
