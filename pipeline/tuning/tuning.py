@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.altering.sources import split_settings
-from pipeline.api.planning import Kind, Log, settings_of, sources_of
+from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
@@ -51,7 +51,7 @@ ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 9
 
 def tune(
     logs: Log | Iterable[Log],
-    estimator: str | Mapping[str, Kind],
+    estimator: Named,
     free: str | Sequence[str],
     *,
     by: By = "likelihood",

@@ -96,6 +96,7 @@ def modelled_by(
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
+        label=name,
     )
 
 

@@ -117,7 +117,8 @@ class Estimator(Generic[ParametersType]):
 
     `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
     for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
-    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets. `label` is what it is called
+    where it is given without one.
     """
 
     summary: str
@@ -125,6 +126,7 @@ class Estimator(Generic[ParametersType]):
     parameters: type[ParametersType]
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
     variant: str | None = None
+    label: str = "own"
 
     def __str__(self) -> str:
         return self.summary

@@ -71,7 +71,9 @@ class UnscentedParameters(MethodParameters):
     """Options of methods that may use the unscented transform.
 
     Attributes:
-        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter.
+        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf
+            has 0.5 unless its name says another, as in lrkf:ukf:kappa=0, so that all points weigh
+            alike; with the same kappa both give the same.
     """
 
     kappa: float = 0.0
