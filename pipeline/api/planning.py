@@ -19,6 +19,7 @@ from recorders.recording import Recording
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.replaying.late import Late
 from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.foreign.naming import allowed, shorthand
 from replay.inference.model.model import Model
 from replay.judging.metrics.measuring import find_metrics
 
@@ -109,7 +110,7 @@ def plan_replay(
     alterations, given = split_settings(set or {})
     settings = settings_of(estimators)
     if given:
-        settings = with_settings(settings, given)
+        settings = with_settings(settings, allowed(given))
     wanted = [metrics] if isinstance(metrics, str) else list(metrics or [])
     find_metrics(wanted)
     sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs, alterations)]
@@ -204,5 +205,5 @@ def settings_of(
 def _labelled(named: Named) -> Mapping[str, Kind]:
     """What stands under which label; a name and an estimator are labels of their own."""
     if isinstance(named, str):
-        return {named: {}}
-    return {named.label: named} if isinstance(named, Estimator) else named
+        return dict([shorthand(named)])
+    return {named.label: named} if isinstance(named, Estimator) else allowed(named)

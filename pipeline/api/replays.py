@@ -20,7 +20,8 @@ import pandas as pd
 from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Log, Named, plan_replay
-from pipeline.output.alarms import Alarm, alarms_of
+from pipeline.output.alarming import alarms_of
+from pipeline.output.alarms import Alarm
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder

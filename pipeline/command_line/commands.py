@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.api.planning import plan_replay
-from pipeline.output.alarms import Alarm, alarms_of
+from pipeline.output.alarming import alarms_of
+from pipeline.output.alarms import Alarm
 from pipeline.output.coverage import sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files
 from pipeline.output.results import (
@@ -102,7 +103,15 @@ def replay_logs(
     }
     alarms = alarms_of(done.judge, done.parameters, done.coverage)
     unused = sentences(done.coverage)
-    _print_outcome(done.judge, names, alarms, as_json=as_json, written=paths, told=told, unused=unused)
+    _print_outcome(
+        done.judge,
+        list(estimators),
+        alarms,
+        as_json=as_json,
+        written=paths,
+        told=told,
+        unused=unused,
+    )
 
 
 def companions_if(foxglove: bool) -> Companions | None:
