@@ -74,6 +74,8 @@ class Recursive:
             where its parameters do not let it.
         initialization: how it finds what a log does not state; None where that states all.
         assumed: the parameters that are assumed, since the log does not state them.
+        is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
+            parameters.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Recursive:
     out_of_sequence: "Callable[[int], Recursive] | None" = None
     initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
+    is_random: bool = False
 
 
 @renamed(whole="static")

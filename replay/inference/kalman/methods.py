@@ -112,6 +112,7 @@ class Method:
             BadInput where they name none.
         filtering: what goes through a log, where that is no `replay.inference.run.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
+        is_random: whether it draws random numbers, beside those of its samples.
     """
 
     summary: str
@@ -123,6 +124,7 @@ class Method:
     made_for: Callable[[Any], "Method"] | None = None
     filtering: Callable[..., Any] | None = None
     takes_all_modes: bool = False
+    is_random: bool = False
 
 
 def _iterated(stage: Stage) -> Steps:
