@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
-from pipeline.output.alarm import Alarm
+from pipeline.output.alarms import Alarm
 from pipeline.output.charts import Chart, draw
 from pipeline.output.claims import Claim, known
 from recorders.atomic import whole_folder

@@ -18,7 +18,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.output.alarm import Alarm
+from pipeline.output.alarms import Alarm
 from pipeline.output.claims import NO_VERDICT, Claim
 from pipeline.output.results import (
     Bounds,
