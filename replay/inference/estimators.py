@@ -23,7 +23,7 @@ from replay.inference.model.augmentation import (
     estimated,
     with_gauss_markov,
 )
-from replay.inference.model.binding import in_its_plane, roles_of, topics_of
+from replay.inference.model.binding import in_its_plane, offers_of, roles_of, topics_of
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
@@ -275,7 +275,8 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, initialization=initialization, assumed=assumed)
+        offers = offers_of(model, found, topics)
+        made = replace(made, initialization=initialization, assumed=assumed, offers=offers)
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 

@@ -74,6 +74,7 @@ class Recursive:
             where its parameters do not let it.
         initialization: how it finds what a log does not state; None where that states all.
         assumed: the parameters that are assumed, since the log does not state them.
+        offers: by topic that it does not take, the setting with which it would.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Recursive:
     out_of_sequence: "Callable[[int], Recursive] | None" = None
     initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
+    offers: Mapping[str, str] = field(default_factory=dict)
 
 
 @renamed(whole="static")

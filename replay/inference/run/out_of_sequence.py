@@ -233,7 +233,7 @@ class OutOfSequenceFilter:
         loop(
             runs,
             events,
-            np.repeat(inner.settings[None], runs, axis=0),
+            inner.settings_of_runs(state.context, runs),
             inner.gates,
             self.window_ns,
             carried,

@@ -213,7 +213,7 @@ class IteratedSmoother(Smoother):
             )
             return steps.memory((own,)), back_memory(t, t)
 
-        settings = np.repeat(self.settings[None], runs, axis=0)
+        settings = self.settings_of_runs(state.context, runs)
         gates = np.full_like(self.gates, np.inf)
         loop(
             runs, events, settings, gates, plan, carried, vectors, offsets, innovations, later,
