@@ -73,8 +73,11 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """A sentence for what was mended in a trajectory."""
-        return [*self.estimate.notes, *self.truth.notes]
+        """A sentence for what was mended in a trajectory, and where no time offset helps."""
+        sought = self.comparison.time_offset_s == "estimate"
+        in_vain = "no time offset makes the error smaller; none was added"
+        told = [in_vain] if sought and not self.compared.time_offset_s else []
+        return [*self.estimate.notes, *self.truth.notes, *told]
 
     @property
     def poses(self) -> pd.DataFrame:

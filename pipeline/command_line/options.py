@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from replay.foreign.naming import allow_programs_of_files
+
 
 class Output(click.Path):
     """Declares what a command writes, by which the audit of outputs in tests finds it.
@@ -84,13 +86,32 @@ GOLDEN, JUNIT = map(OutputFile, (".xz", ".xml"))
 ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
-settings_option = click.option(
-    "--settings",
-    "settings_file",
-    type=ANY_PATH,
-    metavar="FILE",
-    help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides it.",
-)
+
+
+def settings_option(function: Callable[..., None]) -> Callable[..., None]:
+    """The option --settings, and that on programs which files such as that one name."""
+
+    def allow(context: click.Context, parameter: click.Parameter, value: bool) -> None:  # noqa: ARG001
+        allow_programs_of_files(value)
+
+    file = click.option(
+        "--settings",
+        "settings_file",
+        type=ANY_PATH,
+        metavar="FILE",
+        help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides "
+        "it.",
+    )
+    programs = click.option(
+        "--allow-programs",
+        is_flag=True,
+        expose_value=False,
+        callback=allow,
+        help="Also run programs (lib:, exec:) that a golden, a result or a settings file names.",
+    )
+    return file(programs(function))
+
+
 errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )

@@ -112,8 +112,11 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
+    from pipeline.logs.information import worst
     from pipeline.output.outputs import check_files, imported
+    from recorders.log import open_log
     from recorders.parameters import parse_settings
+    from recorders.plausibility.checks import findings_of
     from recorders.recording import import_log
 
     if guess:
@@ -132,6 +135,8 @@ def import_(
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
+    for sentence in worst(findings_of(open_log(target)), target):
+        click.echo(printable(sentence))
 
 
 def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:

@@ -4,9 +4,7 @@ What it keeps are sums: of every metric, by step over the runs, and for each run
 not grow with the length of a log, except by two numbers for each step of NEES.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,6 +16,8 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.diagnostics import StreamDiagnostics
+from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
     Errors,
     Innovations,
@@ -40,14 +40,17 @@ from replay.judging.metrics.measuring import (
     metric_key,
     plus,
 )
-from replay.judging.metrics.metrics import covered, estimated_share
+from replay.judging.metrics.metrics import covered, estimated_share, innovation_sums
 from replay.judging.metrics.quantities import Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
+from replay.judging.tracks.errors import Judged as Targets
+from replay.judging.tracks.evaluation import targets_of, track_blocks
 
 if TYPE_CHECKING:
     import pandas as pd
 
+TRACK = schemas.TRACK_ESTIMATE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
@@ -74,26 +77,6 @@ class Judged(NamedTuple):
     innovations: list[Innovations]
 
 
-@dataclass
-class StreamDiagnostics:
-    """Collects what a stream says of the replay itself, for sentences."""
-
-    failed: dict[int, str] = field(default_factory=dict)
-    speaking: set[int] | None = None
-    skipped: Counter[str] = field(default_factory=Counter)
-    started: Counter[str] = field(default_factory=Counter)
-    covered: Sums = field(default_factory=dict)
-
-    def merge(self, other: "StreamDiagnostics") -> None:
-        """Take in what was said of other runs."""
-        self.failed |= other.failed
-        self.skipped.update(other.skipped)
-        self.started.update(other.started)
-        if other.speaking is not None:
-            self.speaking = other.speaking | (self.speaking or set())
-        self.covered = plus(self.covered, other.covered)
-
-
 class Judge:
     """Judges an ensemble, or a part of one, as its replay goes on.
 
@@ -104,6 +87,8 @@ class Judge:
         first_run: the number of the first run in the whole ensemble.
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
+
+    `innovations` are their sums by topic, see `innovation_sums`.
     """
 
     def __init__(
@@ -120,6 +105,7 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
+        self._targets: list[Targets | None] | None = None
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
         self._burn_in_s = burn_in_s
@@ -130,7 +116,7 @@ class Judge:
         self._diagnostics: dict[str, StreamDiagnostics] = {}
         self._unjudged: dict[str, str] = {}
         self._first_fixes: dict[str, list[Origin | None]] = {}
-        self._degrees: Counter[str] = Counter()
+        self.innovations: dict[str, Sums] = {}
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -146,7 +132,9 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
-                self._degrees[topic] += int(innovations.degrees.sum())
+                self.innovations[topic] = plus(
+                    self.innovations.get(topic, {}), innovation_sums(innovations)
+                )
                 self._measured.add(topic, innovations)
             self._listen(topic, rows)
             named = (*split_topic(topic), topic.rpartition("/")[2])
@@ -161,6 +149,11 @@ class Judge:
         for topic, sets in found.items():
             judged.sets.append(sets)
             self._measured.add(topic, sets)
+        if any(rows.stream.schema.full_name == TRACK for rows in outputs.values()):
+            if self._targets is None:
+                self._targets = [targets_of(source) for source in self._sources]
+            for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
+                self._measured.add(topic, tracks)
         return judged
 
     def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
@@ -193,6 +186,7 @@ class Judge:
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
         kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
+        kept.constant.add(errors)
 
     def _listen(self, topic: str, rows: Ragged) -> None:
         """Take in what a stream says of the replay itself."""
@@ -221,7 +215,7 @@ class Judge:
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._on_errors = (), [], None
+        self._sources, self._truths, self._targets, self._on_errors = (), [], None, None
         self._steps.clear()
         for each in self._quantities.values():
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
@@ -233,7 +227,8 @@ class Judge:
         self._doubts = other.doubts | self.doubts
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
-        self._degrees.update(other._degrees)
+        for topic, sums in other.innovations.items():
+            self.innovations[topic] = plus(self.innovations.get(topic, {}), sums)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -270,13 +265,19 @@ class Judge:
                 if runs and size:
                     key = metric_key(errors.estimator, name, errors.case)
                     found[key] = chi_square_interval(size, runs, probability)
-        for topic, degrees in self._degrees.items():
-            if degrees:
+        for topic, sums in self.innovations.items():
+            if degrees := sums["degrees"]:
                 low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
                 found[key] = low / degrees, high / degrees
         return {key: found[key] for key in self.metrics if key in found}
+
+    @property
+    def constants(self) -> dict[tuple[str, str], Constant]:
+        """Return by estimator and case the errors that stay, see `ConstantSums`."""
+        found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
+        return {what: each for what, each in found.items() if each is not None}
 
     @property
     def has_numbers(self) -> bool:

@@ -32,6 +32,8 @@ from replay.inference.run.recursion import (
     FilterEvents,
     Innovations,
     RecursionState,
+    RunInputs,
+    RunResults,
     filled,
     no_results,
     recursion,
@@ -312,16 +314,12 @@ class Filter:
         if any(each.redrawn for each in self.samplers):
             generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
         for part, sets in self.sets(generators, events):
-            loop(
-                part.stop - part.start,
-                events._replace(offsets=events.offsets[part.start : part.stop + 1]),
-                settings[part],
-                self.gates,
-                of_runs(carried, part),
-                estimates._replace(end=estimates.end[part]),
-                innovations._replace(end=innovations.end[part]),
-                scratch=partial(steps.memory, sets),
-            )
+            own = events._replace(offsets=events.offsets[part.start : part.stop + 1])
+            inputs = RunInputs(own, settings[part], self.gates)
+            ends = estimates.end[part], innovations.end[part]
+            results = RunResults(estimates._replace(end=ends[0]), innovations._replace(end=ends[1]))
+            memory = partial(steps.memory, sets)
+            loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=memory)
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES

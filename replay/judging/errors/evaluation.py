@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Stream
 from recorders.log.planes import Origin
+from recorders.models.orientation import heading
 from replay.distributions import chi2
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.planes import into_plane_of
@@ -40,7 +41,7 @@ from replay.judging.errors.planes import FirstFixes, planes_of, unlike
 from replay.judging.errors.truths import Truths
 
 Floats = NDArray[np.float64]
-POSITION = ("x_m", "y_m", "z_m")
+POSITION, HEADING = ("x_m", "y_m", "z_m"), "heading_rad"
 BOUND = "bound"  # in the metadata of what is no estimate, but what no estimator gets below
 
 
@@ -72,6 +73,7 @@ class Errors:
             known here.
         is_bound: whether these are no estimates, but what is known at the truth itself: the covariances
             are then what the squares of errors are at least.
+        heading_rad: (n,) the true heading; None where truth and estimate have none.
     """
 
     estimator: str
@@ -88,6 +90,7 @@ class Errors:
     without_truth: int
     components_without_truth: tuple[str, ...] = ()
     is_bound: bool = False
+    heading_rad: Floats | None = None
 
     @property
     def squared(self) -> Floats:
@@ -121,7 +124,9 @@ PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
     """Some rows of errors."""
-    return replace(errors, **{name: getattr(errors, name)[rows] for name in PER_ROW})
+    columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
+    heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
+    return replace(errors, **columns, heading_rad=heading_rad)
 
 
 class Innovations(NamedTuple):
@@ -257,7 +262,19 @@ def errors_of(
         int((~known).sum()),
         lacking,
         is_bound,
+        _heading_of(truth[known], judged),
     )
+
+
+def _heading_of(state: Floats, components: Components) -> Floats | None:
+    """The heading (n,) in a state (n, components); None where it has none."""
+    names, kinds = list(components), list(components.values())
+    if components.get(HEADING) == "angle":
+        return state[:, names.index(HEADING)]
+    if "quaternion" in kinds:
+        first = kinds.index("quaternion")
+        return heading(state[:, first : first + WIDTHS["quaternion"]])
+    return None
 
 
 def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
