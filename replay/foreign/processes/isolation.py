@@ -22,9 +22,9 @@ from replay.engine.compiling.compile import core_count
 from replay.engine.streams.blocks import copied
 from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
-from replay.foreign.following import Followed, followed, offsets_of, reason_of_code
+from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
+from replay.foreign.processes.tasks import LOADING, RunGiven, mapped
 from replay.foreign.results import begun
-from replay.foreign.tasks import LOADING, RunGiven, mapped
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
@@ -85,14 +85,13 @@ def _memory(process: psutil.Process) -> int:
 
 def end(process: "subprocess.Popen[bytes]") -> None:
     """End a process and all that it started."""
-    with suppress(psutil.Error):
-        for each in family(psutil.Process(process.pid)):
-            with suppress(psutil.Error):
-                each.kill()
-    with suppress(OSError):
-        process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout):
+    if process.poll() is None:  # else its number may be another's
+        with suppress(psutil.Error):
+            for each in family(psutil.Process(process.pid)):
+                with suppress(psutil.Error):
+                    each.kill()
+        process.wait()
+    for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
             with suppress(OSError):
                 stream.close()
@@ -110,10 +109,10 @@ class Worker:
     """Represents a process that takes runs through filters of libraries, one after another."""
 
     def __init__(self) -> None:
-        root = str(Path(__file__).parents[2])  # what we are imported from, whatever the folder is
+        root = str(Path(__file__).parents[3])  # what we are imported from, whatever the folder is
         paths = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "replay.foreign.worker"],
+            [sys.executable, "-P", "-m", "replay.foreign.processes.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from recorders.errors import BadInput
-from replay.foreign.library import Library
+from replay.foreign.native.library import Library
 
 
 def main() -> None:
@@ -52,7 +52,9 @@ def _describe(task: dict[str, Any]) -> dict[str, Any]:
 
 def _follow(task: dict[str, Any]) -> dict[str, Any]:
     """Take one run through its filter; see `isolation.Worker.follow`."""
-    from replay.foreign.tasks import follow_task  # NumPy and the compiler, which describing needs not
+    from replay.foreign.processes.tasks import (
+        follow_task,
+    )  # NumPy and the compiler, which describing needs not
 
     return follow_task(_library(task["library"]), Path(task["folder"]), task["parameters"], task["seed"])
 

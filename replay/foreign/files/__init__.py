@@ -1,0 +1,1 @@
+"""What programs that read a log are given, and what they write."""
