@@ -92,8 +92,8 @@ log, out, how, sigma = sys.argv[1:]
 if Path(log).is_dir():
     topics = {path.name for path in Path(log).iterdir()}
     assert "robot1-odometry.csv" in topics and not any("truth" in each for each in topics)
-    rows = np.genfromtxt(Path(log) / "robot1-odometry.csv", delimiter=",", names=True)
-    stamps = rows["time_ns"].astype(np.int64)
+    rows = np.genfromtxt(Path(log) / "robot1-odometry.csv", delimiter=",", names=True, dtype=None)
+    stamps = rows["time_ns"]
 else:
     with open(log, "rb") as file:
         found = [m.publish_time for _, c, m in make_reader(file).iter_messages(["/robot1/odometry"])]
@@ -104,7 +104,8 @@ if how == "csv":
     lines = [f"{t},{k},0,3.0,{variance},{variance},0.01,0.0" for k, t in enumerate(stamps)]
     Path(out).write_text("\\n".join([names, *lines]))
 elif how == "tum":
-    Path(out).write_text("\\n".join(f"{t // 10**9}.{t % 10**9:09d} {k} 0 0 0 0 0 1" for k, t in enumerate(stamps)))
+    lines = [f"{t // 10**9}.{t % 10**9:09d} {k} 0 0 0 0 0 1" for k, t in enumerate(stamps)]
+    Path(out).write_text("\\n".join(lines))
 elif how == "fail":
     sys.exit("no such road")
 elif how == "table":
