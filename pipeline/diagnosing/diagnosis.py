@@ -199,7 +199,8 @@ class Diagnosis:
         """
         place = Path(folder)
         check_folder(place, {"input": self.replay.paths})
-        outcome = summarise(self.replay.judge, self.replay.done.coverage)
+        done = self.replay.done
+        outcome = summarise(done.judge, done.coverage, done.parameters)
         outcome = replace_tables(outcome, {"diagnosis": self.causes, "components": self.components})
         outcome.figures |= self.profiles
         outcome.input_sha256 = self.replay.input_sha256

@@ -10,12 +10,12 @@ from typing import Annotated, Any, NamedTuple, Self
 from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
 from pipeline.altering.changes import is_of_topic
-from pipeline.output.claims import StatedClaim, decide, require_names
+from pipeline.output.claims import StatedClaim, decide, require_names, require_recordings
 from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
 from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import PoolFactory
-from pipeline.runs.inputs import Import, Logs, Record, load_scenario, shipped
+from pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
 from pipeline.runs.settings import named_by, parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
@@ -49,6 +49,7 @@ class Experiment(Parameters):
         arrival_order: whether messages are processed in the order in which they arrived.
         late: what becomes of late measurements, as `--late` of `fuselog replay` has it.
         options: the study's own.
+        recordings: which recordings claims are of, by name, where the runs are no simulated ones.
         claims: what is claimed of the metrics that it yields.
         claims_of: name of another experiment whose claims are tried first.
     """
@@ -68,6 +69,7 @@ class Experiment(Parameters):
     late: str | None = None
     options: dict[str, Any] = {}
     # what is claimed changes nothing in what is run, and a result has it with its verdict
+    recordings: Annotated[dict[str, Recording], Field(exclude=True)] = {}
     claims: Annotated[list[StatedClaim], Field(exclude=True)] = []
     claims_of: Annotated[str, Field(exclude=True)] = ""
 
@@ -98,6 +100,12 @@ class Experiment(Parameters):
         if (self.arrival_order or self.alterations) and self.study != "localization":
             which = "arrival_order, late and settings of topics"
             raise ValueError(f"study {self.study} replays in the order of the stamps; leave out {which}")
+        return self
+
+    @model_validator(mode="after")
+    def _has_the_recordings(self) -> Self:
+        if self.recordings and not (self.import_ or self.logs):
+            raise ValueError("recordings are what is imported or given as logs; leave out [recordings]")
         return self
 
     @property
@@ -262,6 +270,13 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
     return list(files)
 
 
+def _given(experiment: Experiment, data: Path | None) -> list[Path]:
+    """The files that an experiment imports, or among which those are, or the logs that it replays."""
+    if data is None or experiment.logs is not None:
+        return experiment.files
+    return sorted(path for path in data.rglob("*") if path.is_file()) if data.is_dir() else [data]
+
+
 def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Settings where they belong; raises BadInput where one belongs nowhere."""
     entries = {each.alias or name for name, each in Experiment.model_fields.items()}
@@ -347,8 +362,10 @@ def run_experiment(
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
     numbers = numbers_of(experiment, options)
     require_names(experiment.claims, numbers, f"experiment {name}")
+    require_recordings(experiment.claims, experiment.recordings, f"experiment {name}")
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
+    recordings = holding(experiment.recordings, _given(experiment, data), f"experiment {name}")
     with (
         checkpoints_of(folder) as checkpoints,
         result_folder(folder) as part,
@@ -370,7 +387,7 @@ def run_experiment(
         )
         outcome = study.run(experiment, setting)
         metrics = plain(outcome.metrics)
-        outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers)
+        outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers, recordings)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)

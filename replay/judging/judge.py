@@ -13,20 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import schemas
+from recorders.log.planes import Origin
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
     Errors,
     Innovations,
     chi_square_interval,
-    components_without_truth,
     errors_at,
     errors_of,
     innovations_of,
     split_topic,
+    unjudged_sentence,
 )
+from replay.judging.errors.planes import first_fixes
 from replay.judging.errors.truths import Doubt, Truths
 from replay.judging.metrics.means import MeansOfAll
 from replay.judging.metrics.measuring import (
@@ -38,14 +41,17 @@ from replay.judging.metrics.measuring import (
     metric_key,
     plus,
 )
-from replay.judging.metrics.metrics import covered, estimated_share
+from replay.judging.metrics.metrics import covered, estimated_share, innovation_sums
 from replay.judging.metrics.quantities import Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
+from replay.judging.tracks.errors import Judged as Targets
+from replay.judging.tracks.evaluation import targets_of, track_blocks
 
 if TYPE_CHECKING:
     import pandas as pd
 
+TRACK = schemas.TRACK_ESTIMATE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
 FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
@@ -102,6 +108,8 @@ class Judge:
         first_run: the number of the first run in the whole ensemble.
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
+
+    `innovations` are their sums by topic, see `innovation_sums`.
     """
 
     def __init__(
@@ -118,6 +126,7 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
+        self._targets: list[Targets | None] | None = None
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
         self._burn_in_s = burn_in_s
@@ -127,7 +136,8 @@ class Judge:
         self._steps: dict[str, NDArray[np.int64]] = {}
         self._diagnostics: dict[str, StreamDiagnostics] = {}
         self._unjudged: dict[str, str] = {}
-        self._degrees: Counter[str] = Counter()
+        self._first_fixes: dict[str, list[Origin | None]] = {}
+        self.innovations: dict[str, Sums] = {}
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -135,6 +145,7 @@ class Judge:
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
         judged = Judged([], [], [])
+        self._first_fixes |= first_fixes(outputs)
         for topic, rows in outputs.items():
             schema = rows.stream.schema.full_name
             if schema == GAUSSIAN:
@@ -142,7 +153,9 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
-                self._degrees[topic] += int(innovations.degrees.sum())
+                self.innovations[topic] = plus(
+                    self.innovations.get(topic, {}), innovation_sums(innovations)
+                )
                 self._measured.add(topic, innovations)
             self._listen(topic, rows)
             named = (*split_topic(topic), topic.rpartition("/")[2])
@@ -157,13 +170,25 @@ class Judge:
         for topic, sets in found.items():
             judged.sets.append(sets)
             self._measured.add(topic, sets)
+        if any(rows.stream.schema.full_name == TRACK for rows in outputs.values()):
+            if self._targets is None:
+                self._targets = [targets_of(source) for source in self._sources]
+            for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
+                self._measured.add(topic, tracks)
         return judged
 
     def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
         begun = self._steps.setdefault(topic, np.zeros(self.runs, np.int64))
         if topic not in self._unjudged:
-            self._unjudged[topic] = _unjudged_sentence(rows, self._sources)
-        errors = errors_of(rows, self._truths, self._gap_limit_s, steps=begun, first_run=self._first_run)
+            self._unjudged[topic] = unjudged_sentence(rows, self._sources, self._first_fixes)
+        errors = errors_of(
+            rows,
+            self._truths,
+            self._gap_limit_s,
+            steps=begun,
+            first_run=self._first_run,
+            first_fixes=self._first_fixes,
+        )
         self._steps[topic] = begun + np.diff(rows.offsets)
         if errors is None:
             return
@@ -182,6 +207,7 @@ class Judge:
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
         kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
+        kept.constant.add(errors)
 
     def _listen(self, topic: str, rows: Ragged) -> None:
         """Take in what a stream says of the replay itself."""
@@ -210,7 +236,7 @@ class Judge:
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._on_errors = (), [], None
+        self._sources, self._truths, self._targets, self._on_errors = (), [], None, None
         self._steps.clear()
         for each in self._quantities.values():
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
@@ -222,7 +248,8 @@ class Judge:
         self._doubts = other.doubts | self.doubts
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
-        self._degrees.update(other._degrees)
+        for topic, sums in other.innovations.items():
+            self.innovations[topic] = plus(self.innovations.get(topic, {}), sums)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -259,13 +286,19 @@ class Judge:
                 if runs and size:
                     key = metric_key(errors.estimator, name, errors.case)
                     found[key] = chi_square_interval(size, runs, probability)
-        for topic, degrees in self._degrees.items():
-            if degrees:
+        for topic, sums in self.innovations.items():
+            if degrees := sums["degrees"]:
                 low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
                 found[key] = low / degrees, high / degrees
         return {key: found[key] for key in self.metrics if key in found}
+
+    @property
+    def constants(self) -> dict[tuple[str, str], Constant]:
+        """Return by estimator and case the errors that stay, see `ConstantSums`."""
+        found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
+        return {what: each for what, each in found.items() if each is not None}
 
     @property
     def has_numbers(self) -> bool:
@@ -282,7 +315,7 @@ class Judge:
 
     @property
     def components_without_truth(self) -> list[str]:
-        """A sentence for every estimate of which the truth lacks components."""
+        """A sentence for every estimate of which the truth lacks components, or is in another plane."""
         return [sentence for sentence in self._unjudged.values() if sentence]
 
     @property
@@ -375,12 +408,3 @@ class Judge:
 
 def _what(topic: str) -> str:
     return " ".join(filter(None, split_topic(topic)))
-
-
-def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
-    names = components_without_truth(estimates, sources)
-    if not names:
-        return ""
-    verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
-    truth = estimates.stream.metadata["truth"]
-    return f"{_what(estimates.stream.topic)}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
