@@ -24,6 +24,7 @@ from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
 from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
 from replay.foreign.processes.tasks import LOADING, RunGiven, mapped
+from replay.foreign.processes.worker import IDLE
 from replay.foreign.results import begun
 
 Given = TypeVar("Given")
@@ -134,6 +135,16 @@ class Worker:
         self.is_over = True
         end(self._process)
 
+    @property
+    def is_alive(self) -> bool:
+        """Tell whether it waits for work."""
+        return self._process.poll() is None
+
+    @property
+    def code(self) -> int | None:
+        """Return its exit code; None while there is none."""
+        return self._process.returncode
+
     def ask(self, task: dict[str, Any], limits: Limits, progress: Callable[[], int] = lambda: 0) -> Any:
         """Have a task done; raises Ended where the process does not do it, BadInput what it raises."""
         assert self._process.stdin is not None
@@ -167,8 +178,11 @@ class Ran(NamedTuple):
 
 def follow_apart(
     worker: Worker, library: str, given: RunGiven, description: Description, limits: Limits
-) -> Ran:
-    """Take one run through its filter in a process; what it says before it crashes counts."""
+) -> Ran | None:
+    """Take one run through its filter in a process; what it says before it crashes counts.
+
+    None where the process had ended before, for want of work.
+    """
     due, recorded = offsets_of(description, given.events)
     with scratch_folder("fuselog-filter") as folder:
         given.save(folder / "given.npz")
@@ -187,6 +201,8 @@ def follow_apart(
                 failure = Failure(told[1], reason_of_code(told[0], description))
         except Ended as ended:
             worker.end()
+            if worker.code == IDLE and int(made.progress[0]) == LOADING:
+                return None
             failure = failure_at(int(made.progress[0]), given, description, str(ended))
         return Ran(copied(followed(made, due, recorded)), failure)
 
@@ -203,34 +219,48 @@ def failure_at(event: int, given: RunGiven, description: Description, why: str) 
 
 
 class Workers:
-    """Represents some processes; one that did not survive its run is replaced."""
+    """Represents the processes that work on some runs; those that survive are kept for the next.
 
-    def __init__(self, count: int) -> None:
-        self._idle: queue.SimpleQueue[Worker | None] = queue.SimpleQueue()
-        self._all: list[Worker] = []
+    A process that is given nothing for a while ends by itself, see `worker`.
+    """
+
+    def __init__(self) -> None:
+        self._working: set[Worker] = set()
         self._is_over = False
-        for _ in range(count):
-            self._idle.put(None)
 
     @contextmanager
     def one(self) -> Iterator[Worker]:
         """Take a process out for a run."""
-        worker = self._idle.get()
         if self._is_over:
             raise Ended("was stopped")
-        if worker is None:
-            worker = Worker()
-            self._all.append(worker)
+        worker = _kept_or_new()
+        self._working.add(worker)
         try:
             yield worker
         finally:
-            self._idle.put(None if worker.is_over else worker)
+            self._working.discard(worker)
+            if not worker.is_over:
+                _KEPT.put(worker)
 
     def end(self) -> None:
-        """End them all; there are no more."""
+        """End those that still work; there are no more."""
         self._is_over = True
-        for worker in self._all:
+        for worker in list(self._working):
             worker.end()
+
+
+_KEPT: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+
+
+def _kept_or_new() -> Worker:
+    """Return a process that waits for work."""
+    with suppress(queue.Empty):
+        while True:
+            worker = _KEPT.get_nowait()
+            if worker.is_alive:
+                return worker
+            worker.end()
+    return Worker()
 
 
 def follow_runs_apart(
@@ -238,13 +268,16 @@ def follow_runs_apart(
 ) -> list[Ran | None]:
     """Take runs through filters in processes, as many at once as there are cores; None stays None."""
     count = max(1, min(core_count(), sum(each is not None for each in runs)))
-    workers = Workers(count)
+    workers = Workers()
 
     def one(given: RunGiven | None) -> Ran | None:
         if given is None:
             return None
-        with workers.one() as worker:
-            return follow_apart(worker, library, given, description, limits)
+        while True:
+            with workers.one() as worker:
+                ran = follow_apart(worker, library, given, description, limits)
+            if ran is not None:
+                return ran
 
     return in_threads(one, runs, count, workers.end)
 
@@ -263,10 +296,16 @@ def in_threads(
 
 def describe_apart(library: str) -> str:
     """Ask a library for its description, in a process."""
-    worker = Worker()
-    try:
-        return str(worker.ask({"library": library}, Limits(STARTS_S, 2000.0))["description"])
-    except Ended as ended:
-        raise BadInput(f"{library}: {ended} while it was asked for its description; mend it") from None
-    finally:
-        worker.end()
+    while True:
+        worker = _kept_or_new()
+        try:
+            found = worker.ask({"library": library}, Limits(STARTS_S, 2000.0))["description"]
+            _KEPT.put(worker)
+            return str(found)
+        except Ended as ended:
+            worker.end()
+            if worker.code != IDLE:
+                raise BadInput(f"{library}: {ended} while it was asked what it is; mend it") from None
+        except BaseException:
+            worker.end()
+            raise
