@@ -263,7 +263,8 @@ def diagnose(
     settings = merge(own, allowed(given))
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
-        raise BadInput(f"{done.failures[0]}; solve that first")
+        why = next((f": {each.words}" for each in of_plausibility(source, source.topics, ())), "")
+        raise BadInput(f"{done.failures[0]}; solve that first{why}")
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
         raise BadInput(
