@@ -95,16 +95,21 @@ class Body:
 
 
 def bodies(streams: Mapping[str, Stream]) -> list[Body]:
-    """The bodies that topics are of: one for every namespace, or one alone where no role comes twice."""
+    """The bodies that topics are of: one for every namespace, or one alone where no role comes twice.
+
+    A namespace within another has what that has as well: a unit `/imu2/inertial` moves as `/fix` says.
+    """
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
     )
-    together, apart = Body(), dict[str, Body]()
-    for topic, stream in streams.items():
-        if len(stream) >= FEWEST and not topic.startswith("/estimates/"):
-            own = apart.setdefault(topic.rpartition("/")[0], Body())
-            for each in (own, together):
-                _add(each, stream, first_ns)
+    told = {topic: stream for topic, stream in streams.items() if len(stream) >= FEWEST}
+    together, apart = Body(), {topic.rpartition("/")[0]: Body() for topic in told}
+    for topic, stream in told.items():
+        _add(together, stream, first_ns)
+        space = topic.rpartition("/")[0]
+        for name, body in apart.items():
+            if f"{name}/".startswith(f"{space}/"):
+                _add(body, stream, first_ns)
     if all(len({each.topic for each in role}) <= 1 for role in together.roles):
         return [together]
     return list(apart.values())

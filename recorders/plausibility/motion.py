@@ -28,7 +28,7 @@ from recorders.plausibility.windows import (
 SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
 LEAST_LAG_S = 0.15
 LONG_S = 1.0  # a lag that no body makes whose course is not where it heads
-ALIKE = 0.8  # a correlation
+ALIKE, PLAIN = 0.8, 0.95  # correlations; the latter where the course need not be the heading
 
 
 class Slope(NamedTuple):
@@ -133,7 +133,7 @@ class Motion:
             nearest_s = min(late_s.values(), key=lambda other_s: abs(own_s - other_s))
             if self._goes_where_it_points(each):
                 late_s[each.source] = own_s
-            elif _sure_lag_s(each.timing):
+            elif _sure_lag_s(each.timing) and abs(each.timing.likeness) > PLAIN:
                 late_s[each.source] = nearest_s if abs(own_s - nearest_s) < LONG_S else own_s
         if not late_s:
             return {}
