@@ -14,7 +14,7 @@ import pandas as pd
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
-from pipeline.diagnosing.hypotheses import Kind
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import Outcome
@@ -79,7 +79,7 @@ def _plain(alteration: alter.Alteration) -> Callable[[MemorySource, int], alter.
 
 
 def _drift(source: MemorySource, _: int) -> alter.Alteration:
-    return alter.drifted(*source.extent("publish_time"))
+    return alter.drifted(source.extent("publish_time")[0])
 
 
 def _landmark_numbers(source: MemorySource, seed: int) -> alter.Alteration:
@@ -216,7 +216,7 @@ SCENARIOS = {
                 "/vehicle2/fix",
                 0.05,
                 altered="/vehicle2/fix",
-                alteration=lambda source, _: alter.delayed(*source.extent("publish_time")),
+                alteration=_plain(alter.delayed),
                 by=0.05,
             ),
             "outliers": Fault(
