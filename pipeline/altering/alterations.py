@@ -119,7 +119,11 @@ def ramped(first_ns: int, field: str, entry: int | None = None) -> Alteration:
 
 
 def _ramped(first_ns: int, field: str, entry: int | None, stream: Stream, rate: float) -> Stream:
-    return _shifted(field, entry, stream, rate * 1e-9 * (stream.publish_time_ns - first_ns))
+    return _shifted(field, entry, stream, rate * _since_s(stream, first_ns))
+
+
+def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
+    return np.asarray(1e-9 * (stream.publish_time_ns - first_ns), np.float64)
 
 
 def permuted(field: str, order: Sequence[int]) -> Alteration:
@@ -157,7 +161,7 @@ def heading_multiplied(stream: Stream, factor: float) -> Stream:
 
 def heading_ramped(first_ns: int) -> Alteration:
     """Orientations turn about the vertical by so many rad/s from the run's begin on."""
-    return lambda stream, rate: heading_turned(stream, rate * 1e-9 * (stream.publish_time_ns - first_ns))
+    return lambda stream, rate: heading_turned(stream, rate * _since_s(stream, first_ns))
 
 
 def heading_from_north(stream: Stream, _: float) -> Stream:

@@ -29,7 +29,7 @@ WHATS = {
     "FIELD_turn": "The vector is turned about the vertical by this angle (rad), and is turned back.",
     "heading_bias": "The heading of orientations, or of a prior, is too large by it (rad); they have "
     "heading_scale and heading_drift as well.",
-    "heading_convention": "north, where headings of orientations are clockwise from there, as a compass's.",
+    "heading_convention": "north, where headings of orientations are a compass's, clockwise from there.",
     "origin": "Of geodetic fixes the origin of the plane: latitude and longitude in deg, altitude in m. "
     "Of positions where their zero lies in the plane, in m: it is added.",
     "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",

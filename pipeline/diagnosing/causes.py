@@ -1,19 +1,25 @@
 """The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.diagnosing.numbers import number
 from pipeline.diagnosing.search import DROP_95, Gains, Peak, interval, peak
 from replay.distributions import chi2
+from replay.engine.replaying.estimator import bind
+from replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
+
+
+SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
 
 
 class Told(NamedTuple):
@@ -117,14 +123,29 @@ def find_causes(
         )
         if not ranked:
             break
-        least = ranked[0][0].score(ranked[0][1]) - RIVAL
-        alike = sorted((pair for pair in ranked if pair[0].score(pair[1]) > least), key=_is_early)
+        first = ranked[0]
+        least = first[0].score(first[1]) - RIVAL
+        alike = [
+            pair for pair in ranked if pair[0].score(pair[1]) > least or _is_other_name(pair, first)
+        ]
+        alike.sort(key=_is_early)
         causes = [_cause(gains(each), at, each) for at, each in alike]
         found.append(causes[0]._replace(others=tuple(causes[1:])))
         now = causes[0].hypothesis.without(now, causes[0].value)
         gone = {id(each) for _, each in alike}
         candidates = [each for each in candidates if id(each) not in gone]
     return found, listed
+
+
+def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:
+    """Whether a topic is late by as much as the likeliest cause has another early.
+
+    These are one fault but for what is at the ends of the log.
+    """
+    (at, of), (best, early) = pair, first
+    if not _is_early(first) or of.kind != early.kind or of.topic == early.topic:
+        return False
+    return abs(at.value + best.value) < SAME_SIZE * abs(best.value) and at.gain > SAME_GAIN * best.gain
 
 
 def _is_early(pair: tuple[Peak, Hypothesis]) -> bool:
@@ -152,7 +173,7 @@ def _peaks(
     while asked:
         found = iter(gains_of([(candidates[place], at) for place, each in asked.items() for at in each]))
         answers = {place: [next(found) for _ in each] for place, each in asked.items()}
-        greatest = max(greatest, *(gain for each in answers.values() for gain in each))
+        greatest = max([greatest, *(gain for each in answers.values() for gain in each)])
         asked = {}
         for place, answer in answers.items():
             try:
@@ -204,3 +225,40 @@ def _intervals(gains: Gains, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
         bend[row, column] = bend[column, row] = 0.25 * (both - one - other + none)
     spread = 1.96 * np.sqrt(np.abs(np.diag(np.linalg.pinv(-bend)))) * steps
     return tuple(map(float, values - spread)), tuple(map(float, values + spread))
+
+
+class Sought(NamedTuple):
+    """What was found.
+
+    Attributes:
+        causes: the likeliest first.
+        tried: every hypothesis, with what it gains of the log as it is.
+        log_likelihood: of the log as it is; NaN where its innovations have none, and nothing is tried.
+    """
+
+    causes: Sequence[Cause]
+    tried: Sequence[Tried]
+    log_likelihood: float
+
+
+def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: int) -> Sought:
+    """Find the likeliest causes.
+
+    Args:
+        source: the log.
+        label: the estimator's.
+        settings: its parameters with its `kind`; the gate is open.
+        most: how many causes at most.
+
+    Raises BadInput where the estimator cannot be replayed.
+    """
+    likelihood, base = Likelihood(label), Trial(source, settings)
+    seen = likelihood.begin(base)
+    [before] = likelihood([base])
+    if not np.isfinite(before):
+        return Sought([], [], np.nan)
+    bound = bind(label, [source], settings)
+    causes, tried = find_causes(
+        likelihood, base, hypotheses(bound, base, seen, likelihood.readings), most
+    )
+    return Sought(causes, tried, before)

@@ -90,9 +90,8 @@ def diagnose_log(
         ],
     )
     if tells_tried:
-        columns = ("fault", "value", "gain")
         print_table(
-            columns,
+            ("fault", "value", "gain"),
             [
                 [
                     " ".join(filter(None, (row["kind"], row["topic"], row["part"]))),

@@ -18,8 +18,11 @@ SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
 CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval
 
 
-def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
-    """Find errors that innovations do not see."""
+def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
+    """Find errors that innovations do not see, which causes that were found may explain or not."""
+    mend = "let a bias be estimated, or see fuselog observability LOG"
+    if has_causes:
+        mend = "mend what is said above, and look whether it is still so"
     metrics = done.judge.metrics
     for key, (_, high) in done.judge.bounds.items():
         _, quantity, case = split_metric(key)
@@ -31,7 +34,7 @@ def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
                 _truth(case),
                 f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
                 f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
-                "the state follows; let a bias be estimated, or see fuselog observability LOG",
+                f"the state follows; {mend}",
             )
 
 

@@ -20,9 +20,10 @@ from pipeline.api.planning import Kind as EstimatorKind
 from pipeline.api.planning import Log, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Trying
-from pipeline.diagnosing.causes import Cause, Told, Tried, find_causes, least_gain, tried_table
+from pipeline.diagnosing.causes import Cause, Told, Tried, least_gain, seek, tried_table
 from pipeline.diagnosing.consistency import judged_by_itself, unnamed, unseen_errors
 from pipeline.diagnosing.findings import (
+    FIRST,
     Finding,
     component_table,
     of_estimates,
@@ -30,8 +31,6 @@ from pipeline.diagnosing.findings import (
     of_messages,
 )
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
-from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.diagnosing.outputs import Outputs
 from pipeline.diagnosing.portion import first_part, on_the_rest
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
@@ -40,6 +39,7 @@ from pipeline.output.results import Outcome, result_folder, split_metric, write_
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import source_of_estimates, stated_estimators
+from pipeline.tuning.measured import until_last_measured
 from recorders.errors import BadInput, choices
 from recorders.log import Stream, schemas
 from recorders.parameters import merge
@@ -49,7 +49,6 @@ from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.evaluation import split_topic
 
 MOST_SENTENCES = 5
-FIRST = ("lost messages", "stamps")  # what stands before causes: it is seen without any filter
 CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
@@ -274,6 +273,8 @@ def diagnose(
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
     settings = merge(own, given)
+    bound = bind(label, [source], {"kind": label, **settings})
+    source = until_last_measured(source, bound)
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
@@ -283,24 +284,21 @@ def diagnose(
             f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
             "filter of the same model, such as -e ekf"
         )
-    bound = bind(label, [source], {"kind": label, **settings})
-    gate = float(getattr(bound[0].parameters, "gate_probability", 1.0))
+    gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes = []
-    causes, tried = list[Cause](), list[Tried]()
+    causes: Sequence[Cause] = []
+    tried: Sequence[Tried] = []
     least, likely, end_ns = np.inf, np.nan, None
     opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
-    if innovations.state("log_likelihood"):
-        likelihood = Likelihood(label)
+    has_likelihood = innovations.state("log_likelihood")
+    if has_likelihood:
         part, end_ns, note = first_part(source, bound, streamed)
         notes += [note] if note else []
-        base = Trial(part, opened)
-        seen = likelihood.begin(base)
-        alternatives = hypotheses(bound, base, seen, likelihood.readings)
-        [likely] = likelihood([base])
-        causes, tried = find_causes(likelihood, base, alternatives, MOST_SENTENCES)
-        least = least_gain(len(alternatives))
-    else:
+        causes, tried, likely = seek(part, label, opened, MOST_SENTENCES)
+        least = least_gain(len(tried))
+        has_likelihood = bool(np.isfinite(likely))
+    if not has_likelihood:
         notes.append(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
@@ -317,7 +315,11 @@ def diagnose(
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
         *(each for each in of_log if each.kind not in FIRST),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
-        *(each for each in unseen_errors(done, label) if each.topic not in no_judges),
+        *(
+            each
+            for each in unseen_errors(done, label, has_causes=bool(causes))
+            if each.topic not in no_judges
+        ),
     ]
     if not causes and not findings:
         findings += unnamed(done, innovations, len(tried), no_judges)

@@ -18,6 +18,7 @@ from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
+FIRST = ("lost messages", "stamps")  # what stands before causes: it is seen without any filter
 TAIL = 3.0  # standard deviations
 IMPROBABLE = 1e-4
 WINDOW = 30  # innovations, over which NIS is averaged to see a filter diverge

@@ -1,8 +1,8 @@
 """What other settings, or a log without a fault, would gain: the log-likelihood of replays.
 
-All trials have the same measurements, and begin by the same rule. What a trial does not score, such as
-a fix that a delay moves out of the odometry's span, has the likelihood of a broad model: the next message
-is as far from the last as messages of its topic usually are.
+All trials have the same measurements, and begin by the same rule. What a trial does not score, such
+as a fix that a delay moves out of the odometry's span, has the likelihood of a broad model: the next
+message is as far from the last as messages of its topic usually are.
 
 A measurement that the gate keeps out is an outlier: it may be anywhere in the volume that the
 innovations span, and is one with the share that they have. Without a gate there are none, and the
@@ -33,7 +33,8 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import Ensemble, MemorySource
 
 Floats = NDArray[np.float64]
-MOST_MESSAGES = 1_000_000  # of the runs that are replayed together
+MOST_MESSAGES = 300_000  # of the runs that are replayed together
+EVER_NS = 2**62
 ROOM_NS = 86_400 * 10**9  # before the first stamp
 LEAST_SCORED = 0.5  # of the measurements: a trial that scores fewer is of another log
 
@@ -57,14 +58,14 @@ class Scored(NamedTuple):
         source: its messages.
         begin_ns: where the filter begins if no prior says so.
         left: by estimate, what the broad model says of the others.
-        count: by estimate, how many measurements are there.
+        beyond: by estimate, how many these are.
         stretch: by estimate, what is added since measurements are in other units than the log's.
     """
 
     source: MemorySource
     begin_ns: int
     left: Mapping[str, float]
-    count: Mapping[str, int]
+    beyond: Mapping[str, int]
     stretch: Mapping[str, float]
 
 
@@ -119,7 +120,7 @@ class Likelihood:
         [parts] = self._innovations([trial], [scored])
         found = max(parts, key=_stated)
         self.count = {
-            name: max(len(part.get(_topic(name), ())) for part in parts) + scored.count.get(name, 0)
+            name: max(len(part.get(_topic(name), ())) for part in parts) + scored.beyond.get(name, 0)
             for name in (each.name for each in bound)
         }
         self.volumes = {topic: _extents(stream) for topic, stream in found.items()}
@@ -164,15 +165,17 @@ class Likelihood:
             reading = self.readings.get(each.name)
             if reading is None:
                 continue
-            begin_ns, end_ns = _span(reading.controls, each, trial.source.streams)
+            begin_ns, end_ns, step_ns = _span(reading.controls, each, trial.source.streams)
             for topic in each.streams:
                 stream = trial.source.streams[topic]
                 if topic not in reading.controls and len(stream):
                     stamps_ns = stream.publish_time_ns
-                    is_in = (stamps_ns >= begin_ns) & (stamps_ns <= end_ns)
+                    is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
                     lost = int(len(stream) - is_in.sum())
-                    if lost:
-                        streams[topic] = stream.take(is_in)
+                    if stamps_ns.min() < begin_ns or lost:
+                        inside = stream.take(is_in)
+                        held_ns = np.maximum(inside.publish_time_ns, begin_ns)
+                        streams[topic] = replace(inside, publish_time_ns=held_ns)
                     left[each.name] = left.get(each.name, 0.0) + lost * self.broad[topic]
                     count[each.name] = count.get(each.name, 0) + lost
                     added = trial.stretched.get(topic, 0.0) * int(is_in.sum())
@@ -223,7 +226,7 @@ class Likelihood:
                 if all_:
                     return {}
                 continue
-            lacking = all_ - scored.count.get(name, 0) - len(stream)
+            lacking = all_ - scored.beyond.get(name, 0) - len(stream)
             if len(stream) < LEAST_SCORED * all_ or (lacking and name not in self.readings):
                 return {}
             is_in = stream["accepted"] != 0
@@ -251,20 +254,24 @@ def _topic(name: str) -> str:
     return f"/estimates/{name}/innovation"
 
 
-def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int]:
-    """From where to where a filter can score measurements."""
-    ends = np.iinfo(np.int64)
-    begin_ns, end_ns = int(ends.min), int(ends.max)
+def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
+    """From where to where a filter can score measurements, and the step of what drives it.
+
+    What is before by a step at most is scored at the begin, and what is after while the last control
+    holds, and once more as long: what a small delay moves over an end stays comparable.
+    """
+    begin_ns, end_ns, longest_ns = -EVER_NS, EVER_NS, 0
     for topic in controls:
         stamps_ns = streams[topic].publish_time_ns
         if len(stamps_ns):
             step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0
             begin_ns = max(begin_ns, int(stamps_ns.min()))
-            end_ns = min(end_ns, int(stamps_ns.max()) + step_ns)
+            end_ns = min(end_ns, int(stamps_ns.max()))
+            longest_ns = max(longest_ns, step_ns)
     for topic in bound.priors:
         if topic in streams and len(streams[topic]):
             begin_ns = int(streams[topic].publish_time_ns[0])
-    return begin_ns, end_ns
+    return begin_ns, end_ns, longest_ns
 
 
 def _broad(numbers: Floats, kinds: Sequence[str]) -> float:

@@ -18,7 +18,8 @@ DROP_95 = 1.92  # of the log-likelihood, from its greatest to where 95 % of a pa
 ROUNDS = 14  # of a refinement at most
 DOUBLINGS = 12  # of the way to an end
 LARGEST = 1e12  # a loss, of what cannot be used
-NEAR = 0.05  # of log-likelihood: a peak that is known this well is known
+NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
+CLEAR = 0.05  # of the same, where a peak is of several numbers
 FAR = 0.02  # of what a peak lacks to the greatest: one that is far from it need not be known better
 NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
 
@@ -45,18 +46,24 @@ def peak(of: Hypothesis, floor: float, greatest: Callable[[], float] = lambda: 0
     Args:
         of: the fault; it gains zero where its number is zero.
         floor: a gain that is less than this is not worth a search.
-        greatest: the greatest gain that is known of any fault.
+        greatest: the greatest gain that is known of any fault. Where none gains anything nearby, or by a
+            special value, nothing is looked for far away.
     """
     if of.size > 1:
         return (yield from _of_several(of, floor, greatest))
-    asked = [*of.specials, *(value for value in of.tried if value not in of.specials)]
-    known: dict[Number, float] = dict(zip(asked, (yield asked), strict=True))
+    near, far = of.tried[:2], [value for value in of.tried[2:] if value not in of.specials]
+    asked = [*of.specials, *near]
+    known: dict[float, float] = dict(zip(asked, (yield asked), strict=True))
     special = max(of.specials, key=lambda value: known[value], default=None)
     best = Peak(special, known[special], is_special=True) if special is not None else Peak(0.0, 0.0)
     if not of.tried:
         return best
     known[0.0] = 0.0
-    if max(known.values()) < 0.5 * floor and _by_parabola(known, of.tried[:2]) < 0.5 * floor:
+    is_flat = max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor
+    if is_flat and greatest() < floor:  # and nothing else is wrong
+        return Peak(0.0, 0.0)
+    known.update(zip(far, (yield far), strict=True))
+    if max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor:
         return Peak(0.0, 0.0)  # a smooth function that is about greatest here
     before = -np.inf
     for _ in range(ROUNDS):
@@ -122,12 +129,12 @@ def _next(known: Mapping[float, float], limit: float) -> list[float]:
         else:
             apart = 0.25 * min(best - low, high - best) + 0.5 * abs(at - best)
             near = [at, at - apart, at + apart]
-            values = [*near, *middles] if _is_lopsided(known, low, best, high) else near
+            values = [*near, *middles] if _is_lopsided(low, best, high) else near
         values = [value for value in values if low < value < high]
     return [value for value in dict.fromkeys(values) if value not in known]
 
 
-def _is_lopsided(known: Mapping[float, float], low: float, best: float, high: float) -> bool:
+def _is_lopsided(low: float, best: float, high: float) -> bool:
     """Whether a bracket is so uneven that a parabola says little."""
     return max(best - low, high - best) > 8.0 * min(best - low, high - best)
 
@@ -170,7 +177,7 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
         if found <= gain:
             break
         improved, at, gain = found - gain, at + move, found
-        if gain < 0.5 * floor or improved < NEAR + FAR * max(greatest() - gain, 0.0):
+        if gain < 0.5 * floor or improved < max(CLEAR, FAR * (greatest() - gain)):
             break
         if number == 0:
             with np.errstate(divide="ignore"):
@@ -196,7 +203,7 @@ def interval(gains: Gains, at: Peak, scale: float) -> tuple[float, float]:
         for _ in range(DOUBLINGS):
             outer = middle + step
             if rest(outer) < 0.0:
-                return float(brentq(rest, inner, outer, xtol=1e-2 * abs(outer - middle)))
+                return float(brentq(rest, inner, outer, xtol=1e-3 * abs(outer - middle)))
             inner, step = outer, 2.0 * step
         return sign * np.inf
 

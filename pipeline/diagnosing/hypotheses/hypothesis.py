@@ -35,7 +35,7 @@ Kind = Literal[
     "unseen error",
     "unnamed",
 ]
-Number = float | tuple[float, ...]
+Number = Any  # a float; of a fault of several numbers a tuple of floats
 SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
 
 

@@ -15,7 +15,6 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     Hypothesis,
     Kind,
     has,
-    in_topic,
     size_of,
     times,
 )
@@ -176,7 +175,7 @@ def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
         settings = {**trial.settings, "gate_probability": GATE, **_reopens(parameters)}
         return trial._replace(settings=settings)
 
-    is_closed = getattr(parameters, "gate_probability", 1.0) <= GATE
+    is_closed = (getattr(parameters, "gate_probability", None) or 1.0) <= GATE
     yield Hypothesis(
         "outliers",
         "gate_probability",

@@ -78,7 +78,7 @@ def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
 
 
 def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
-    """By how much the speeds of positions lag behind a control that goes with them, in s, if that is told.
+    """By how much the speeds of positions lag behind a control that goes with them, in s, if it is told.
 
     By the best correlation over a grid; a tenth of a second is near enough to begin a search at.
     """

@@ -93,6 +93,8 @@ def replay(
     ]
     for monitor, static in zip(monitors, statics, strict=True):
         monitor.static = static
+        if report is None:  # nobody asks what became of measurements
+            monitor.usage.shares.end(is_known=False)
         monitor.usage.note_start(static)
     told: list[Ragged] = []
     initialization = partial(_open, ensemble, order, stamps, told)

@@ -1,6 +1,7 @@
-"""Says what an estimator of a model reads: of which topics which numbers, and which parameters for what."""
+"""Says what an estimator of a model reads: which numbers of which topics, which parameters for what."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -82,13 +83,10 @@ def _noises(stage: Stage, found: Found) -> dict[str, str]:
     state = trial_state(model.kinds)
     of_motion: list[Callable[[Any], Any]] = []
     for motion in stage.modes or (stage.motion,):
-        of_motion += [
-            lambda parameters, noise=noise: noise(state, 1.0, parameters)
-            for noise in (motion.noise, motion.gap_noise)
-            if noise is not None
-        ]
+        given = (noise for noise in (motion.noise, motion.gap_noise) if noise is not None)
+        of_motion += [partial(noise, state, 1.0) for noise in given]
         if motion.control_noise is not None:
-            of_motion.append(lambda parameters, motion=motion: motion.control_noise(1.0, parameters))
+            of_motion.append(partial(motion.control_noise, 1.0))
     noises = {topic.name: sensor.noise for sensor, topic in reversed(found.sensors) if sensor.noise}
     found_noises = {name: topic for topic, noise in noises.items() for name in _squared(noise, names)}
     return found_noises | {name: "" for each in of_motion for name in _squared(each, names)}
@@ -150,7 +148,7 @@ def _own_errors(
     control = 1.7 + np.arange(model.controls)
     entering = ((0.0,) * stage.motion.noises,) if stage.motion.noises else ()
 
-    def moved(driven: Floats, parameters: Any) -> Floats:
+    def moved(driven: Any, parameters: Any) -> Floats:
         return np.array(stage.motion.move(state, tuple(driven), *entering, 0.5, parameters), float)
 
     with np.errstate(all="ignore"):
