@@ -19,6 +19,7 @@ from recorders.recording import Recording
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.replaying.late import Late
 from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.foreign.naming import allowed, shorthand
 from replay.inference.model.model import Model
 from replay.judging.metrics.measuring import find_metrics
 
@@ -108,7 +109,7 @@ def plan_replay(
     alterations, given = split_settings(set or {})
     settings = settings_of(estimators)
     if given:
-        settings = with_settings(settings, given)
+        settings = with_settings(settings, allowed(given))
     wanted = [metrics] if isinstance(metrics, str) else list(metrics)
     find_metrics(wanted)
     sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs, alterations)]
@@ -178,7 +179,8 @@ def settings_of(
                 f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
                 '{"mine": {...}}'
             )
-        for label, what in ({each: {}} if isinstance(each, str) else each).items():
+        named = dict([shorthand(each)]) if isinstance(each, str) else allowed(each)
+        for label, what in named.items():
             if label in chosen:
                 raise BadInput(f"estimator {label} is given twice; give the second another label")
             chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}

@@ -20,6 +20,7 @@ import pandas as pd
 from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Kind, Log, plan_replay
+from pipeline.output.alarms import Alarm, alarms_of
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -134,7 +135,9 @@ class Replay:
 
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.components_without_truth]
+        said = [f"Replay of {runs} by {', '.join(self.settings)}"]
+        said += [each.words for each in self.alarms[:1]]
+        said += self.judge.components_without_truth
         return "\n".join(
             [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
         )
@@ -196,6 +199,11 @@ class Replay:
     def losses(self) -> list[str]:
         """A sentence for what was not estimated throughout, and for measurements that were not used."""
         return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
+
+    @cached_property
+    def alarms(self) -> list[Alarm]:
+        """What makes the numbers doubtful, the worst first: each has a sentence, `words`."""
+        return alarms_of(self.judge, self.done.parameters, self.done.coverage)
 
     @property
     def coverage(self) -> pd.DataFrame:
@@ -265,7 +273,7 @@ class Replay:
         stated = {"arrival_order": self.arrival_order or None, "late": self.late}
         settings |= {name: value for name, value in stated.items() if value is not None}
         with result_folder(place) as part:
-            outcome = summarise(self.judge, self.done.coverage)
+            outcome = summarise(self.judge, self.done.coverage, self.done.parameters)
             outcome.input_sha256 = self.input_sha256
             return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
 

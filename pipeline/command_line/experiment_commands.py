@@ -5,13 +5,16 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.api.api import run, sweep
-from pipeline.output.results import RUNS, read_table, split_metric
+from pipeline.output.results import RESULT_FILE, RUNS, read_table, split_metric
 from pipeline.output.terminal import (
+    has_many_cases,
     print_claims,
     print_json,
     print_metrics,
+    print_others,
     print_parameters,
     print_table,
+    print_worst,
     progress,
     say,
 )
@@ -20,6 +23,7 @@ from pipeline.runs.settings import read_settings
 from pipeline.runs.sweeps import DRAWN, Sampling, parse_over
 from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
+from replay.foreign.naming import allowed
 
 
 def run_named(
@@ -63,8 +67,18 @@ def run_named(
     if tells_parameters:
         print_parameters(result.settings["parameters"])
         say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
+    if result.claims or has_many_cases(result.metrics):
+        from pipeline.output.report.verdict import verdict  # it takes long to import
+
+        say(" ".join(verdict(result)))
     runs = done.folder / RUNS
-    print_metrics(result.metrics, result.bounds, read_table(runs) if runs.is_file() else None)
+    details = done.folder / (
+        "tables/summary.csv" if "tables/summary.csv" in result.files else RESULT_FILE
+    )
+    print_worst(result.alarms)
+    table = read_table(runs) if runs.is_file() else None
+    print_metrics(result.metrics, result.bounds, table, str(details))
+    print_others(result.alarms)
     print_claims(result.claims)
     say(f"{done.folder}: {', '.join(result.contents)}")
 
@@ -83,7 +97,7 @@ def _stated_experiment(
     if not files and (len(named) > 1 or labels):
         raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
     stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
-    values = merge(read_settings(settings_file, stated.labels), parse_settings(settings))
+    values = merge(read_settings(settings_file, stated.labels), allowed(parse_settings(settings)))
     files = [*stated.files, *filter(None, [settings_file])]
     return stated._replace(files=files), {**values, **over}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from pipeline.command_line.help import command
-from pipeline.command_line.options import ANY_PATH, COUNT, LOG, foxglove_option, set_option
+from pipeline.command_line.options import ANY_PATH, COUNT, LOG, PLACE, foxglove_option, set_option
 from recorders.errors import BadInput, printable
 
 
@@ -89,6 +89,12 @@ def record(
     "without it, import table lists these.",
 )
 @click.option(
+    "--origin",
+    type=PLACE,
+    metavar="LATITUDE,LONGITUDE[,HEIGHT]",
+    help="For ROS and tables: the origin of the plane that positions are in, in deg and m.",
+)
+@click.option(
     "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
 )
 @set_option("recorder")
@@ -98,6 +104,7 @@ def import_(
     out: Path | None,
     clock: str | None,
     mapping: str | None,
+    origin: list[float] | None,
     guess: bool,
     settings: tuple[str, ...],
 ) -> None:
@@ -105,8 +112,11 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
+    from pipeline.logs.information import worst
     from pipeline.output.outputs import check_files, imported
+    from recorders.log import open_log
     from recorders.parameters import parse_settings
+    from recorders.plausibility.checks import findings_of
     from recorders.recording import import_log
 
     if guess:
@@ -119,12 +129,14 @@ def import_(
     target = out or Path(f"{source}.mcap")
     check_files([(target, imported(source))], {"data": paths})
     more = [str(path) for path in paths[1:]]
-    chosen = {"clock": clock, "mapping": mapping, "more": more or None}
+    chosen = {"clock": clock, "mapping": mapping, "origin": origin, "more": more or None}
     given = {name: value for name, value in chosen.items() if value is not None}
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
+    for sentence in worst(findings_of(open_log(target)), target):
+        click.echo(printable(sentence))
 
 
 def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:

@@ -7,15 +7,19 @@ import numpy as np
 from pipeline.api.replays import Replay
 from pipeline.diagnosing.findings import Finding
 from pipeline.output.results import MetricValue, split_metric
+<<<<<<< HEAD
 from recorders.log import Stream, schemas
 from replay.engine.streams.sources import LogSource, MemorySource
+=======
+from recorders.log import Stream
+from replay.judging.consistency.consistency import CONSISTENT
+>>>>>>> main
 from replay.judging.consistency.whiteness import whitened
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 from replay.judging.metrics.measuring import metric_key
 
 SAME = 0.9  # of the messages: a truth that equals as many of what the filter used is the same
 SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
-CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval
 
 
 def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:

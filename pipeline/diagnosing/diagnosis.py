@@ -46,6 +46,7 @@ from recorders.parameters import merge
 from replay.engine.replaying.estimator import Estimator, bind
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.foreign.naming import allowed, of_file, refuse_programs
 from replay.judging.errors.evaluation import split_topic
 
 MOST_SENTENCES = 5
@@ -212,7 +213,8 @@ class Diagnosis:
         """
         place = Path(folder)
         check_folder(place, {"input": self.replay.paths})
-        outcome = summarise(self.replay.judge, self.replay.done.coverage)
+        done = self.replay.done
+        outcome = summarise(done.judge, done.coverage, done.parameters)
         outcome = replace_tables(outcome, {"diagnosis": self.causes, "components": self.components})
         outcome.figures |= self.profiles
         outcome.input_sha256 = self.replay.input_sha256
@@ -272,9 +274,13 @@ def diagnose(
         )
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
+<<<<<<< HEAD
     settings = merge(own, given)
     bound = bind(label, [source], {"kind": label, **settings})
     source = until_last_measured(source, bound)
+=======
+    settings = merge(own, allowed(given))
+>>>>>>> main
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
@@ -349,7 +355,9 @@ def _asked(
         if len(labels) != 1:
             raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
-        return source_of_estimates(source.log), {labels[0]: own}
+        chosen = of_file({labels[0]: own})
+        refuse_programs(chosen, source.name)
+        return source_of_estimates(source.log), chosen
     if estimator is None:
         raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)

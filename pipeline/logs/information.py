@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,6 +12,8 @@ from pipeline.output.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
 from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from recorders.parameters import describe
+from recorders.plausibility.checks import findings_of
+from recorders.plausibility.finding import Finding
 from recorders.recording import Recorder
 from recorders.registry import load
 from replay.engine.compiling.cache import cache_folder, kept_files
@@ -55,12 +57,30 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     if log.companions:
         count = sum(topic.messages for topic in log.companions.values())
         say(f"beside them, for viewers: {count} messages on {len(log.companions)} topics of Foxglove")
+    for sentence in worst(_findings(log), path):
+        say(sentence)
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
     elif log.topics:
         _say_what_fits(path, log, is_all=is_all)
     if log.loss_statement:
         warn(log.loss_statement)
+
+
+def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
+    """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
+    if found:
+        others = f"; {len(found) - 1} more: fuselog info {shlex.quote(str(path))} --json"
+        yield f"implausible: {found[0].mended}{others if len(found) > 1 else ''}"
+
+
+def _findings(log: Log) -> list[Finding]:
+    """What the log says of its own faults; of one that is damaged nothing, and that it is."""
+    try:
+        return findings_of(log)
+    except BadInput as error:
+        warn(f"{error}; what it holds is not looked at")
+        return []
 
 
 class Fitting(NamedTuple):
@@ -172,6 +192,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "last_log_time_ns": last_ns,
         "run": asdict(log.run) if log.run else None,
         "topics": topics,
+        "findings": [each._asdict() for each in _findings(log)],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
         "lost": log.loss_statement,
     }

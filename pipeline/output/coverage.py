@@ -14,7 +14,17 @@ from recorders.log import Clock
 from recorders.parsing import parse_json
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.replaying.usage import CONTROLS, INNOVATION, LANDMARK, SKIPPED, TRUTH, Row, Usage
+from replay.engine.replaying.usage import (
+    CONTROLS,
+    INNOVATION,
+    LANDMARK,
+    PRIOR,
+    SKIPPED,
+    TRUTH,
+    UNTAKEN,
+    Row,
+    Usage,
+)
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource, Source, is_sensed
 from replay.judging.errors.truths import Doubt
@@ -23,7 +33,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = [*Row._fields]
-UNTAKEN = "the estimator does not take this topic"
 # An estimates log's note on the span and the clock of its replay, unless it is all by publish time.
 REPLAYED = "replayed"
 
@@ -135,7 +144,7 @@ def _recounted(
     maps = {
         topic: gather([source.read([topic])[topic]])
         for topic in {topic for each in bound for topic in each.static}
-        if topic in source.topics and source.topics[topic].schema_name == LANDMARK
+        if topic in source.topics and source.topics[topic].schema_name in (LANDMARK, PRIOR)
     }
     own_maps = {
         each.name: {topic: maps[topic] for topic in each.static if topic in maps} for each in bound

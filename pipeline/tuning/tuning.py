@@ -42,6 +42,7 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.streams.channels import stated
+from replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
@@ -109,7 +110,7 @@ def tune(
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is tuned at a time; give one")
     [(label, own)] = chosen.items()
-    settings = {"kind": label, **merge(own, given)}
+    settings = {"kind": label, **merge(own, allowed(given))}
     bound = bind(label, sources, settings)
     sources = [until_last_measured(each, bound) for each in sources]
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)

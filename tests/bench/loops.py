@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from replay.engine.replaying.estimator import Bound
 from replay.engine.replaying.replaying import replay
 from replay.engine.streams.sources import Source
-from replay.inference.run import filtering
+from replay.inference.run import filtering, recursion
 from replay.inference.run.recursion import Estimates, Innovations, filled
 
 Floats = NDArray[np.float64]
@@ -26,6 +26,11 @@ class Call(NamedTuple):
     results: tuple[Estimates, Innovations]
     scratch: Callable[[], Any]
 
+    @property
+    def events(self) -> int:
+        """How many events there are."""
+        return len(getattr(self.before[0], "events", self.before[0]).time_ns)
+
     def __call__(self) -> Floats:
         """Do it again, into new arrays; returns the means of all runs end to end."""
         *columns, carried = self.before
@@ -33,9 +38,15 @@ class Call(NamedTuple):
             type(each)(each.end.copy(), *(np.empty_like(column) for column in each[1:]))
             for each in self.results
         )
-        arguments = (*columns, copy.deepcopy(carried), estimates, innovations)
+        arguments = (*columns, copy.deepcopy(carried), *handed_over(estimates, innovations))
         self.loop(self.runs, *arguments, scratch=self.scratch)
         return filled(estimates, np.append(self.results[0].end, len(estimates.mean)))[0].mean
+
+
+def handed_over(estimates: Estimates, innovations: Innovations) -> tuple[Any, ...]:
+    """What a loop fills, as the checkout at hand gives it: together, or in earlier ones apart."""
+    together = getattr(recursion, "RunResults", None)
+    return (together(estimates, innovations),) if together else (estimates, innovations)
 
 
 def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
@@ -48,6 +59,8 @@ def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
 
         def record(runs: int, *arguments: Any, scratch: Callable[[], Any]) -> None:
             *before, estimates, innovations = arguments
+            if hasattr(recursion, "RunResults"):
+                *before, (estimates, innovations) = arguments
             kept = copy.deepcopy((estimates.end, innovations.end, before[-1]))
             results = (estimates._replace(end=kept[0]), innovations._replace(end=kept[1]))
             calls.append(Call(loop, runs, (*before[:-1], kept[2]), results, scratch))

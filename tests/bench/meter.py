@@ -17,7 +17,7 @@ from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.streams.sources import MemorySource
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
-from tests.bench.loops import Call, calls_of
+from tests.bench.loops import Call, calls_of, handed_over
 
 OWN = "a user's own model"
 
@@ -31,7 +31,7 @@ def main(scenario: str, parameters: Mapping[str, Any], runs: int, estimator: str
         calls = calls_of(bound(scenario, estimator, sources), sources)
         taken.append(process_time() - begin)
     assert calls, "no filter is made of a model"
-    events = sum(len(call.before[0].time_ns) for call in calls)
+    events = sum(call.events for call in calls)
     least, begin = float("inf"), process_time()
     while process_time() < begin + 1.0:
         least = min(least, sum(loop_seconds(call) for call in calls))
@@ -62,7 +62,7 @@ def loop_seconds(call: Call) -> float:
     """CPU seconds of one more call of a loop, into the arrays that it filled before."""
     *columns, carried = call.before
     results = (type(each)(each.end.copy(), *each[1:]) for each in call.results)
-    arguments = (*columns, copy.deepcopy(carried), *results)
+    arguments = (*columns, copy.deepcopy(carried), *handed_over(*results))
     begin = process_time()
     call.loop(call.runs, *arguments, scratch=call.scratch)
     return process_time() - begin

@@ -275,6 +275,7 @@ def recorded_unit(unit: Unit) -> fl.MemorySource:
         stamps_ns(unit.sample_s),
         specific_force_mps2=unit.force_mps2,
         turn_rate_radps=np.stack([zero, zero, unit.turn_radps], axis=1),
+        magnetic_field_ut=np.empty((len(zero), 0)),
     )
     velocities = fl.make_stream(
         "/car/velocity",

@@ -254,6 +254,12 @@ def test_poses_that_are_the_truth(tmp_path: Path) -> None:
     names = "x_m,y_m,z_m,heading_rad,orientation_w,orientation_x,orientation_y,orientation_z"
     assert truth.metadata["components"] == names
     assert_allclose(truth["state"], [[3, 4, 5, 0.5, np.cos(half), 0, 0, np.sin(half)]], atol=1e-12)
+    placed = imported(path, truth="/r1/mocap", origin=[48.0, 11.0])[0]
+    stated = {topic for topic, each in placed.items() if "origin_latitude_deg" in each.metadata}
+    assert stated == {"/r1/truth"}
+    assert placed["/r1/truth"].metadata["origin_longitude_deg"] == "11.0"
+    adrift = imported(path, origin=[48.0, 11.0])[0]["/r1/odometry_pose"]
+    assert "origin_latitude_deg" not in adrift.metadata
     level: list[Sent] = [*sent, ("/level", START_NS, make("std_msgs/msg/Float64", data=0.75))]
     other = write_bag(tmp_path / "other", "mcap", level, make.store)
     for name, words in (

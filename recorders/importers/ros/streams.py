@@ -13,6 +13,7 @@ from recorders.importers.mapping import checked, not_finite
 from recorders.importers.ros.messages import Part
 from recorders.importers.ros.parameters import Clock
 from recorders.log import Schema, Stream, make_stream
+from recorders.log.planes import Origin, is_planar
 
 # Names of frames, and which messages (n,) name them.
 Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
@@ -59,11 +60,18 @@ class StreamMaker:
         first_ns: the first publish time of all.
     """
 
-    def __init__(self, path: Path, clock: Clock, names: Mapping[tuple[str, str], str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        clock: Clock,
+        names: Mapping[tuple[str, str], str],
+        origin: Origin | None = None,
+    ) -> None:
         self.told: Counter[tuple[str, str]] = Counter()
         self.came_of: dict[str, dict[str, None]] = defaultdict(dict)
         self.first_ns: int | None = None
         self._path, self._clock, self._names = path, clock, names
+        self._origin = origin
         self._written: dict[str, _Written] = {}
         self._streams: dict[tuple[str, ...], str] = {}
 
@@ -116,6 +124,13 @@ class StreamMaker:
             self._streams[key] = name if is_first else "/".join([name, *filter(None, frame.values())])
         return self._streams[key]
 
+    def _plane_of(self, topic: str, part: Part, metadata: Mapping[str, str]) -> dict[str, str]:
+        """The origin that a stream states: not one of transforms, nor of what an odometry adds up to."""
+        is_own = part.kind == "odometry_pose" or (topic, part.kind) not in self._names
+        if self._origin is None or is_own or not is_planar(part.schema.full_name, metadata):
+            return {}
+        return self._origin.metadata
+
     def _put(
         self,
         name: str,
@@ -134,6 +149,7 @@ class StreamMaker:
         if name not in self._written:
             stated = {key: in_words(value[0]) for key, value in constants.items()}
             metadata = {**{key: each for key, each in frame.items() if each}, **part.metadata, **stated}
+            metadata |= self._plane_of(sent.topic, part, metadata)
             first = {key: value[:1].copy() for key, value in constants.items()}
             self._written[name] = _Written(part.schema, metadata, widths, first)
         written = self._written[name]

@@ -162,6 +162,10 @@ class Estimator(Generic[ParametersType]):
     def __str__(self) -> str:
         return self.summary
 
+    def specified(self, label: str, settings: Mapping[str, Any]) -> "Estimator[Any]":  # noqa: ARG002
+        """The estimator that settings make of it: another where they name a foreign filter."""
+        return self
+
     # one of any model has these by what the name says: `_OfAnyModel`
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:  # noqa: ARG002
         """The parameters that count under a name with this variant, such as `smoother:iterated`."""
@@ -212,10 +216,19 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
             f"estimator '{label}': a label may have letters, digits and '-', '_', ':', '=' alone; "
             "choose another"
         )
+    estimator, values = specified(label, settings)
+    return estimator, build(estimator.parameters, values, f"estimator {label}")
+
+
+def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], dict[str, Any]]:
+    """Return the estimator of a label and the values of its parameters, which are not checked yet.
+
+    Raises BadInput where the name is unknown, or a foreign filter may not be run or does not answer.
+    """
     values = dict(settings)
     kind = values.pop("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
-    return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
+    return estimator.specified(label, values), {**values, **variant}
 
 
 @contextmanager

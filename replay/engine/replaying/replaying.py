@@ -13,6 +13,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock
+from recorders.log.planes import common_origin
 from replay.engine.replaying.estimator import Batch, Bound, Recursive, code_of
 from replay.engine.replaying.late import Late, taking_late
 from replay.engine.replaying.monitor import RunMonitor
@@ -91,8 +92,9 @@ def replay(
         RunMonitor(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
         for bound in estimators
     ]
+    plane = common_origin({name: topic.metadata for name, topic in ensemble[0].topics.items()})
     for monitor, static in zip(monitors, statics, strict=True):
-        monitor.static = static
+        monitor.static, monitor.plane = static, plane
         if report is None:  # nobody asks what became of measurements
             monitor.usage.shares.end(is_known=False)
         monitor.usage.note_start(static)

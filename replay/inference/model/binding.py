@@ -7,16 +7,20 @@ as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is l
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from recorders.errors import BadInput
 from recorders.log import Schema, Topic, schemas
+from recorders.log.planes import FRAME, plane_in_words, stated_in
 from replay.engine.arrays import Floats
 from replay.engine.streams.channels import resolved
-from replay.engine.streams.geodetic import GEODETIC
+from replay.engine.streams.geodetic import GEODETIC, stated_origin
 from replay.engine.streams.results import named
 from replay.inference.model.model import (
     Control,
     Model,
     Sensor,
 )
+
+START = "start"  # the frame of what begins at zero, wherever that is
 
 
 class Found(NamedTuple):
@@ -31,6 +35,7 @@ class Found(NamedTuple):
         has_prior: whether the log does; else see `replay.inference.run.initialization`.
         fallbacks: topics that take the place of some components of the control.
         origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
+        frame: the frame of its own that its positions are in; empty where they are in the log's plane.
     """
 
     prefix: str
@@ -41,6 +46,7 @@ class Found(NamedTuple):
     has_prior: bool = True
     fallbacks: tuple[tuple[Control, Topic], ...] = ()
     origin: Floats | None = None
+    frame: str = ""
 
     @property
     def geodetic(self) -> tuple[Topic, ...]:
@@ -157,3 +163,38 @@ def _suffices(
 def measures_state(model: Model, sensor: Sensor) -> bool:
     """Tell whether a sensor measures components of the state by their names, with their covariance."""
     return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
+
+
+def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Found:
+    """Find the plane that positions are in: the log's, or a frame of its own; see `Filter.start`.
+
+    Raises BadInput where a sensor says where the thing is in a frame of its own, and another one on
+    earth; and where fixes are used and channels state different origins.
+    """
+    placing = [(sensor, topic) for sensor, topic in found.sensors if "x_m" in sensor.measured]
+    if "x_m" not in model.state:
+        placing = []
+    own = [
+        (sensor, topic)
+        for sensor, topic in placing
+        if topic not in found.geodetic
+        and stated_in(topic.name, topic.metadata) is None
+        and (topic.metadata.get(FRAME) or found.geodetic)
+    ]
+    origin = stated_origin(topics) if found.geodetic else None
+    if origin is not None:
+        own = [(sensor, topic) for sensor, topic in own if topic.metadata.get(FRAME)]
+    if own and len(own) < len(placing):
+        (sensor, topic), other = own[0], next(each for each in placing if each not in own)
+        raise BadInput(
+            f"estimator {label}: {other[1].name} says where on earth, {topic.name} in "
+            f"{plane_in_words(topic.metadata)}, and no channel states where on earth that is; state it "
+            f"with --set {topic.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or leave one of them out with "
+            f"--set topics.{other[0].topic}= or --set topics.{sensor.topic}="
+        )
+    if own:
+        return found._replace(frame=own[0][1].metadata[FRAME])
+    starts_anywhere = not found.has_prior and not model.finds_start and model.start is not None
+    if starts_anywhere and not placing and model.control is not None:
+        return found._replace(frame=START)
+    return found._replace(origin=origin)

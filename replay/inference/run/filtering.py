@@ -1,13 +1,14 @@
 """Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.log import Topic, schemas
+from recorders.log.planes import FRAME
 from replay.distributions import chi2
 from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
@@ -31,6 +32,8 @@ from replay.inference.run.recursion import (
     FilterEvents,
     Innovations,
     RecursionState,
+    RunInputs,
+    RunResults,
     filled,
     no_results,
     recursion,
@@ -309,12 +312,16 @@ class Filter:
         for part, sets in self.sets(generators, events):
             loop(
                 part.stop - part.start,
-                events._replace(offsets=events.offsets[part.start : part.stop + 1]),
-                settings[part],
-                self.gates,
+                RunInputs(
+                    events._replace(offsets=events.offsets[part.start : part.stop + 1]),
+                    settings[part],
+                    self.gates,
+                ),
                 of_runs(carried, part),
-                estimates._replace(end=estimates.end[part]),
-                innovations._replace(end=innovations.end[part]),
+                RunResults(
+                    estimates._replace(end=estimates.end[part]),
+                    innovations._replace(end=innovations.end[part]),
+                ),
                 scratch=partial(steps.memory, sets),
             )
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
@@ -368,6 +375,8 @@ class Filter:
             estimates.mean,
             estimates.covariance,
         )
+        if self.found.frame:
+            stream = replace(stream, metadata={**stream.metadata, FRAME: self.found.frame})
         return Ragged(stream, offsets)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:

@@ -9,12 +9,12 @@ told when no message can change it any more.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.log import make_stream, schemas
-from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.arrays import Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.streams.results import ALL_WELL, failures_of
@@ -40,6 +40,8 @@ from replay.inference.run.recursion import (
     FilterEvents,
     Innovations,
     RecursionState,
+    RunInputs,
+    RunResults,
     fault_of,
     filled,
     processing,
@@ -47,6 +49,13 @@ from replay.inference.run.recursion import (
 from replay.sampling.sets import sets_by_runs
 
 # The loop
+
+
+class Repeats(NamedTuple):
+    """Holds how many updates each event had repeated (n,), and the row that each run is at (runs,)."""
+
+    updates: Integers
+    row: Integers
 
 
 @lru_cache(maxsize=64)
@@ -90,15 +99,14 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
     def process_again(
         run: int,
         row: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
+        inputs: RunInputs,
         carried: RecursionState,
         kept: KeptMessages,
         at: Integers,
         memory: Any,
     ) -> int:
         """Predict to a kept message and update by it; returns what failed, or ALL_WELL."""
+        events = inputs.events
         stored = FilterEvents(
             events.offsets,
             kept.time_ns,
@@ -116,7 +124,8 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
             for j in range(kept.difference.shape[1]):
                 kept.covariance[row, i, j] = np.nan
         at[run] = row
-        failure = process(run, row, stored, settings, gates, carried, records, memory)
+        again = RunInputs(stored, inputs.settings, inputs.gates)
+        failure = process(run, row, again, carried, records, memory)
         kept.has_innovation[row] = at[run] > row
         restore(carried, run, kept.after, row)
         return failure
@@ -148,32 +157,27 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
 
     def follow(
         run: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
+        inputs: RunInputs,
         window_ns: int,
         carried: RecursionState,
         history: History,
-        estimates: Any,
-        innovations: Innovations,
-        repeated: Integers,
-        at: Integers,
+        results: RunResults,
+        repeats: Repeats,
         memory: Any,
     ) -> None:
         """Move what is carried and kept, and fill the results, until the events end or the run fails."""
+        events, (estimates, innovations) = inputs.events, results
         kept, capacity = history.kept, len(history.kept.time_ns) // len(history.first)
         for event in range(events.offsets[run], events.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
             begin = insert(run, event, events, history, capacity)
             last = run * capacity + history.first[run] + history.counts[run] - 1
-            repeated[event] = last - begin
+            repeats.updates[event] = last - begin
             restore(kept.after, begin - 1, carried, run)
             failure = ALL_WELL
             for row in range(begin, last + 1):
-                failure = process_again(
-                    run, row, events, settings[run], gates, carried, kept, at, memory
-                )
+                failure = process_again(run, row, inputs, carried, kept, repeats.row, memory)
                 if failure != ALL_WELL:
                     break
             if failure == ALL_WELL and events.wants_estimate[event]:
@@ -232,16 +236,12 @@ class OutOfSequenceFilter:
         sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
         loop(
             runs,
-            events,
-            np.repeat(inner.settings[None], runs, axis=0),
-            inner.gates,
+            RunInputs(events, np.repeat(inner.settings[None], runs, axis=0), inner.gates),
             self.window_ns,
             carried,
             history,
-            estimates,
-            innovations,
-            repeated,
-            np.zeros(runs, np.int64),
+            RunResults(estimates, innovations),
+            Repeats(repeated, np.zeros(runs, np.int64)),
             scratch=partial(steps.memory, sets),
         )
         states, *others = inner.output_streams(*filled(estimates, due))

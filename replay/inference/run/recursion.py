@@ -22,6 +22,8 @@ from replay.inference.kalman.steps import (
     NOTHING_MEASURED,
     UNKNOWN,
     InnovationRecord,
+    Interval,
+    Measurement,
     Steps,
 )
 from replay.inference.linear_algebra.tuples import range_of
@@ -98,6 +100,27 @@ class Innovations(NamedTuple):
     numbers: Floats
 
 
+class RunInputs(NamedTuple):
+    """Holds what a recursion goes by, in all runs.
+
+    Attributes:
+        events: in the order in which they are processed.
+        settings: (runs, 1 + sensors, fields), see `settings_of`.
+        gates: (sensors + 1, m + 1), bounds of the NIS by sensor; the last row is an open gate's.
+    """
+
+    events: FilterEvents
+    settings: Floats
+    gates: Floats
+
+
+class RunResults(NamedTuple):
+    """Holds what a recursion fills in: the method's own estimates, and innovations."""
+
+    estimates: Any
+    innovations: Innovations
+
+
 ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
 
 
@@ -160,7 +183,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         steps: the method's steps for it.
         settings_of: `settings_of(settings, row)` makes a row's parameters.
 
-    Returns `process(run, event, events, settings, gates, carried, innovations, memory)`.
+    Returns `process(run, event, inputs, carried, innovations, memory)`.
     """
     predict = steps.predict
     update = choosing(steps.updates)
@@ -177,29 +200,21 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 carried.control[run, k] = data[first + k]
 
     def advance(
-        run: int,
-        event: int,
-        duration_s: float,
-        events: FilterEvents,
-        settings: Floats,
-        carried: RecursionState,
-        memory: Any,
+        run: int, event: int, duration_s: float, inputs: RunInputs, carried: RecursionState, memory: Any
     ) -> bool:
         """Predict to an event."""
-        control = carried.control[run]
-        first = events.data.shape[1] - controls
+        control, data = carried.control[run], inputs.events.data[event]
+        first = len(data) - controls
         if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
             for k in range(controls):
-                control[k] = 0.5 * (control[k] + events.data[event, first + k])
-        parameters = settings_of(settings, 0)
-        return predict(run, carried.belief, control, duration_s, parameters, event, memory)
+                control[k] = 0.5 * (control[k] + data[first + k])
+        interval = Interval(control, duration_s, settings_of(inputs.settings[run], 0), event)
+        return predict(run, carried.belief, interval, memory)
 
     def process(
         run: int,
         event: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
+        inputs: RunInputs,
         carried: RecursionState,
         innovations: Innovations,
         memory: Any,
@@ -208,6 +223,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
         UNKNOWN in a gap of the control after which it goes on.
         """
+        events, gates = inputs.events, inputs.gates
         source, data = events.source[event], events.data[event]
         duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
@@ -217,7 +233,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 carried.control[run, :] = np.nan
                 return UNKNOWN
             carried.time_ns[run] = events.time_ns[event]
-            if not advance(run, event, duration_s, events, settings, carried, memory):
+            if not advance(run, event, duration_s, inputs, carried, memory):
                 return NOT_POSITIVE_DEFINITE
         if duration_s >= 0.0 if interpolated else source == CONTROL:
             drive(run, data, carried)
@@ -226,10 +242,11 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             record = InnovationRecord(
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
-            parameters = settings_of(settings, source + 1)
+            parameters = settings_of(inputs.settings[run], source + 1)
             waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
-            outcome = update(source, run, carried.belief, data, parameters, gate, event, memory, record)
+            measurement = Measurement(data, parameters, gate, event)
+            outcome = update(source, run, carried.belief, measurement, memory, record)
             if outcome >= 0:
                 return outcome
             if outcome == ALL_WELL:
@@ -253,28 +270,19 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         steps: the method's steps for it.
         settings_of: see above.
 
-    Returns `follow(run, events, settings, gates, carried, estimates, innovations, memory)`, with
-    settings (runs, 1 + sensors, fields) and gates (sensors + 1, m + 1); it changes what is carried in
-    place.
+    Returns `follow(run, inputs, carried, results, memory)`; it changes what is carried in place.
     """
     process, estimate = processing(stage, steps, settings_of), steps.estimate
 
     def follow(
-        run: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
-        carried: RecursionState,
-        estimates: Estimates,
-        innovations: Innovations,
-        memory: Any,
+        run: int, inputs: RunInputs, carried: RecursionState, results: RunResults, memory: Any
     ) -> None:
         """Move what is carried, and fill the results, until the events end or the run fails."""
-        start_ns = carried.time_ns[run]
+        events, estimates, start_ns = inputs.events, results.estimates, carried.time_ns[run]
         for event in range(events.offsets[run], events.offsets[run + 1]):
             if carried.failure[run] != ALL_WELL:
                 break
-            failure = process(run, event, events, settings[run], gates, carried, innovations, memory)
+            failure = process(run, event, inputs, carried, results.innovations, memory)
             if (
                 failure == ALL_WELL
                 and events.wants_estimate[event]

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.trajectories import Trajectory
+from replay.engine.streams.planes import HEADING
 from replay.engine.vectors.components import stated_components
 from replay.engine.vectors.tangent import manifold_blocks, tangent_components
-from replay.judging.errors.alignment import HEADING
 from replay.judging.errors.evaluation import POSITION
 from replay.judging.errors.trajectories import POSE_KINDS
 
