@@ -17,11 +17,8 @@ from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
 from replay.engine.streams.sources import LogSource, MemorySource
 
 AXES = "xyz"
-<<<<<<< HEAD
 STATED = "covariance_rad2"  # by a channel of orientations: their variances
-=======
 ALL_TOPICS = "/*"
->>>>>>> main
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
 WHATS = {
     "delay_s": "The stamps are so late, and are taken back by it.",

@@ -7,13 +7,9 @@ import numpy as np
 from pipeline.api.replays import Replay
 from pipeline.diagnosing.findings import Finding
 from pipeline.output.results import MetricValue, split_metric
-<<<<<<< HEAD
 from recorders.log import Stream, schemas
 from replay.engine.streams.sources import LogSource, MemorySource
-=======
-from recorders.log import Stream
 from replay.judging.consistency.consistency import CONSISTENT
->>>>>>> main
 from replay.judging.consistency.whiteness import whitened
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 from replay.judging.metrics.measuring import metric_key

@@ -274,13 +274,9 @@ def diagnose(
         )
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
-<<<<<<< HEAD
-    settings = merge(own, given)
+    settings = merge(own, allowed(given))
     bound = bind(label, [source], {"kind": label, **settings})
     source = until_last_measured(source, bound)
-=======
-    settings = merge(own, allowed(given))
->>>>>>> main
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
