@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
-from pipeline.diagnosing.hypotheses import Kind
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
 from recorders.plausibility.checks import BLOCK, findings_in
 from recorders.plausibility.finding import Cause
@@ -21,6 +21,7 @@ from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
+FIRST = ("lost messages", "stamps")  # what stands before causes: it is seen without any filter
 TAIL = 3.0  # standard deviations
 IMPROBABLE = 1e-4
 WINDOW = 30  # innovations, over which NIS is averaged to see a filter diverge
@@ -53,29 +54,47 @@ KINDS: Mapping[Cause, Kind] = {
     "lost messages": "lost messages",
     "clock": "clock drift",
     "delay": "delay",
-    "unit": "values",
-    "scale": "values",
-    "sign": "values",
-    "gravity": "values",
-    "quaternion": "values",
+    "unit": "factor or sign",
+    "scale": "factor or sign",
+    "sign": "factor or sign",
+    "gravity": "factor or sign",
+    "quaternion": "convention",
     "mounting": "bias or turned frame",
     "covariance": "measurement noise",
 }
+NOISE = ("measurement noise", "process noise", "outliers")
 
 
-def of_plausibility(
-    source: LogSource | MemorySource, streamed: Collection[str], advised: Iterable[str]
-) -> Iterator[Finding]:
-    """What a log says of its own faults before any filter, of the topics that an estimator reads.
-
-    `advised` are settings that are advised already.
-    """
-    named = {each.partition("=")[0] for each in advised} - {""}
+def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str]) -> Iterator[Finding]:
+    """What a log says of its own faults before any filter, of the topics that an estimator reads."""
     topics = [topic for topic in source.topics if is_sensed(source, topic)]
     for each in findings_in(source.blocks(topics, "publish_time", BLOCK)):
-        if each.topic in streamed and each.key not in named:
+        if each.topic in streamed:
             setting = f"{each.key}={each.setting}" if each.key else ""
             yield Finding(KINDS[each.cause], each.topic, each.mended, None, setting)
+
+
+def of_log(
+    source: LogSource | MemorySource, streamed: Collection[str], causes: Collection[tuple[Kind, str]]
+) -> tuple[list[Finding], list[Finding]]:
+    """What is seen without a filter: what stands before the causes, and the rest.
+
+    `causes` are kinds and topics that likelihoods name. These know the number better, and leave out what
+    is told of the same topic, where both are of its noise or both are not.
+    """
+    known = {(kind in NOISE, topic) for kind, topic in causes}
+    before = [
+        each
+        for each in of_plausibility(source, streamed)
+        if each.kind in FIRST or (each.kind in NOISE, each.topic) not in known
+    ]
+    told = {(each.kind, each.topic) for each in before}
+    streams = (source.read([topic])[topic] for topic in streamed)
+    others = [
+        each for each in of_messages(streams, source.epoch_ns) if (each.kind, each.topic) not in told
+    ]
+    before += [each for each in others if each.kind in FIRST]
+    return before, [each for each in others if each.kind not in FIRST]
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
@@ -196,7 +215,8 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
     stamps_ns = np.unique(stream.publish_time_ns)
     steps = np.diff(stamps_ns)
     if len(steps) >= FEWEST:
-        usual = float(np.median(steps))
+        least = float(np.quantile(steps, 0.1))
+        usual = float(np.median(steps[steps < 1.5 * least]))  # also where half of the messages are lost
         multiples = np.rint(steps / usual)
         is_regular = np.abs(steps / usual - multiples) < 0.2
         gaps = np.flatnonzero(is_regular & (multiples > 1))

@@ -9,11 +9,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
+from pipeline.diagnosing.battery.car import FAULTS, Car, drive
 from recorders.models.geodesy import out_of_tangent_plane
-from tests.pipeline.car_d import FAULTS, Car, drive
 
 BERLIN = (52.5, 13.4, 40.0)
 FOOT_M = 0.3048
+SPAN_S = 50.0  # of the drive
 NAMES = (
     "Datum;Uhrzeit (CET);Geschwindigkeit [km/h];Gierrate [°/s];Breite [°];Länge [°];Höhe [ft];"
     "Kompass [°];Genauigkeit [ft]"
@@ -37,7 +38,7 @@ def dump(car: Car, place: Path) -> None:
         (at_s, f";;;;;{angle:.4f};") for at_s, angle in zip(car.compass_s, compass_deg, strict=True)
     ]
     lines = [NAMES]
-    for at_s, cells in sorted(rows):
+    for at_s, cells in sorted(row for row in rows if row[0] <= SPAN_S):
         minutes, milliseconds = divmod(round(1000 * at_s), 60_000)
         clock = f"05.10.2026;14:{3 + minutes:02d}:{milliseconds // 1000:02d},{milliseconds % 1000:03d}"
         lines.append(f"{clock};{cells.replace('.', ',')}")
@@ -59,26 +60,27 @@ def test_a_german_dump_is_imported_by_one_command(fuselog: Callable[..., Any], t
     log = fl.open(imported(car, tmp_path, fuselog))
     assert set(log) == {"/odometry", "/fix", "/heading"}
     wheels, fixes, compass = log["/odometry"], log["/fix"], log["/heading"]
-    assert_allclose(wheels["forward_mps"], car.speed_mps, atol=1e-6)
-    assert_allclose(wheels["turn_radps"], car.turn_radps, atol=1e-7)
+    assert_allclose(wheels["forward_mps"], car.speed_mps[: len(wheels)], atol=1e-6)
+    assert_allclose(wheels["turn_radps"], car.turn_radps[: len(wheels)], atol=1e-7)
     assert np.datetime64(int(wheels.publish_time_ns[1]), "ns") == np.datetime64("2026-10-05T13:03:00.1")
     assert_allclose(fixes["altitude_m"], BERLIN[2], atol=1e-3)
     assert_allclose(fixes["covariance_m2"][0], np.diag([0.25, 0.25, 1.0]).ravel(), rtol=1e-5)
-    half = 0.5 * car.compass_rad
+    half = 0.5 * car.compass_rad[: len(compass)]
     turned = compass["quaternion"][:, 0] * np.cos(half) + compass["quaternion"][:, 3] * np.sin(half)
     assert_allclose(np.abs(turned), 1.0, atol=1e-9)
     said = fuselog("info", tmp_path / "drive.mcap", "--json")
     assert said.json["findings"] == []
 
 
-# What is named first, of each fault; and of two, among the first three.
+# The setting that is named first, of each fault; of two both are among the first three.
 NAMED = {
-    "speed x 3.6": {"/odometry.forward_scale": 1 / 3.6},
+    "speed x 3.6": {"forward_scale": 1 / 3.6},
     "turn rate's sign": {"/odometry.turn_scale": -1.0},
     "degrees as radians": {"/odometry.turn_scale": np.pi / 180.0},
     "fixes .3 s late": {"/fix.delay_s": 0.3},
     "fix variance x 4": {"/fix.covariance_scale": 0.25},
-    "speed x 3.6, turn rate's sign": {"/odometry.forward_scale": 1 / 3.6, "/odometry.turn_scale": -1.0},
+    "lever (2, .6) m": {"lever_x_m": 2.0, "lever_y_m": 0.6},
+    "speed x 3.6 + lever (2, .6) m": {"forward_scale": 1 / 3.6, "lever_x_m": 2.0, "lever_y_m": 0.6},
 }
 
 
@@ -88,9 +90,10 @@ def test_each_fault_of_the_dump_is_named_first(
     fuselog: Callable[..., Any], tmp_path: Path, names: str
 ) -> None:
     car = drive(3)
-    for name in names.split(", "):
+    for name in names.split(" + "):
         car = FAULTS[name](car)
     found = fl.diagnose(imported(car, tmp_path, fuselog), "ekf").sentences
-    first = dict(each.setting.split("=") for each in found[: 1 if len(NAMED[names]) == 1 else 3])
+    told = " ".join(each.setting for each in found[: 3 if "+" in names else 1])
+    first = dict(each.split("=") for each in told.split())
     for key, value in NAMED[names].items():
-        assert float(first[key]) == pytest.approx(value, rel=0.15)
+        assert float(first[key]) == pytest.approx(value, rel=0.4)

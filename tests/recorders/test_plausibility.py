@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.diagnosing.battery.car import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose
 from recorders.plausibility.body import bodies
@@ -13,7 +14,6 @@ from recorders.plausibility.checks import findings
 from recorders.plausibility.motion import Motion
 from recorders.plausibility.speeds import scatter
 from recorders.recording import record_run
-from tests.pipeline.car_d import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
 
 FOUND = {  # of car D with its compass: cause, topic and setting that are named first
     "nothing": None,
@@ -34,8 +34,8 @@ FOUND = {  # of car D with its compass: cause, topic and setting that are named 
     "fixes 18 s late": ("delay", "/car/fix", "/car/fix.delay_s"),
     "half of the odometry lost": ("lost messages", "/car/odometry", ""),
     "gyro density / 5": None,
-    "compass + 4.5 deg": ("mounting", "/car/compass", ""),
-    "compass clockwise from north": ("sign", "/car/compass", ""),
+    "compass + 4.5 deg": ("mounting", "/car/heading", ""),
+    "compass clockwise from north": ("sign", "/car/heading", ""),
 }
 OF_UNIT = {
     "nothing": None,

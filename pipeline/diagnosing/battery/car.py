@@ -1,6 +1,7 @@
-"""Car D of the sheet of sensors, section 3: wheels, a gyroscope, fixes and a compass, without a prior.
+"""A car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; with and without prior.
 
-Its faults by name, the inertial unit that may ride with it, with its own, and logs of both.
+Its faults by name, the inertial unit that may ride with it, with its own, and logs of both. Faults are
+put into the columns themselves, not by what a diagnosis undoes them with.
 """
 
 from collections.abc import Callable
@@ -9,14 +10,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import fuselog as fl
-from recorders.log import RunMetadata, Stream
+from recorders.log import RunMetadata, Stream, make_stream, schemas
+from replay.engine.streams.sources import MemorySource
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.floating]
 DURATION_S, REST_S, RAMP_S = 100.0, 10.0, 5.0
 FIX_SIGMA_M, COMPASS_SIGMA_RAD = 0.5, 0.03
 FORWARD_DENSITY, TURN_DENSITY = 0.05, 0.01
 GRAVITY_MPS2 = 9.81
+START_SIGMAS = np.array([1.0, 1.0, 0.1])  # of a prior, in m and rad
 
 
 class Truth(NamedTuple):
@@ -162,13 +164,13 @@ def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
     return np.rint(1e9 * times_s).astype(np.int64)
 
 
-def recorded(car: Car, *, has_compass: bool = True) -> fl.MemorySource:
-    """The car as a log, which `fl.write` writes."""
+def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
+    """The car as a log, which `fl.write` writes; a prior is about the true start."""
     n, half = len(car.fix_s), 0.5 * car.compass_rad
     zero = np.zeros_like(half)
-    wheels = fl.make_stream(
+    wheels = make_stream(
         "/car/odometry",
-        fl.schemas.ODOMETRY,
+        schemas.ODOMETRY,
         stamps_ns(car.odometry_s),
         metadata={
             "forward_noise_density": repr(FORWARD_DENSITY),
@@ -177,29 +179,37 @@ def recorded(car: Car, *, has_compass: bool = True) -> fl.MemorySource:
         forward_mps=car.speed_mps,
         turn_radps=car.turn_radps,
     )
-    fixes = fl.make_stream(
+    fixes = make_stream(
         "/car/fix",
-        fl.schemas.POSITION_FIX,
+        schemas.POSITION_FIX,
         stamps_ns(car.fix_s),
         position_m=car.fix_m,
         covariance_m2=np.tile(car.fix_variance_m2 * np.eye(2).ravel(), (n, 1)),
     )
-    compass = fl.make_stream(
-        "/car/compass",
-        fl.schemas.ORIENTATION,
+    compass = make_stream(
+        "/car/heading",
+        schemas.ORIENTATION,
         stamps_ns(car.compass_s),
         metadata={"covariance_rad2": ",".join(3 * [repr(COMPASS_SIGMA_RAD**2)])},
         quaternion=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
     )
-    return source([wheels, fixes, *[compass] * has_compass])
+    prior = make_stream(
+        "/car/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        np.zeros(1, np.int64),
+        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+        mean=car.truth.pose[:1],
+        covariance=np.diag(START_SIGMAS**2).ravel()[None],
+    )
+    return source([wheels, fixes, *[compass] * has_compass, *[prior] * has_prior])
 
 
-def source(streams: list[Stream]) -> fl.MemorySource:
+def source(streams: list[Stream]) -> MemorySource:
     """Streams as a recording of a car."""
-    return fl.MemorySource({each.topic: each for each in streams}, RunMetadata("car", epoch_ns=0), "car")
+    return MemorySource({each.topic: each for each in streams}, RunMetadata("car", epoch_ns=0), "car")
 
 
-def car(seed: int, stated: float = 1.0) -> fl.MemorySource:
+def car(seed: int, stated: float = 1.0) -> MemorySource:
     """The log without a compass; its fixes state so many times their variance."""
     clean = drive(seed)
     return recorded(clean._replace(fix_variance_m2=stated * clean.fix_variance_m2), has_compass=False)
@@ -266,20 +276,20 @@ UNIT_FAULTS: dict[str, Callable[[Unit], Unit]] = {
 }
 
 
-def recorded_unit(unit: Unit) -> fl.MemorySource:
+def recorded_unit(unit: Unit) -> MemorySource:
     """The log of the unit and of the receiver's velocities."""
     zero = np.zeros_like(unit.turn_radps)
-    samples = fl.make_stream(
+    samples = make_stream(
         "/car/inertial",
-        fl.schemas.INERTIAL_SAMPLE,
+        schemas.INERTIAL_SAMPLE,
         stamps_ns(unit.sample_s),
         specific_force_mps2=unit.force_mps2,
         turn_rate_radps=np.stack([zero, zero, unit.turn_radps], axis=1),
         magnetic_field_ut=np.empty((len(zero), 0)),
     )
-    velocities = fl.make_stream(
+    velocities = make_stream(
         "/car/velocity",
-        fl.schemas.VELOCITY_FIX,
+        schemas.VELOCITY_FIX,
         stamps_ns(unit.velocity_s),
         velocity_mps=unit.velocity_mps,
         covariance_m2ps2=np.tile(0.01 * np.eye(2).ravel(), (len(unit.velocity_s), 1)),
