@@ -307,8 +307,8 @@ def diagnose(
             "measurements alone"
         )
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
-    named = [(each.hypothesis.kind, each.hypothesis.topic) for each in causes]
-    before, after = of_log(source, streamed, named)
+    named = [each.hypothesis for cause in causes for each in (cause, *cause.others)]
+    before, after = of_log(source, streamed, [(each.kind, each.topic) for each in named])
     of_stamps = [each for each in before if each.kind in FIRST]
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence(*each[:4], setting=each.setting) for each in before]
