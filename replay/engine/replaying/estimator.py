@@ -105,6 +105,9 @@ class Recursive:
             where its parameters do not let it.
         initialization: how it finds what a log does not state; None where that states all.
         assumed: the parameters that are assumed, since the log does not state them.
+        is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
+            parameters.
+        offers: by topic that it does not take, the setting with which it would.
         reading: what it reads; None where that is not known.
     """
 
@@ -120,6 +123,8 @@ class Recursive:
     out_of_sequence: "Callable[[int], Recursive] | None" = None
     initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
+    is_random: bool = False
+    offers: Mapping[str, str] = field(default_factory=dict)
     reading: Callable[[], Reading] | None = None
 
 
@@ -150,7 +155,8 @@ class Estimator(Generic[ParametersType]):
 
     `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
     for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
-    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets. `label` is what it is called
+    where it is given without one.
     """
 
     summary: str
@@ -158,6 +164,7 @@ class Estimator(Generic[ParametersType]):
     parameters: type[ParametersType]
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
     variant: str | None = None
+    label: str = "own"
 
     def __str__(self) -> str:
         return self.summary
