@@ -94,6 +94,7 @@ def modelled_by(
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
+        label=name,
     )
 
 
@@ -165,7 +166,8 @@ def _any_parameters(method: Method) -> type[Parameters]:
                 kind = _accepted(field)
                 other = fields.get(name, (kind,))[0]
                 meaning = _of_models(told[name])
-                fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
+                unset = Field(None, description=meaning, validate_default=False)
+                fields[name] = (kind if other == kind else Any, unset)
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
 
 
@@ -275,7 +277,8 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, initialization=initialization, assumed=assumed)
+        is_random = method.is_random or any(each.redrawn for each in samplers)
+        made = replace(made, initialization=initialization, assumed=assumed, is_random=is_random)
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 

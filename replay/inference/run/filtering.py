@@ -310,20 +310,13 @@ class Filter:
         if any(each.redrawn for each in self.samplers):
             generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
         for part, sets in self.sets(generators, events):
-            loop(
-                part.stop - part.start,
-                RunInputs(
-                    events._replace(offsets=events.offsets[part.start : part.stop + 1]),
-                    settings[part],
-                    self.gates,
-                ),
-                of_runs(carried, part),
-                RunResults(
-                    estimates._replace(end=estimates.end[part]),
-                    innovations._replace(end=innovations.end[part]),
-                ),
-                scratch=partial(steps.memory, sets),
+            own = events._replace(offsets=events.offsets[part.start : part.stop + 1])
+            results = RunResults(
+                estimates._replace(end=estimates.end[part]),
+                innovations._replace(end=innovations.end[part]),
             )
+            inputs, memory = RunInputs(own, settings[part], self.gates), partial(steps.memory, sets)
+            loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=memory)
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
