@@ -16,8 +16,7 @@ import pandas as pd
 
 from pipeline.altering.sources import alterations_of, setting_of, split_settings
 from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Kind as EstimatorKind
-from pipeline.api.planning import Log, settings_of, sources_of
+from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
@@ -225,7 +224,7 @@ def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outc
 
 def diagnose(
     log: Log,
-    estimator: str | Mapping[str, EstimatorKind] | None = None,
+    estimator: Named | None = None,
     *,
     set: Mapping[str, Any] | None = None,  # noqa: A002
     gap_limit_s: float = 0.2,
@@ -316,12 +315,12 @@ def diagnose(
 
 
 def _asked(
-    source: LogSource | MemorySource, estimator: str | Mapping[str, EstimatorKind] | None
+    source: LogSource | MemorySource, estimator: Named | None
 ) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
     """The log and the one estimator that are asked for; of estimates the log that they are of."""
     if any(topic.startswith("/estimates/") for topic in source.topics) and isinstance(source, LogSource):
         stated = stated_estimators(source.log)
-        labels = [estimator] if isinstance(estimator, str) else list(estimator or stated)
+        labels = list(stated if estimator is None else settings_of(estimator))
         for label in labels:
             if label not in stated:
                 raise BadInput(f"{source.name}: no estimates of {label}; {choices(label, stated)}")

@@ -194,9 +194,9 @@ class Motion:
         if self.courses is None:
             return None
         windows = turned(self.courses, self.turn_span_s)
-        for likened in (self.aligned, self.likened):
-            told = slope(turn_between(likened(source), windows.begin_s, windows.end_s), windows.values)
-            if told.sign:
+        for moved in (source, self.aligned(source), self.likened(source)):
+            told = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
+            if told.sign > 0:
                 break
         return told
 

@@ -94,6 +94,7 @@ def modelled_by(
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
+        label=name,
     )
 
 
@@ -165,7 +166,8 @@ def _any_parameters(method: Method) -> type[Parameters]:
                 kind = _accepted(field)
                 other = fields.get(name, (kind,))[0]
                 meaning = _of_models(told[name])
-                fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
+                unset = Field(None, description=meaning, validate_default=False)
+                fields[name] = (kind if other == kind else Any, unset)
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
 
 
@@ -276,7 +278,9 @@ def bind_model(
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
         offers = offers_of(model, found, topics)
-        made = replace(made, initialization=initialization, assumed=assumed, offers=offers)
+        is_random = method.is_random or any(each.redrawn for each in samplers)
+        made = replace(made, initialization=initialization, assumed=assumed)
+        made = replace(made, is_random=is_random, offers=offers)
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 

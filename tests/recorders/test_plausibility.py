@@ -70,8 +70,10 @@ def motion_of(streams: Mapping[str, Stream]) -> Motion:
 
 def test_a_winding_road_is_no_wrong_sign() -> None:
     """Bends of one length: half a period late, the turn rate would be the other way round."""
-    odometry, fix, _ = car(HERE.metadata, HERE.metadata)
-    assert findings({each.topic: each for each in (odometry, fix)}) == []
+    for seed in (4, 7):
+        odometry, fix, _ = car(HERE.metadata, HERE.metadata, seed)
+        told = findings({each.topic: each for each in (odometry, fix)})
+        assert "sign" not in [each.cause for each in told]
 
 
 @pytest.mark.parametrize("name", SHEET)

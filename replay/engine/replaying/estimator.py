@@ -75,6 +75,8 @@ class Recursive:
         initialization: how it finds what a log does not state; None where that states all.
         assumed: the parameters that are assumed, since the log does not state them.
         offers: by topic that it does not take, the setting with which it would.
+        is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
+            parameters.
     """
 
     name: str
@@ -90,6 +92,7 @@ class Recursive:
     initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
     offers: Mapping[str, str] = field(default_factory=dict)
+    is_random: bool = False
 
 
 @renamed(whole="static")
@@ -119,7 +122,8 @@ class Estimator(Generic[ParametersType]):
 
     `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
     for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
-    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets. `label` is what it is called
+    where it is given without one.
     """
 
     summary: str
@@ -127,6 +131,7 @@ class Estimator(Generic[ParametersType]):
     parameters: type[ParametersType]
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
     variant: str | None = None
+    label: str = "own"
 
     def __str__(self) -> str:
         return self.summary
