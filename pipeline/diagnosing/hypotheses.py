@@ -25,6 +25,7 @@ from recorders.parameters import Parameters
 from replay.engine.replaying.estimator import Bound
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
+from replay.engine.vectors.components import components_of, stated_components
 from replay.judging.errors.evaluation import split_topic
 
 Kind = Literal[
@@ -304,7 +305,8 @@ def _starts(prior: Stream) -> Iterator[Hypothesis]:
         return
     covariance = prior["covariance"][0]
     size = round(len(covariance) ** 0.5)
-    kinds = prior.metadata.get("kinds", "").split(",")
+    names = components_of(prior.components)
+    kinds = list(stated_components(prior.metadata, names, f"topic {prior.topic}").values())
     variances = np.diagonal(covariance.reshape(size, size))
     has_rotation = "quaternion" in kinds
     column = 0
