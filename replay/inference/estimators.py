@@ -41,6 +41,7 @@ from replay.inference.requirements import (
 from replay.inference.run.filtering import Filter, samplers_of
 from replay.inference.run.initialization import Initializer
 from replay.inference.run.out_of_sequence import OutOfSequenceFilter
+from replay.inference.run.reading import reading_of
 
 
 @lru_cache(maxsize=256)
@@ -277,10 +278,15 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
-        offers = offers_of(model, found, topics)
         is_random = method.is_random or any(each.redrawn for each in samplers)
-        made = replace(made, initialization=initialization, assumed=assumed)
-        made = replace(made, is_random=is_random, offers=offers)
+        made = replace(
+            made,
+            initialization=initialization,
+            assumed=assumed,
+            offers=offers_of(model, found, topics),
+            is_random=is_random,
+            reading=partial(reading_of, own, found),
+        )
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 
