@@ -4,9 +4,7 @@ What it keeps are sums: of every metric, by step over the runs, and for each run
 not grow with the length of a log, except by two numbers for each step of NEES.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -18,6 +16,7 @@ from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.diagnostics import StreamDiagnostics
 from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
     Errors,
@@ -36,13 +35,12 @@ from replay.judging.metrics.measuring import (
     Measurement,
     Metric,
     Output,
-    Sums,
     find_metrics,
     metric_key,
     plus,
 )
-from replay.judging.metrics.metrics import covered, estimated_share, innovation_sums
-from replay.judging.metrics.quantities import Quantities, columns_of
+from replay.judging.metrics.metrics import covered, estimated_share
+from replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
 from replay.judging.tracks.errors import Judged as Targets
@@ -78,26 +76,6 @@ class Judged(NamedTuple):
     innovations: list[Innovations]
 
 
-@dataclass
-class StreamDiagnostics:
-    """Collects what a stream says of the replay itself, for sentences."""
-
-    failed: dict[int, str] = field(default_factory=dict)
-    speaking: set[int] | None = None
-    skipped: Counter[str] = field(default_factory=Counter)
-    started: Counter[str] = field(default_factory=Counter)
-    covered: Sums = field(default_factory=dict)
-
-    def merge(self, other: "StreamDiagnostics") -> None:
-        """Take in what was said of other runs."""
-        self.failed |= other.failed
-        self.skipped.update(other.skipped)
-        self.started.update(other.started)
-        if other.speaking is not None:
-            self.speaking = other.speaking | (self.speaking or set())
-        self.covered = plus(self.covered, other.covered)
-
-
 class Judge:
     """Judges an ensemble, or a part of one, as its replay goes on.
 
@@ -109,7 +87,7 @@ class Judge:
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
 
-    `innovations` are their sums by topic, see `innovation_sums`.
+    `innovations` are their sums by topic.
     """
 
     def __init__(
@@ -137,7 +115,7 @@ class Judge:
         self._diagnostics: dict[str, StreamDiagnostics] = {}
         self._unjudged: dict[str, str] = {}
         self._first_fixes: dict[str, list[Origin | None]] = {}
-        self.innovations: dict[str, Sums] = {}
+        self.innovations: dict[str, InnovationSums] = {}
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -153,9 +131,9 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
-                self.innovations[topic] = plus(
-                    self.innovations.get(topic, {}), innovation_sums(innovations)
-                )
+                if topic not in self.innovations:
+                    self.innovations[topic] = InnovationSums(self._first_run)
+                self.innovations[topic].add(innovations)
                 self._measured.add(topic, innovations)
             self._listen(topic, rows)
             named = (*split_topic(topic), topic.rpartition("/")[2])
@@ -249,7 +227,7 @@ class Judge:
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
         for topic, sums in other.innovations.items():
-            self.innovations[topic] = plus(self.innovations.get(topic, {}), sums)
+            self.innovations.setdefault(topic, InnovationSums(sums.first_run)).merge(sums)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -287,7 +265,7 @@ class Judge:
                     key = metric_key(errors.estimator, name, errors.case)
                     found[key] = chi_square_interval(size, runs, probability)
         for topic, sums in self.innovations.items():
-            if degrees := sums["degrees"]:
+            if degrees := sums.total.degrees:
                 low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
@@ -367,10 +345,10 @@ class Judge:
 
     @property
     def runs_table(self) -> "pd.DataFrame":
-        """Return one row per estimator, case and run: estimates, RMSE of each quantity, mean NEES."""
-        from replay.judging.tables import joined, run_table
+        """Return one row per estimator, case and run: see `tables.table_of_runs`."""
+        from replay.judging.tables import table_of_runs
 
-        return joined(run_table(each) for each in self._quantities.values())
+        return table_of_runs(self._quantities.values(), self.innovations)
 
     @property
     def times(self) -> "pd.DataFrame":
