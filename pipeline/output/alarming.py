@@ -137,8 +137,12 @@ def _of_costs(judge: Judge) -> Iterator[Alarm]:
 
 def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:
     """Measurements that came to nothing for a reason; what a tracker leaves over has none."""
+    measuring = {row.estimator for row in coverage if row.used}
     for row in coverage:
-        if row.sentence and row.why not in (SILENT, UNTAKEN) and row.unused > UNUSED * row.messages:
+        is_by_choice = row.why.startswith(UNTAKEN) and (row.why == UNTAKEN or row.estimator in measuring)
+        if not row.sentence or row.why == SILENT or is_by_choice:
+            continue
+        if row.unused > UNUSED * row.messages:
             excess = row.unused / (UNUSED * row.messages)
             yield Alarm("unused", row.estimator, "", excess, row.sentence)
 

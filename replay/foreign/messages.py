@@ -12,7 +12,7 @@ from replay.engine.streams.failures import Failure
 from replay.engine.streams.measurements import check_width
 from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream
 from replay.foreign.description import Description, TopicRead
-from replay.foreign.following import Followed, Static
+from replay.foreign.native.following import Followed, Static
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
 
 

@@ -23,7 +23,7 @@ from replay.inference.model.augmentation import (
     estimated,
     with_gauss_markov,
 )
-from replay.inference.model.binding import in_its_plane, roles_of, topics_of
+from replay.inference.model.binding import in_its_plane, offers_of, roles_of, topics_of
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
@@ -278,7 +278,13 @@ def bind_model(
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
         is_random = method.is_random or any(each.redrawn for each in samplers)
-        made = replace(made, initialization=initialization, assumed=assumed, is_random=is_random)
+        made = replace(
+            made,
+            initialization=initialization,
+            assumed=assumed,
+            offers=offers_of(model, found, topics),
+            is_random=is_random,
+        )
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 

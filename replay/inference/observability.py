@@ -263,7 +263,7 @@ class Observability(IteratedSmoother):
                 belief=Gramian(unit, np.zeros((runs, t, t)), np.zeros(runs, np.int64))
             )
         )
-        settings = np.repeat(self.settings[None], runs, axis=0)
+        settings = self.settings_of_runs(state.context, runs)
 
         def memory() -> Any:
             return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))

@@ -76,6 +76,7 @@ class Recursive:
         assumed: the parameters that are assumed, since the log does not state them.
         is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
             parameters.
+        offers: by topic that it does not take, the setting with which it would.
     """
 
     name: str
@@ -91,6 +92,7 @@ class Recursive:
     initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
     is_random: bool = False
+    offers: Mapping[str, str] = field(default_factory=dict)
 
 
 @renamed(whole="static")
