@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
@@ -189,8 +189,8 @@ class Stated(NamedTuple):
     files: Sequence[Path] = ()
 
     @property
-    def labels(self) -> Collection[str]:
-        """The labels of its estimators."""
+    def labels(self) -> Mapping[str, Mapping[str, Any]]:
+        """The labels of its estimators, with their settings."""
         return self.with_settings({}, {}).estimators
 
     @property

@@ -1,7 +1,7 @@
 """Parameters of estimators as commands take them: by --set, a settings file, options of their own."""
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +10,21 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import read_toml
 from replay.engine.replaying.estimator import specified
-from replay.foreign.naming import allowed, of_file, refuse_programs, shorthand
+from replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
 Settings = Mapping[str, Mapping[str, Any]]
 # Parameters of estimators that have an option of their own.
 OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
-def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[str, Any]]:
+def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, Any]]:
     """Parameters by estimator label, from the tables of a TOML file; none without a file.
 
-    Raises BadInput where the file has settings of another estimator.
+    Args:
+        path: the file.
+        labels: what was named of each estimator, such as its program.
+
+    Raises BadInput where the file has settings of another estimator, or names another program.
     """
     tables = {} if path is None else of_file(read_toml(path))
     for label, table in tables.items():
@@ -30,6 +34,7 @@ def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[
                 "for each estimator "
                 f"that is replayed: {', '.join(labels)}"
             )
+    tables = {label: without_named(table, labels[label]) for label, table in tables.items()}
     refuse_programs(tables, path)
     return tables
 

@@ -23,7 +23,9 @@ from replay.engine.streams.failures import Failure
 from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL
 from replay.foreign.description import Description, ForeignParameters, read_description
-from replay.foreign.following import (
+from replay.foreign.messages import events_of, joined, of_run, static_of, static_of_run, streams_of
+from replay.foreign.naming import what_runs
+from replay.foreign.native.following import (
     NOT_COPIED,
     Filters,
     Static,
@@ -33,12 +35,10 @@ from replay.foreign.following import (
     offsets_of,
     reason_of_code,
 )
-from replay.foreign.isolation import Limits, Ran, describe_apart, follow_runs_apart
-from replay.foreign.library import Library
-from replay.foreign.messages import events_of, joined, of_run, static_of, static_of_run, streams_of
-from replay.foreign.naming import what_runs
+from replay.foreign.native.library import Library
+from replay.foreign.processes.isolation import Limits, Ran, describe_apart, follow_runs_apart
+from replay.foreign.processes.tasks import RunGiven, sizes_of
 from replay.foreign.results import begun, results
-from replay.foreign.tasks import RunGiven, sizes_of
 from replay.inference.run.recursion import FilterEvents
 from replay.inference.run.timing import add_output_times
 
@@ -320,7 +320,8 @@ def _loaded(path: Path) -> Library:
     return Library(path)
 
 
-def _unspecified(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:  # noqa: ARG001
+def unspecified(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:  # noqa: ARG001
+    """Refuse to bind what no settings specify."""
     raise BadInput(f"estimator {label}: no program is named; give -e lib:PATH or -e exec:COMMAND")
 
 
@@ -328,5 +329,5 @@ LIB = _OfLibraries(
     "a filter of your own in C, C++ or Rust, behind fuselog_filter.h: -e lib:PATH",
     "the topics that the filter's description names",
     LibraryParameters,
-    _unspecified,
+    unspecified,
 )

@@ -12,8 +12,8 @@ from replay.engine.streams.failures import Failure
 from replay.engine.streams.measurements import check_width
 from replay.engine.streams.results import failures_by_run, state_stream
 from replay.foreign.description import Description, TopicRead
-from replay.foreign.following import Followed, Static
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, innovations_of
+from replay.foreign.native.following import Followed, Static
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, recorded_innovations
 
 
 def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
@@ -135,7 +135,7 @@ def streams_of(
     )
     made = [Ragged(state, offsets), failures_by_run(topic, failures, len(offsets) - 1)]
     if description.innovation:
-        made.append(innovations_of(topic, description.innovation, truth, innovations, recorded))
+        made.append(recorded_innovations(topic, description.innovation, truth, innovations, recorded))
     return made
 
 

@@ -102,6 +102,15 @@ def of_file(settings: Mapping[str, Any]) -> dict[str, Any]:
     return allowed(settings) if _FILES_MAY.get() else dict(settings)
 
 
+def without_named(settings: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings without the program that was named as well, as those of `fuselog tune` have it."""
+    return {
+        name: value
+        for name, value in settings.items()
+        if name not in KINDS.values() or isinstance(value, Allowed) or value != named.get(name)
+    }
+
+
 def refuse_programs(tables: Mapping[str, Any], where: object) -> None:
     """Raise BadInput where settings by label, which were read of a file, name a program."""
     for label, own in tables.items():

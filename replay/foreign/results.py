@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from replay.engine.arrays import Integers
+from replay.inference.linear_algebra.gaussian import LOG_TWO_PI
 from replay.inference.run.recursion import Estimates, Innovations
 
 
@@ -86,3 +87,40 @@ def in_file(path: Path) -> Callable[[int], np.ndarray]:
         return np.asarray(np.memmap(path, np.float64, "r+", shape=(count,))).view(np.ndarray)
 
     return memory
+
+
+def fill_squares(innovations: Innovations) -> int:
+    """Fill NIS and log-likelihood of one run's innovations, in place, up to the first without one.
+
+    Returns the row whose covariance is not positive definite, where the innovations end then; else -1.
+    """
+    end = int(innovations.end[0])
+    present = ~np.isnan(innovations.difference[:end])
+    unsound = end
+    for pattern in np.unique(present, axis=0):
+        rows = np.flatnonzero((present == pattern).all(axis=1))
+        at = np.flatnonzero(pattern)
+        missing = np.flatnonzero(~pattern)
+        spread = innovations.covariance[rows][:, at][:, :, at]
+        sound = np.isfinite(spread).all(axis=(1, 2))
+        sound = np.atleast_1d(sound)
+        sound[sound] = np.linalg.eigvalsh(spread[sound]).min(axis=1, initial=np.inf) > 0.0
+        unsound = min(unsound, *rows[~sound].tolist(), end)
+        rows, spread = rows[sound], spread[sound]
+        difference = innovations.difference[rows][:, at]
+        factor = np.linalg.cholesky(spread)
+        white = np.linalg.solve(factor, difference[:, :, None])[:, :, 0]
+        squared = np.einsum("ni,ni->n", white, white)
+        determinant = 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+        is_used = (innovations.numbers[rows, 2] > 0.0) & (len(at) > 0)
+        likelihood = -0.5 * (squared + determinant + len(at) * LOG_TWO_PI)
+        innovations.numbers[rows, 0] = squared
+        innovations.numbers[rows, 1] = np.where(is_used, likelihood, 0.0)
+        innovations.numbers[rows, 2] = is_used
+        for each in missing:
+            innovations.covariance[rows, each, :] = np.nan
+            innovations.covariance[rows, :, each] = np.nan
+    if unsound < end:
+        innovations.end[0] = unsound
+        return unsound
+    return -1

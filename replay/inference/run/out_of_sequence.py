@@ -245,7 +245,7 @@ class OutOfSequenceFilter:
         sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
         loop(
             runs,
-            RunInputs(events, np.repeat(inner.settings[None], runs, axis=0), inner.gates),
+            RunInputs(events, inner.settings_of_runs(state.context, runs), inner.gates),
             LateState(
                 carried, carried.failure, history, self.window_ns, repeated, np.zeros(runs, np.int64)
             ),

@@ -122,7 +122,7 @@ class RunResults(NamedTuple):
     innovations: Innovations
 
 
-def innovations_of(
+def recorded_innovations(
     topic: str, components: Mapping[str, str], truth: str, innovations: Innovations, offsets: Integers
 ) -> Ragged:
     """Make the stream of innovations that a recursion filled in; run r has offsets[r]:offsets[r + 1]."""

@@ -1,17 +1,20 @@
 """Compiles filters in C for the tests of this room."""
 
+import os
 import shutil
 import subprocess
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
-import replay.foreign
+import replay.foreign.native
 
-HEADER = Path(replay.foreign.__file__).parent
+HEADER = Path(replay.foreign.native.__file__).parent
 COMPILERS = {".c": ("cc", "-std=c99"), ".cpp": ("c++", "-std=c++17")}
-EXAMPLES = Path(__file__).parents[3] / "docs" / "foreign"
+EXAMPLES = Path(__file__).parents[3] / "docs" / "your-filter"
 MISBEHAVING = Path(__file__).with_name("misbehaving.c")
 
 Compile = Callable[..., Path]
@@ -35,3 +38,15 @@ def compile_filter(tmp_path_factory: pytest.TempPathFactory) -> Compile:
         return made
 
     return compile_it
+
+
+@pytest.fixture
+def nothing_left() -> Iterator[None]:
+    """No process of a filter is left behind."""
+    own = psutil.Process(os.getpid())
+    before = {each.pid for each in own.children(recursive=True)}
+    yield
+    began = time.monotonic()
+    while {each.pid for each in own.children(recursive=True)} - before:
+        assert time.monotonic() < began + 20.0, "a filter's process is still there"
+        time.sleep(0.05)

@@ -9,11 +9,14 @@ import os
 import threading
 from functools import cache
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from recorders.errors import BadInput
-from replay.foreign.library import Library
+from replay.foreign.native.library import Library
+
+IDLE_S = 5.0  # after so long without work it ends
+IDLE = 86  # the exit code then
 
 
 def main() -> None:
@@ -32,7 +35,10 @@ def main() -> None:
 
         threading.Thread(target=listen, daemon=True).start()
         while True:
-            task = json.loads(tasks.get())
+            try:
+                task = json.loads(tasks.get(timeout=IDLE_S))
+            except Empty:
+                os._exit(IDLE)
             try:
                 answer = _describe(task) if "folder" not in task else _follow(task)
             except BadInput as error:
@@ -51,8 +57,10 @@ def _describe(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _follow(task: dict[str, Any]) -> dict[str, Any]:
-    """Take one run through its filter; see `isolation.Worker.follow`."""
-    from replay.foreign.tasks import follow_task  # NumPy and the compiler, which describing needs not
+    """Take one run through its filter; see `isolation.follow_apart`."""
+    from replay.foreign.processes.tasks import (
+        follow_task,
+    )  # NumPy and the compiler, which describing needs not
 
     return follow_task(_library(task["library"]), Path(task["folder"]), task["parameters"], task["seed"])
 

@@ -10,15 +10,16 @@ from replay.engine.arrays import Floats
 from replay.engine.streams.blocks import of_runs
 from replay.engine.streams.results import ALL_WELL
 from replay.foreign.description import Description, read_description
-from replay.foreign.following import (
+from replay.foreign.native.following import (
     Static,
     filters_of,
     follow_all,
     offsets_of,
 )
-from replay.foreign.library import Library
+from replay.foreign.native.library import Library
 from replay.foreign.results import Results, Sizes, begun, in_file, results
 from replay.inference.run.recursion import FilterEvents
+from replay.inference.run.timing import select_events
 
 LOADING = -1  # the progress of a process that has not begun
 
@@ -39,6 +40,10 @@ class RunGiven(NamedTuple):
     prior: tuple[int, Floats, Floats] | None
     parameters: Sequence[float]
     seed: int
+
+    def from_time(self, time_ns: int) -> "RunGiven":
+        """Return the same without messages that are older."""
+        return self._replace(events=select_events(self.events, self.events.time_ns >= time_ns))
 
     def save(self, path: Path) -> None:
         """Write the arrays to a file."""

@@ -1,7 +1,7 @@
 /* fuselog_filter.h: your filter in fuselog's replay. Version 1; C99, for C++, Rust and Ada as well.
  *
  * A shared library that has these functions is an estimator: fuselog replay run.mcap -e lib:./libmine.so
- * What each has to do stands beside it; docs/foreign.md leads through an example.
+ * What each has to do stands beside it; docs/your-filter.md leads through an example.
  *
  * Keep all that a filter knows behind the pointer that `create` gives: several filters live at once, each
  * used by one thread at a time. Times are in nanoseconds. Matrices are row-major. The covariance is in the

@@ -9,9 +9,9 @@ import numpy as np
 from replay.engine.arrays import Floats, Function, Integers, varying
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.results import ALL_WELL
-from replay.foreign.calls import INNOVATION, PREDICT, START, STATE, TAKE
 from replay.foreign.description import Description
-from replay.foreign.library import NOTHING, REJECTED, WELL, Addresses, Library
+from replay.foreign.native.calls import INNOVATION, PREDICT, START, STATE, TAKE
+from replay.foreign.native.library import NOTHING, REJECTED, WELL, Addresses, Library
 from replay.foreign.results import Results
 from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,

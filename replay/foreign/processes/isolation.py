@@ -22,9 +22,10 @@ from replay.engine.compiling.compile import core_count
 from replay.engine.streams.blocks import copied
 from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
-from replay.foreign.following import Followed, followed, offsets_of, reason_of_code
+from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
+from replay.foreign.processes.tasks import LOADING, RunGiven, mapped
+from replay.foreign.processes.worker import IDLE
 from replay.foreign.results import begun
-from replay.foreign.tasks import LOADING, RunGiven, mapped
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
@@ -85,14 +86,13 @@ def _memory(process: psutil.Process) -> int:
 
 def end(process: "subprocess.Popen[bytes]") -> None:
     """End a process and all that it started."""
-    with suppress(psutil.Error):
-        for each in family(psutil.Process(process.pid)):
-            with suppress(psutil.Error):
-                each.kill()
-    with suppress(OSError):
-        process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout):
+    if process.poll() is None:  # else its number may be another's
+        with suppress(psutil.Error):
+            for each in family(psutil.Process(process.pid)):
+                with suppress(psutil.Error):
+                    each.kill()
+        process.wait()
+    for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
             with suppress(OSError):
                 stream.close()
@@ -110,10 +110,10 @@ class Worker:
     """Represents a process that takes runs through filters of libraries, one after another."""
 
     def __init__(self) -> None:
-        root = str(Path(__file__).parents[2])  # what we are imported from, whatever the folder is
+        root = str(Path(__file__).parents[3])  # what we are imported from, whatever the folder is
         paths = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "replay.foreign.worker"],
+            [sys.executable, "-P", "-m", "replay.foreign.processes.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -134,6 +134,16 @@ class Worker:
         """End the process, whatever it does."""
         self.is_over = True
         end(self._process)
+
+    @property
+    def is_alive(self) -> bool:
+        """Tell whether it waits for work."""
+        return self._process.poll() is None
+
+    @property
+    def code(self) -> int | None:
+        """Return its exit code; None while there is none."""
+        return self._process.returncode
 
     def ask(self, task: dict[str, Any], limits: Limits, progress: Callable[[], int] = lambda: 0) -> Any:
         """Have a task done; raises Ended where the process does not do it, BadInput what it raises."""
@@ -168,8 +178,11 @@ class Ran(NamedTuple):
 
 def follow_apart(
     worker: Worker, library: str, given: RunGiven, description: Description, limits: Limits
-) -> Ran:
-    """Take one run through its filter in a process; what it says before it crashes counts."""
+) -> Ran | None:
+    """Take one run through its filter in a process; what it says before it crashes counts.
+
+    None where the process had ended before, for want of work.
+    """
     due, recorded = offsets_of(description, given.events)
     with scratch_folder("fuselog-filter") as folder:
         given.save(folder / "given.npz")
@@ -188,6 +201,8 @@ def follow_apart(
                 failure = Failure(told[1], reason_of_code(told[0], description))
         except Ended as ended:
             worker.end()
+            if worker.code == IDLE and int(made.progress[0]) == LOADING:
+                return None
             failure = failure_at(int(made.progress[0]), given, description, str(ended))
         return Ran(copied(followed(made, due, recorded)), failure)
 
@@ -204,34 +219,48 @@ def failure_at(event: int, given: RunGiven, description: Description, why: str) 
 
 
 class Workers:
-    """Represents some processes; one that did not survive its run is replaced."""
+    """Represents the processes that work on some runs; those that survive are kept for the next.
 
-    def __init__(self, count: int) -> None:
-        self._idle: queue.SimpleQueue[Worker | None] = queue.SimpleQueue()
-        self._all: list[Worker] = []
+    A process that is given nothing for a while ends by itself, see `worker`.
+    """
+
+    def __init__(self) -> None:
+        self._working: set[Worker] = set()
         self._is_over = False
-        for _ in range(count):
-            self._idle.put(None)
 
     @contextmanager
     def one(self) -> Iterator[Worker]:
         """Take a process out for a run."""
-        worker = self._idle.get()
         if self._is_over:
             raise Ended("was stopped")
-        if worker is None:
-            worker = Worker()
-            self._all.append(worker)
+        worker = _kept_or_new()
+        self._working.add(worker)
         try:
             yield worker
         finally:
-            self._idle.put(None if worker.is_over else worker)
+            self._working.discard(worker)
+            if not worker.is_over:
+                _KEPT.put(worker)
 
     def end(self) -> None:
-        """End them all; there are no more."""
+        """End those that still work; there are no more."""
         self._is_over = True
-        for worker in self._all:
+        for worker in list(self._working):
             worker.end()
+
+
+_KEPT: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+
+
+def _kept_or_new() -> Worker:
+    """Return a process that waits for work."""
+    with suppress(queue.Empty):
+        while True:
+            worker = _KEPT.get_nowait()
+            if worker.is_alive:
+                return worker
+            worker.end()
+    return Worker()
 
 
 def follow_runs_apart(
@@ -239,13 +268,16 @@ def follow_runs_apart(
 ) -> list[Ran | None]:
     """Take runs through filters in processes, as many at once as there are cores; None stays None."""
     count = max(1, min(core_count(), sum(each is not None for each in runs)))
-    workers = Workers(count)
+    workers = Workers()
 
     def one(given: RunGiven | None) -> Ran | None:
         if given is None:
             return None
-        with workers.one() as worker:
-            return follow_apart(worker, library, given, description, limits)
+        while True:
+            with workers.one() as worker:
+                ran = follow_apart(worker, library, given, description, limits)
+            if ran is not None:
+                return ran
 
     return in_threads(one, runs, count, workers.end)
 
@@ -264,10 +296,16 @@ def in_threads(
 
 def describe_apart(library: str) -> str:
     """Ask a library for its description, in a process."""
-    worker = Worker()
-    try:
-        return str(worker.ask({"library": library}, Limits(STARTS_S, 2000.0))["description"])
-    except Ended as ended:
-        raise BadInput(f"{library}: {ended} while it was asked for its description; mend it") from None
-    finally:
-        worker.end()
+    while True:
+        worker = _kept_or_new()
+        try:
+            found = worker.ask({"library": library}, Limits(STARTS_S, 2000.0))["description"]
+            _KEPT.put(worker)
+            return str(found)
+        except Ended as ended:
+            worker.end()
+            if worker.code != IDLE:
+                raise BadInput(f"{library}: {ended} while it was asked what it is; mend it") from None
+        except BaseException:
+            worker.end()
+            raise
