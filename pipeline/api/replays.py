@@ -19,8 +19,9 @@ import pandas as pd
 
 from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Kind, Log, plan_replay
-from pipeline.output.alarms import Alarm, alarms_of
+from pipeline.api.planning import Log, Named, plan_replay
+from pipeline.output.alarming import alarms_of
+from pipeline.output.alarms import Alarm
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
 def replay(
     logs: Log | Iterable[Log],
-    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+    estimators: Named | Iterable[Named],
     *,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -53,15 +54,16 @@ def replay(
     arrival_order: bool = False,
     late: str | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
-    metrics: str | Sequence[str] = (),
+    metrics: str | Sequence[str] | None = None,
 ) -> "Replay":
     """Replay estimators over logs, and judge them where there is truth.
 
     Args:
         logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
-        estimators: registered names, or labels of your own with what they stand for: an `Estimator`, as
-            `recursive`, `batch` and `modelled` make them, or settings, whose `kind` is a name or an
-            `Estimator`: `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
+        estimators: registered names, an `Estimator`, as `recursive`, `batch` and `modelled` make them,
+            or labels of your own with what they stand for: an `Estimator`, or settings, whose `kind` is
+            a name or an `Estimator`:
+            `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
         start_s: where the replayed span begins, in seconds since each run's epoch.
         end_s: where it ends.
         start_from: what filters begin with at `start_s`: "truth", or the estimates log of an earlier

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.api.planning import plan_replay
-from pipeline.output.alarms import Alarm, alarms_of
+from pipeline.output.alarming import alarms_of
+from pipeline.output.alarms import Alarm
 from pipeline.output.coverage import sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files
 from pipeline.output.results import (

@@ -127,6 +127,12 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON f
 parameters_option = click.option(
     "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
 )
+parameters_alone_option = click.option(
+    "--parameters",
+    "tells_parameters",
+    is_flag=True,
+    help="Print all parameters of the estimators, defaults included, and run nothing.",
+)
 recover_option = click.option(
     "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
 )

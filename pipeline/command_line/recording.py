@@ -95,7 +95,10 @@ def record(
     help="For ROS and tables: the origin of the plane that positions are in, in deg and m.",
 )
 @click.option(
-    "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
+    "--guess",
+    is_flag=True,
+    help="For tables: write a mapping to start from to -o FILE.toml instead; with -o FILE.mcap import "
+    "by it at once, and write it beside the log.",
 )
 @set_option("recorder")
 def import_(
@@ -122,8 +125,12 @@ def import_(
     if guess:
         if source != "table":
             raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
-        _write_guess(paths, out or Path("mapping.toml"))
-        return
+        if out is None or out.suffix != ".mcap":
+            _write_guess(paths, out or Path("mapping.toml"))
+            return
+        check_files([(out, imported(source))], {"data": paths})
+        mapping = str(out.with_suffix(".toml"))
+        _write_guess(paths, Path(mapping), is_used=True)
     if len(paths) > 1 and source != "table":
         raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
     target = out or Path(f"{source}.mcap")
@@ -139,8 +146,8 @@ def import_(
         click.echo(printable(sentence))
 
 
-def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
-    """Write a mapping of tables to start from, and say how to go on."""
+def _write_guess(paths: tuple[Path, ...], mapping: Path, *, is_used: bool = False) -> None:
+    """Write a mapping of tables to start from, and say how to go on; or that it is used as it is."""
     from pipeline.output.outputs import MAPPING, check_files
     from recorders.atomic import whole_file
     from recorders.importers.tables.guessing import guess
@@ -149,6 +156,9 @@ def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
     text = guess(paths)
     with whole_file(mapping) as file:
         file.write_text(text, encoding="utf-8")
+    if is_used:
+        click.echo(printable(f"{mapping}: what was guessed and is imported by; read it"))
+        return
     command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(mapping)])
     click.echo(printable(f"{mapping}: read it, then: {command}"))
 

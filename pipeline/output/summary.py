@@ -5,7 +5,7 @@ from typing import Any
 
 import pandas as pd
 
-from pipeline.output.alarms import alarms_of
+from pipeline.output.alarming import alarms_of
 from pipeline.output.charts import Axis, Chart, Panel, Style, band, curve, thinned
 from pipeline.output.coverage import coverage_table
 from pipeline.output.results import MetricValue, Outcome, split_metric

@@ -44,7 +44,7 @@ class Origin(NamedTuple):
         return dict(zip(ORIGIN, map(repr, self), strict=True))
 
     def __str__(self) -> str:
-        return ", ".join(f"{number:.9g}" for number in self)
+        return f"{self.latitude_deg:.9g}, {self.longitude_deg:.9g}, {self.altitude_m:.6g}"
 
 
 def origin_of(parts: Sequence[str]) -> Origin | None:

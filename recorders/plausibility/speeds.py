@@ -10,8 +10,7 @@ from recorders.plausibility.finding import Finding, digits
 from recorders.plausibility.motion import Motion
 
 # By what a speed is too large that was logged in another unit and read as m/s.
-UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mph", 1 / 0.514444: "kn"}
-MAPPED = {"km/h", "ft/s", "kn"}  # those that a mapping knows
+UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}
 NEAR = 0.05  # of a factor
 SCALE = (0.8, 1.25)  # what a metre of a speed may move places by
 SPREAD = 0.25
@@ -86,7 +85,6 @@ def factors(motion: Motion) -> Iterator[Finding]:
         elif factor > 1.0:
             what = f"is {factor:.4g} times too large, as {known[nearest]} taken for m/s"
             mapping = f'units.{source.field} = "{known[nearest]}" in the mapping'
-            mapping = mapping if known[nearest] in MAPPED else ""
         else:
             what = f"is {1 / factor:.4g} times too small, as m/s taken for {known[nearest]}"
             mapping = f'units.{source.field} = "m/s" in the mapping'

@@ -23,7 +23,7 @@ from replay.inference.model.augmentation import (
     estimated,
     with_gauss_markov,
 )
-from replay.inference.model.binding import in_its_plane, roles_of, topics_of
+from replay.inference.model.binding import in_its_plane, offers_of, roles_of, topics_of
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
@@ -41,6 +41,7 @@ from replay.inference.requirements import (
 from replay.inference.run.filtering import Filter, samplers_of
 from replay.inference.run.initialization import Initializer
 from replay.inference.run.out_of_sequence import OutOfSequenceFilter
+from replay.inference.run.reading import reading_of
 
 
 @lru_cache(maxsize=256)
@@ -94,6 +95,7 @@ def modelled_by(
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
+        label=name,
     )
 
 
@@ -165,7 +167,8 @@ def _any_parameters(method: Method) -> type[Parameters]:
                 kind = _accepted(field)
                 other = fields.get(name, (kind,))[0]
                 meaning = _of_models(told[name])
-                fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
+                unset = Field(None, description=meaning, validate_default=False)
+                fields[name] = (kind if other == kind else Any, unset)
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
 
 
@@ -275,7 +278,15 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, initialization=initialization, assumed=assumed)
+        is_random = method.is_random or any(each.redrawn for each in samplers)
+        made = replace(
+            made,
+            initialization=initialization,
+            assumed=assumed,
+            offers=offers_of(model, found, topics),
+            is_random=is_random,
+            reading=partial(reading_of, own, found),
+        )
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 

@@ -22,7 +22,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.streams.blocks import Ragged, copied
-from replay.engine.vectors.tangent import tangent_components
+from replay.engine.vectors.tangent import named_now, tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import Method, MethodParameters
 from replay.inference.kalman.predict import motion_derivative
@@ -221,7 +221,8 @@ class Observability(IteratedSmoother):
     def _scales(self, state: FilterState) -> Floats:
         """Return what a scaled component of one stands for (runs, t)."""
         scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
-        for name, scale in self.parameters.scales.items():
+        model = self.stage.model
+        for name, scale in named_now(self.parameters.scales, list(model.state), model.kinds).items():
             if name not in self.components:
                 raise BadInput(
                     f"estimator {self.name}: --scale {name}: the state has no such component; "
@@ -262,7 +263,7 @@ class Observability(IteratedSmoother):
                 belief=Gramian(unit, np.zeros((runs, t, t)), np.zeros(runs, np.int64))
             )
         )
-        settings = np.repeat(self.settings[None], runs, axis=0)
+        settings = self.settings_of_runs(state.context, runs)
 
         def memory() -> Any:
             return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))

@@ -4,9 +4,7 @@ What it keeps are sums: of every metric, by step over the runs, and for each run
 not grow with the length of a log, except by two numbers for each step of NEES.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,9 +13,9 @@ from numpy.typing import NDArray
 from recorders.log import schemas
 from recorders.log.planes import Origin
 from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.diagnostics import LEAVES, Diagnostics
 from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
     Errors,
@@ -41,7 +39,7 @@ from replay.judging.metrics.measuring import (
     metric_key,
     plus,
 )
-from replay.judging.metrics.metrics import covered, estimated_share, innovation_sums
+from replay.judging.metrics.metrics import innovation_sums
 from replay.judging.metrics.quantities import Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
@@ -54,13 +52,6 @@ if TYPE_CHECKING:
 TRACK = schemas.TRACK_ESTIMATE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
-FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
-STARTED = schemas.STARTED.full_name
-COVERAGE = schemas.COVERAGE.full_name
-# What a replay says of itself, leaves of topics: no estimates, nothing to judge.
-TOLD = ("failure", "skipped", "started", "coverage")
-# Less than this share of a span is said; a run's first measurements may well be before the prior.
-LEAST_SHARE = 0.995
 # A table has at most so many steps; of more, neighbours share a row.
 STEPS = 1 << 17
 # The sums over time of one run: at most so many bins, of a millisecond times a power of two.
@@ -76,26 +67,6 @@ class Judged(NamedTuple):
     errors: list[Errors]
     sets: list[SetErrors]
     innovations: list[Innovations]
-
-
-@dataclass
-class StreamDiagnostics:
-    """Collects what a stream says of the replay itself, for sentences."""
-
-    failed: dict[int, str] = field(default_factory=dict)
-    speaking: set[int] | None = None
-    skipped: Counter[str] = field(default_factory=Counter)
-    started: Counter[str] = field(default_factory=Counter)
-    covered: Sums = field(default_factory=dict)
-
-    def merge(self, other: "StreamDiagnostics") -> None:
-        """Take in what was said of other runs."""
-        self.failed |= other.failed
-        self.skipped.update(other.skipped)
-        self.started.update(other.started)
-        if other.speaking is not None:
-            self.speaking = other.speaking | (self.speaking or set())
-        self.covered = plus(self.covered, other.covered)
 
 
 class Judge:
@@ -134,7 +105,7 @@ class Judge:
         self._measured = Measurement(find_metrics() if metrics is None else metrics)
         self._quantities: dict[str, Quantities] = {}
         self._steps: dict[str, NDArray[np.int64]] = {}
-        self._diagnostics: dict[str, StreamDiagnostics] = {}
+        self._diagnostics = Diagnostics(first_run)
         self._unjudged: dict[str, str] = {}
         self._first_fixes: dict[str, list[Origin | None]] = {}
         self.innovations: dict[str, Sums] = {}
@@ -157,7 +128,7 @@ class Judge:
                     self.innovations.get(topic, {}), innovation_sums(innovations)
                 )
                 self._measured.add(topic, innovations)
-            self._listen(topic, rows)
+            self._diagnostics.add(topic, rows, self._sources)
             named = (*split_topic(topic), topic.rpartition("/")[2])
             output = Output(*named, rows, self._sources, self._first_run)
             if schema == BOUND_STEP:
@@ -209,30 +180,6 @@ class Judge:
         kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
         kept.constant.add(errors)
 
-    def _listen(self, topic: str, rows: Ragged) -> None:
-        """Take in what a stream says of the replay itself."""
-        schema = rows.stream.schema.full_name
-        diagnostics = self._diagnostics.setdefault(topic, StreamDiagnostics())
-        speaking = np.flatnonzero(np.diff(rows.offsets)).tolist()
-        if schema == GAUSSIAN:
-            spoke = {self._first_run + run for run in speaking}
-            diagnostics.speaking = spoke | (diagnostics.speaking or set())
-        elif schema == FAILURE:
-            for run in speaking:
-                found = rows.of_run(run)
-                elapsed_s = (int(found.publish_time_ns[0]) - self._sources[run].epoch_ns) * 1e-9
-                reason = sentences_of(found.take(slice(0, 1)))[0]
-                sentence = f"{_what(topic)} failed at {elapsed_s:.3f} s: {reason}"
-                diagnostics.failed.setdefault(self._first_run + run, sentence)
-        elif schema == SKIPPED:
-            diagnostics.skipped.update(sentences_of(rows.stream))
-        elif schema == STARTED:
-            diagnostics.started.update(sentences_of(rows.stream))
-        elif schema == COVERAGE:
-            diagnostics.covered = plus(
-                diagnostics.covered, covered(Output("", "", "", rows, self._sources))
-            )
-
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
@@ -258,8 +205,7 @@ class Judge:
         self._means.merge(other._means)
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
-        for topic, theirs in other._diagnostics.items():
-            self._diagnostics.setdefault(topic, StreamDiagnostics()).merge(theirs)
+        self._diagnostics.merge(other._diagnostics)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -303,7 +249,7 @@ class Judge:
     @property
     def has_numbers(self) -> bool:
         """Tell whether there are numbers, but for what a replay says of itself."""
-        return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in TOLD))
+        return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in LEAVES))
 
     @property
     def doubts(self) -> dict[str, Doubt]:
@@ -321,15 +267,7 @@ class Judge:
     @property
     def failures(self) -> list[str]:
         """A sentence for every run that an estimator could not follow to the end, or not at all."""
-        said: dict[tuple[str, int], str] = {}
-        for topic, diagnostics in self._diagnostics.items():
-            silent = (
-                self._names.keys() - diagnostics.speaking if diagnostics.speaking is not None else set()
-            )
-            said |= {(_what(topic), run): f"{_what(topic)} gave no estimates" for run in sorted(silent)}
-        for topic, diagnostics in self._diagnostics.items():
-            said |= {(_what(topic), run): sentence for run, sentence in diagnostics.failed.items()}
-        return [f"{self._names[run]}: {sentence}" for (_, run), sentence in said.items()]
+        return self._diagnostics.failures(self._names)
 
     @property
     def notes_of_coverage(self) -> list[str]:
@@ -337,23 +275,12 @@ class Judge:
 
         Those for what was assumed, as of where to begin, come first.
         """
-        said = []
-        for topic, diagnostics in self._diagnostics.items():
-            for reason, count in diagnostics.started.items():
-                runs = f" (in {count} runs)" if count > 1 else ""
-                said.append(f"{_what(topic)}: {reason}{runs}")
-        for topic, diagnostics in self._diagnostics.items():
-            share = estimated_share(diagnostics.covered)
-            if share is not None and share < LEAST_SHARE:
-                percent = f"{100 * share:.1f} % of the span was estimated"
-                said.append(f"{_what(topic)}: {percent}; its figures are of that")
-            for reason, count in diagnostics.skipped.items():
-                said.append(f"{_what(topic)}: {count} not used: {reason}")
-        for what, bounds in self._bounds.items():
-            if bounds.complaint:
-                name = " ".join(filter(None, what))
-                said.append(f"{name}: averaged along the true trajectories, since {bounds.complaint}")
-        return said
+        averaged = "averaged along the true trajectories, since"
+        return self._diagnostics.notes() + [
+            f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
+            for what, bounds in self._bounds.items()
+            if bounds.complaint
+        ]
 
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
@@ -404,7 +331,3 @@ class Judge:
     def judged(self) -> dict[str, Errors]:
         """Return by topic the last block of estimates that have errors: its names and kinds."""
         return {topic: each.errors for topic, each in self._quantities.items()}
-
-
-def _what(topic: str) -> str:
-    return " ".join(filter(None, split_topic(topic)))

@@ -50,7 +50,7 @@ def test_a_trial_by_a_filter_and_by_madgwick(real_data, tmp_path):
     assert verdicts["ekf errs less than madgwick"] == "not reproducible", "one trial has no interval"
     events = read(tmp_path / "out" / "magnet-added" / "timeline.rrd")[f"/events/{TRIAL}/ekf"]
     texts = [text for (text,) in events["TextLog:text"] if "field disturbed" in text]
-    assert texts[0].startswith("ekf: magnetic field disturbed for 20 s, by up to ")
+    assert "s, ekf: magnetic field disturbed for 20 s, by up to " in texts[0]
     assert len(texts) == 2
     spans = (tmp_path / "out" / "tables" / "disturbances.csv").read_text()
     assert spans.count("magnet-added") == 2

@@ -548,6 +548,45 @@ def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
     assert notes["not taken, attachment camera.yaml"].startswith("1, ")
 
 
+def test_noise_densities_are_those_of_stated_covariances(tmp_path: Path) -> None:
+    """By the step of 10 ms; zeros, -1 and what no sensor has state nothing, and the last is told."""
+    make, stamps = Maker(), [START_NS + number * STEP_NS for number in range(9)]
+    twist = np.diag([0.04, 1.0, 1.0, 1.0, 1.0, 0.0009]).ravel()
+    own, absurd, zeros = np.diag([0.01, 0.01, 0.04]).ravel(), 1e6 * np.eye(3).ravel(), [0.0] * 9
+    cases: list[tuple[str, str, dict[str, Any]]] = [
+        ("/a/odom", "nav_msgs/msg/Odometry", {"twist__covariance": twist}),
+        ("/b/odom", "nav_msgs/msg/Odometry", {"twist__covariance": [0.0] * 36}),
+        ("/a/imu", "sensor_msgs/msg/Imu",
+         {"linear_acceleration_covariance": own, "angular_velocity_covariance": absurd}),
+        ("/b/imu", "sensor_msgs/msg/Imu",
+         {"linear_acceleration_covariance": zeros, "angular_velocity_covariance": [-1.0, *zeros[1:]]}),
+    ]  # fmt: skip
+    sent = [
+        (topic, stamp, make(kind, stamp, **given)) for stamp in stamps for topic, kind, given in cases
+    ]
+    streams, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
+    stated = {
+        topic: {
+            name: float(value) for name, value in streams[topic].metadata.items() if "density" in name
+        }
+        for topic in ("/a/odometry", "/b/odometry", "/a/inertial", "/b/inertial")
+    }
+    assert stated == {
+        "/a/odometry": {
+            "forward_noise_density": pytest.approx(0.02),
+            "turn_noise_density": pytest.approx(0.003),
+        },
+        "/b/odometry": {},
+        "/a/inertial": {"force_noise_density": pytest.approx(0.1 * 0.02**0.5, rel=1e-5)},
+        "/b/inertial": {},
+    }
+    assert notes["/a/odometry: forward_noise_density"] == (
+        "0.02, of a standard deviation of 0.2 m/s every 0.01 s"
+    )
+    absurd_note = "not stated, since a standard deviation of 1e+03 rad/s is no sensor's"
+    assert notes["/a/inertial: gyro_noise_density"] == absurd_note
+
+
 def test_frames_and_constants_that_change(tmp_path: Path) -> None:
     """A second frame of a topic is another stream; a covariance that changes is told."""
     make = Maker()

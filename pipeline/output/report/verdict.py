@@ -7,7 +7,7 @@ from textwrap import shorten
 from pipeline.output.claims import NO_VERDICT
 from pipeline.output.results import MetricTable, Result, metric_tables
 from pipeline.output.terminal import format_value
-from replay.judging.judge import LEAST_SHARE
+from replay.judging.diagnostics import LEAST_SHARE
 
 # More estimators than these are counted, and more claims than these are in the table below alone.
 MOST_NAMED = 6

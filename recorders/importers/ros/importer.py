@@ -207,6 +207,7 @@ class _Import:
                 notes[":".join(chain.pair)] = (
                     f"{chain.left_out} stamps left out at which a transform of the chain is not known"
                 )
+        notes |= self._streams.noise
         for (subject, fact), count in self._streams.told.items():
             notes[f"{subject}: {fact}"] = str(count)
         for topic, why in sorted(self._not_taken.items()):

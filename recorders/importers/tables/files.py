@@ -234,10 +234,11 @@ def _text_batches(
         ),
     )
     for batch in map(_by_name, batches):
-        if decimal != ".":  # Arrow minds it in numbers alone
+        if decimal != ".":  # Arrow minds it in numbers alone; of texts only those are mended
+            number = rf"^\s*([-+]?\d*){re.escape(decimal)}(\d+(?:[eE][-+]?\d+)?)\s*$"
             for name in wanted:
                 if wanted[name]:
-                    batch[name] = pc.replace_substring(batch[name], decimal, ".")
+                    batch[name] = pc.replace_substring_regex(batch[name], number, r"\1.\2")
         for name in wanted:
             if wanted[name] and pc.any(pc.match_substring(batch[name], "\ufffd")).as_py():
                 raise ValueError(f"column {name} holds text that is not UTF-8")

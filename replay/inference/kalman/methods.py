@@ -67,7 +67,9 @@ class UnscentedParameters(MethodParameters):
     """Options of methods that may use the unscented transform.
 
     Attributes:
-        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter.
+        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf
+            has 0.5 unless its name says another, as in lrkf:ukf:kappa=0, so that all points weigh
+            alike; with the same kappa both give the same.
     """
 
     kappa: float = 0.0
@@ -110,6 +112,7 @@ class Method:
             BadInput where they name none.
         filtering: what goes through a log, where that is no `replay.inference.run.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
+        is_random: whether it draws random numbers, beside those of its samples.
     """
 
     summary: str
@@ -121,6 +124,7 @@ class Method:
     made_for: Callable[[Any], "Method"] | None = None
     filtering: Callable[..., Any] | None = None
     takes_all_modes: bool = False
+    is_random: bool = False
 
 
 def _iterated(stage: Stage) -> Steps:

@@ -23,7 +23,7 @@ from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.covariances import Form
 from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import complaint_of, reading_settings
+from replay.inference.model.settings import complaint_of, placed_settings, reading_settings
 from replay.inference.model.stage import Stage, title_of
 from replay.inference.run.events import Context, data_columns, filter_events, points_of
 from replay.inference.run.out_of_sequence import issued
@@ -159,6 +159,11 @@ class Filter:
         if self.found.origin is not None:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
+
+    def settings_of_runs(self, context: Context, runs: int) -> Floats:
+        """Repeat the settings for each run (runs, 1 + sensors, fields), see `placed_settings`."""
+        names, of = number_fields(self.stage.model.parameters), (self.found, self.parameters)
+        return placed_settings(self.settings, names, *of, context.origins, runs)
 
     def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
@@ -305,25 +310,16 @@ class Filter:
         estimates, innovations = self.no_results(due, recorded, innovation_size)
         if innovation_size > min((len(sensor.measured) for sensor in sensors), default=innovation_size):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
-        settings = np.repeat(self.settings[None], runs, axis=0)
-        generators = state.generators
+        settings, generators = self.settings_of_runs(state.context, runs), state.generators
         if any(each.redrawn for each in self.samplers):
             generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
         for part, sets in self.sets(generators, events):
-            loop(
-                part.stop - part.start,
-                RunInputs(
-                    events._replace(offsets=events.offsets[part.start : part.stop + 1]),
-                    settings[part],
-                    self.gates,
-                ),
-                of_runs(carried, part),
-                RunResults(
-                    estimates._replace(end=estimates.end[part]),
-                    innovations._replace(end=innovations.end[part]),
-                ),
-                scratch=partial(steps.memory, sets),
-            )
+            own = events._replace(offsets=events.offsets[part.start : part.stop + 1])
+            inputs = RunInputs(own, settings[part], self.gates)
+            ends = estimates.end[part], innovations.end[part]
+            results = RunResults(estimates._replace(end=ends[0]), innovations._replace(end=ends[1]))
+            memory = partial(steps.memory, sets)
+            loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=memory)
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES

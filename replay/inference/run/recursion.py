@@ -29,6 +29,7 @@ from replay.inference.kalman.steps import (
 from replay.inference.linear_algebra.tuples import range_of
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
+from replay.inference.run.loops import over_events
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -183,7 +184,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         steps: the method's steps for it.
         settings_of: `settings_of(settings, row)` makes a row's parameters.
 
-    Returns `process(run, event, inputs, carried, innovations, memory)`.
+    Returns `process(run, event, inputs, carried, results, memory)`.
     """
     predict = steps.predict
     update = choosing(steps.updates)
@@ -216,14 +217,14 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         event: int,
         inputs: RunInputs,
         carried: RecursionState,
-        innovations: Innovations,
+        results: RunResults,
         memory: Any,
     ) -> int:
         """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did.
 
         UNKNOWN in a gap of the control after which it goes on.
         """
-        events, gates = inputs.events, inputs.gates
+        events, gates, innovations = inputs.events, inputs.gates, results.innovations
         source, data = events.source[event], events.data[event]
         duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
@@ -272,31 +273,45 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
     Returns `follow(run, inputs, carried, results, memory)`; it changes what is carried in place.
     """
-    process, estimate = processing(stage, steps, settings_of), steps.estimate
+    write = writing_estimates(steps.estimate)
 
-    def follow(
-        run: int, inputs: RunInputs, carried: RecursionState, results: RunResults, memory: Any
-    ) -> None:
-        """Move what is carried, and fill the results, until the events end or the run fails."""
-        events, estimates, start_ns = inputs.events, results.estimates, carried.time_ns[run]
-        for event in range(events.offsets[run], events.offsets[run + 1]):
-            if carried.failure[run] != ALL_WELL:
-                break
-            failure = process(run, event, inputs, carried, results.innovations, memory)
-            if (
-                failure == ALL_WELL
-                and events.wants_estimate[event]
-                and events.time_ns[event] >= start_ns
-            ):
-                row = estimates.end[run]
-                estimate(run, carried.belief, estimates, row, memory)
-                failure = fault_of(estimates.mean[row], estimates.covariance[row])
-                if failure == ALL_WELL:
-                    estimates.time_ns[row] = events.time_ns[event]
-                    estimates.end[run] = row + 1
-            carried.failure[run] = ALL_WELL if failure == UNKNOWN else failure
+    def record(
+        run: int,
+        event: int,
+        inputs: RunInputs,
+        carried: RecursionState,
+        results: RunResults,
+        memory: Any,
+    ) -> int:
+        """Fill in the estimate where one is wanted, from the state's own time on."""
+        time_ns = inputs.events.time_ns[event]
+        if inputs.events.wants_estimate[event] and time_ns >= carried.time_ns[run]:
+            return write(run, run, time_ns, carried.belief, results.estimates, memory)
+        return ALL_WELL
 
-    return follow
+    return over_events(processing(stage, steps, settings_of), record)
+
+
+def writing_estimates(estimate: Function) -> Function:
+    """Make `write(run, row, time_ns, belief, estimates, memory)`: it fills in a run's next estimate.
+
+    That is of a row of the belief; an estimate that is none counts as not written. Returns what is wrong
+    with it, see `fault_of`.
+
+    Args:
+        estimate: the method's, see `Steps.estimate`.
+    """
+
+    def write(run: int, row: int, time_ns: int, belief: Any, estimates: Any, memory: Any) -> int:
+        result = estimates.end[run]
+        estimate(row, belief, estimates, result, memory)
+        failure = fault_of(estimates.mean[result], estimates.covariance[result])
+        if failure == ALL_WELL:
+            estimates.time_ns[result] = time_ns
+            estimates.end[run] = result + 1
+        return failure
+
+    return write
 
 
 def fault_of(mean: Floats, covariance: Floats) -> int:

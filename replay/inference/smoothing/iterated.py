@@ -215,7 +215,7 @@ class IteratedSmoother(Smoother):
             )
             return steps.memory((own,)), back_memory(t, t)
 
-        settings = np.repeat(self.settings[None], runs, axis=0)
+        settings = self.settings_of_runs(state.context, runs)
         gates = np.full_like(self.gates, np.inf)
         back = Smoothed(offsets[1:], offsets, FOREVER_NS, smoothed)
         found = SearchState(carried, Piece(vectors, offsets), innovations, later, back, kept.mean)

@@ -19,13 +19,13 @@ from recorders.trajectories import Trajectory
 from replay.engine.streams.planes import HEADING, VECTORS, Movement, moved_states
 from replay.engine.streams.sources import LogSource
 from replay.engine.vectors.components import stated_components
+from replay.judging.errors.planes import ALIGNED
 
 Floats = NDArray[np.float64]
 Align = Literal["none", "yaw", "se2", "se3", "sim3"]
 
 # Of the two largest extents of a path, squared: rounding alone makes straight lines as wide as this.
 LEAST_WIDTH = 1e-10
-ALIGNED = "aligned"  # in the metadata of estimates that are in the truth's frame, whatever theirs was
 # The cosine of an angle that is none but for rounding: 1e-6 rad.
 LEAST_COSINE = 1 - 1e-12
 

@@ -36,8 +36,7 @@ from replay.engine.vectors.tangent import (
     tangent_components,
     truth_at,
 )
-from replay.judging.errors.alignment import ALIGNED
-from replay.judging.errors.planes import FirstFixes, planes_of, unlike
+from replay.judging.errors.planes import ALIGNED, FirstFixes, planes_of, unlike
 from replay.judging.errors.truths import Truths
 
 Floats = NDArray[np.float64]

@@ -9,8 +9,8 @@ from recorders.log.planes import FRAME, Origin, is_planar, plane_in_words, state
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.geodetic import origins_of
 from replay.engine.streams.sources import Source
-from replay.judging.errors.alignment import ALIGNED
 
+ALIGNED = "aligned"  # in the metadata of estimates that are in the truth's frame, whatever theirs was
 # By estimator and case, as in topics: the first fixes that are the origins of every run's plane.
 FirstFixes = Mapping[str, Sequence[Origin | None]]
 
