@@ -137,11 +137,7 @@ class Initializer:
         return Initialized(found, [*told, *self._told(facts)])
 
     def find_broad(
-        self,
-        first: Mapping[str, Ragged],
-        static: Mapping[str, Ragged],  # noqa: ARG002
-        clock: Clock,
-        time_ns: int,
+        self, first: Mapping[str, Ragged], _: Mapping[str, Ragged], clock: Clock, time_ns: int
     ) -> list[Initialized]:
         """Find one run's equally likely starts at a stamp; see `broad_priors`."""
         origins = None if self.found.origin is None else self.found.origin[None]
