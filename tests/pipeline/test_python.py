@@ -1,4 +1,4 @@
-"""The public door: `import fuselog`, and its functions in place of the commands."""
+"""The public interface: `import fuselog`, and its functions in place of the commands."""
 
 import ast
 import gc

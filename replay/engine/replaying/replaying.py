@@ -95,6 +95,8 @@ def replay(
     plane = common_origin({name: topic.metadata for name, topic in ensemble[0].topics.items()})
     for monitor, static in zip(monitors, statics, strict=True):
         monitor.static, monitor.plane = static, plane
+        if report is None:  # nobody asks what became of measurements
+            monitor.usage.shares.end(is_known=False)
         monitor.usage.note_start(static)
     told: list[Ragged] = []
     initialization = partial(_open, ensemble, order, stamps, told)

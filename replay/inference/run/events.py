@@ -164,7 +164,7 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     """Read a control into the columns of its components; NaN where they come from elsewhere."""
     count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
-    read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
+    read = control_numbers(control, ragged)
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
@@ -172,6 +172,12 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     if control.interpolated:  # one that is not finite is as if it had not come
         without_covariance |= ~np.isfinite(read).all(axis=1)
     return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), without_covariance)
+
+
+def control_numbers(control: Control, ragged: Ragged) -> Floats:
+    """Read what drives the motion (n, components)."""
+    names = control.components
+    return _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
 
 
 def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
@@ -197,9 +203,8 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     stream = ragged.stream
     source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
     without_covariance = np.zeros(len(stream), bool)
-    parts = []
     if sensor.covariance:
-        value, spread, without_covariance = _with_covariance(sensor, ragged)
+        value, spread, without_covariance = with_covariance(sensor, ragged)
         variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
         if np.isfinite(variances).all():
             spread[without_covariance], without_covariance = (
@@ -208,12 +213,8 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
             )
         without_covariance = without_covariance | np.isnan(value).all(axis=1)
         parts = [value, spread[:, *np.tril_indices(m)]]
-    elif sensor.read:
-        parts = [_computed(sensor.read, ragged, m)]
-    elif sensor.vector:
-        parts = [read_vectors(stream, sensor.vector, sensor.measured)]
     else:
-        parts = [_fields(stream, tuple(sensor.measured))]
+        parts = [without_covariance_of(sensor, ragged)]
     reference: list[Floats] = []
     if sensor.maps:
         target = stream[sensor.maps[0].of].astype(np.int64)
@@ -237,7 +238,16 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     return Table(np.ascontiguousarray(data), source, target, without_covariance)
 
 
-def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
+def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
+    """Read measurements (n, m) of messages that state no covariance; NaN where one is missing."""
+    if sensor.read:
+        return _computed(sensor.read, ragged, len(sensor.measured))
+    if sensor.vector:
+        return read_vectors(ragged.stream, sensor.vector, sensor.measured)
+    return _fields(ragged.stream, tuple(sensor.measured))
+
+
+def with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
     """Read measurements, their covariances and which of them lack one."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
