@@ -13,8 +13,8 @@ pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with Application
 Navigation, 11.6.2). Both axes have the same noise: three numbers are a track's covariance.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache, partial
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -79,9 +79,7 @@ class ReportTrackerParameters(Parameters):
     forget_s: PositiveFloat = 7200.0
 
 
-@lru_cache(maxsize=1)
-def _compiled() -> Callable[..., None]:
-    return compile_over_runs(over_stamps(track), allocates=False)
+_track = compile_over_runs(over_stamps(track), allocates=False, title="tracks of reports")
 
 
 Reporting = Given[ReportTrackerParameters]
@@ -102,7 +100,7 @@ def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, lis
     ends = np.flatnonzero(reports.is_last)
     together = int(np.diff(ends, prepend=-1).max(initial=1))
     memory = partial(_memory, together, tracks.number.shape[1])
-    _compiled()(given.runs, ReportInputs(reports, settings), tracks, results, scratch=memory)
+    _track(given.runs, ReportInputs(reports, settings), tracks, results, scratch=memory)
     stream = make_stream(
         f"/estimates/{given.name}/track",
         schemas.TRACK_ESTIMATE,
