@@ -29,6 +29,15 @@ class Sentence(NamedTuple):
     cause: Cause | None = None
     setting: str = ""
 
+    @property
+    def names(self) -> list[tuple[Kind, str]]:
+        """What it names: a kind and a topic, and those that the log does not tell from it."""
+        others = self.cause.others if self.cause else ()
+        return [
+            (self.kind, self.topic),
+            *((each.hypothesis.kind, each.hypothesis.topic) for each in others),
+        ]
+
     @classmethod
     def of(cls, found: Finding) -> "Sentence":
         """A finding that no likelihood is needed for."""
