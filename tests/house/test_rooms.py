@@ -45,7 +45,6 @@ WIDER = {
     "pipeline/tuning/tuning.py": {"tune"},
     "recorders/arrivals.py": {"difference_stream"},
     "replay/engine/api/functions.py": {"batch", "recursive"},
-    "replay/engine/streams/results.py": {"innovation_stream"},
 }
 
 
