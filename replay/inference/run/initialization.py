@@ -149,7 +149,7 @@ class Initializer:
         for number, sensor, topic in self._measuring:
             ragged = first[topic.name]
             table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
-            _, [has_message], [row] = first_of_runs(ragged, clock, table.source >= 0)
+            _when, [has_message], [row] = first_of_runs(ragged, clock, table.source >= 0)
             if has_message:
                 references.append(
                     (sensor.measured, *state_by_message(self.stage, number, table.data[row]))
