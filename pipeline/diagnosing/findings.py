@@ -54,15 +54,22 @@ KINDS: Mapping[Cause, Kind] = {
     "lost messages": "lost messages",
     "clock": "clock drift",
     "delay": "delay",
-    "unit": "factor or sign",
-    "scale": "factor or sign",
-    "sign": "factor or sign",
-    "gravity": "factor or sign",
-    "quaternion": "convention",
+    "unit": "values",
+    "scale": "values",
+    "sign": "values",
+    "gravity": "values",
+    "quaternion": "values",
     "mounting": "bias or turned frame",
     "covariance": "measurement noise",
 }
-NOISE = ("measurement noise", "process noise", "outliers")
+
+
+def without_filter(source: LogSource | MemorySource, streamed: Collection[str]) -> list[Finding]:
+    """All that the topics of an estimator say by themselves, each once: the worst of the log first."""
+    implausible = list(of_plausibility(source, streamed))
+    known = [(each.kind, each.topic) for each in implausible]
+    of_topics = of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns)
+    return [*implausible, *(each for each in of_topics if (each.kind, each.topic) not in known)]
 
 
 def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str]) -> Iterator[Finding]:
@@ -72,29 +79,6 @@ def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str])
         if each.topic in streamed:
             setting = f"{each.key}={each.setting}" if each.key else ""
             yield Finding(KINDS[each.cause], each.topic, each.mended, None, setting)
-
-
-def of_log(
-    source: LogSource | MemorySource, streamed: Collection[str], causes: Collection[tuple[Kind, str]]
-) -> tuple[list[Finding], list[Finding]]:
-    """What is seen without a filter: what stands before the causes, and the rest.
-
-    `causes` are kinds and topics that likelihoods name. These know the number better, and leave out what
-    is told of the same topic, where both are of its noise or both are not.
-    """
-    known = {(kind in NOISE, topic) for kind, topic in causes}
-    before = [
-        each
-        for each in of_plausibility(source, streamed)
-        if each.kind in FIRST or (each.kind in NOISE, each.topic) not in known
-    ]
-    told = {(each.kind, each.topic) for each in before}
-    streams = (source.read([topic])[topic] for topic in streamed)
-    others = [
-        each for each in of_messages(streams, source.epoch_ns) if (each.kind, each.topic) not in told
-    ]
-    before += [each for each in others if each.kind in FIRST]
-    return before, [each for each in others if each.kind not in FIRST]
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
