@@ -16,7 +16,7 @@ from replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import origins_of
 from replay.engine.streams.priors import gaussians
-from replay.engine.streams.results import ALL_WELL, failures_of, innovation_stream, state_stream
+from replay.engine.streams.results import ALL_WELL, failures_of, state_stream
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
 from replay.inference.kalman.update import innovation_components
@@ -36,6 +36,7 @@ from replay.inference.run.recursion import (
     RunResults,
     filled,
     no_results,
+    recorded_innovations,
     recursion,
 )
 from replay.inference.run.samples import sample_sets, seeded_generators
@@ -377,19 +378,8 @@ class Filter:
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
         """Make the stream of innovations, which needs a sensor; see `states`."""
-        stream = innovation_stream(
-            f"/estimates/{self.name}/innovation",
-            innovations.time_ns,
-            innovation_components(self.stage.sensors),
-            self.truth,
-            target_id=innovations.target_id,
-            accepted=innovations.numbers[:, 2].astype(np.uint32),
-            innovation=innovations.difference,
-            covariance=innovations.covariance,
-            squared=innovations.numbers[:, 0],
-            log_likelihood=innovations.numbers[:, 1],
-        )
-        return Ragged(stream, offsets)
+        topic, components = f"/estimates/{self.name}", innovation_components(self.stage.sensors)
+        return recorded_innovations(topic, components, self.truth, innovations, offsets)
 
 
 @lru_cache(maxsize=64)

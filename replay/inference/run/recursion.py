@@ -6,15 +6,15 @@ belief is no Gaussian any more.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.streams.blocks import filled_rows
-from replay.engine.streams.results import ALL_WELL
+from replay.engine.streams.blocks import Ragged, filled_rows
+from replay.engine.streams.results import ALL_WELL, InnovationColumns, innovation_stream
 from replay.inference.kalman.steps import (
     NOT_DRIVEN,
     NOT_FINITE,
@@ -120,6 +120,23 @@ class RunResults(NamedTuple):
 
     estimates: Any
     innovations: Innovations
+
+
+def recorded_innovations(
+    topic: str, components: Mapping[str, str], truth: str, innovations: Innovations, offsets: Integers
+) -> Ragged:
+    """Make the stream of innovations that a recursion filled in; run r has offsets[r]:offsets[r + 1]."""
+    numbers = innovations.numbers
+    columns = InnovationColumns(
+        innovations.time_ns,
+        innovations.target_id,
+        numbers[:, 2].astype(np.uint32),
+        innovations.difference,
+        innovations.covariance,
+        numbers[:, 0],
+        numbers[:, 1],
+    )
+    return Ragged(innovation_stream(f"{topic}/innovation", components, truth, columns), offsets)
 
 
 ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
