@@ -1,8 +1,8 @@
 """Lays the streams of many runs end to end in ragged columns, and merges their events in time order."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple, TypeVar
 
@@ -159,7 +159,7 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
     events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
     heads = partial(np.empty, len(everything), np.int64)
-    _merge()(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
+    _merge(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
     return events
 
 
@@ -177,11 +177,6 @@ def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> N
         is_last[:-1] |= column[1:] != column[:-1]
     is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
     return is_last
-
-
-@lru_cache(maxsize=1)
-def _merge() -> Callable[..., None]:
-    return compile_over_runs(merge_run, allocates=False)
 
 
 def merge_run(
@@ -210,3 +205,6 @@ def merge_run(
         events.time_ns[event], events.is_last[event] = time_ns, True
         events.topic[event], events.source[event] = first, heads[first]
         heads[first] += 1
+
+
+_merge = compile_over_runs(merge_run, allocates=False)
