@@ -129,9 +129,12 @@ class Motion:
             if each.source in late_s:
                 continue  # its speeds tell more
             late_s.setdefault(each.against, 0.0)
-            lag_s = _sure_lag_s(each.timing)
-            if abs(lag_s) > LONG_S or self._goes_where_it_points(each):
-                late_s[each.source] = late_s[each.against] - lag_s
+            own_s = late_s[each.against] - _sure_lag_s(each.timing)
+            nearest_s = min(late_s.values(), key=lambda other_s: abs(own_s - other_s))
+            if self._goes_where_it_points(each):
+                late_s[each.source] = own_s
+            elif _sure_lag_s(each.timing):
+                late_s[each.source] = nearest_s if abs(own_s - nearest_s) < LONG_S else own_s
         if not late_s:
             return {}
         sorted_s = sorted(late_s.values())
@@ -187,11 +190,18 @@ class Motion:
         return slope(told, np.linalg.norm(moved.values, axis=1))
 
     def turn(self, source: Series) -> Slope | None:
-        """How much the course turns for each radian of a turn rate."""
+        """How much the course turns for each radian of a turn rate.
+
+        One that is like the course as it is needs no lag: half a period of a winding road is none.
+        """
         if self.courses is None:
             return None
         windows = turned(self.courses, self.turn_span_s)
-        return slope(turn_between(self.likened(source), windows.begin_s, windows.end_s), windows.values)
+        for moved in (source, self.aligned(source), self.likened(source)):
+            told = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
+            if told.sign > 0:
+                break
+        return told
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
         """How much a heading turns for each radian of a turn rate."""

@@ -21,7 +21,6 @@ OF_LEAVES = {"recorders/models", "recorders/simulators", "replay/timeline/famili
 
 # Files of more lines; the schemas are data.
 LARGER = {
-    "pipeline/diagnosing/hypotheses.py",
     "recorders/log/schemas.py",
 }
 

@@ -336,6 +336,15 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
 
 
+def test_a_prior_that_states_no_kinds_is_diagnosed() -> None:
+    """Angles are those in rad, as for a filter."""
+    run = fl.record("landmarks", seed=3, duration_s=5.0)
+    prior = run.streams["/robot1/prior"]
+    bare = replace(prior, metadata={"components": prior.metadata["components"]})
+    found = fl.diagnose(replace(run, streams={**run.streams, bare.topic: bare}), "ekf")
+    assert found.sentences == fl.diagnose(run, "ekf").sentences
+
+
 def test_a_log_without_a_prior_is_diagnosed() -> None:
     """The filter began at the first fixes; there is no prior whose sigma could be wrong."""
     run = fl.record("landmarks", seed=3, duration_s=30.0, fix={"rate_hz": 2.0})

@@ -31,9 +31,9 @@ def driven() -> tuple[Floats, Floats]:
     return np.column_stack([places.T, heading]), np.stack([speed, turn], axis=1)
 
 
-def car(truth_states: dict[str, str], fix_states: dict[str, str]) -> list[fl.Stream]:
+def car(truth_states: dict[str, str], fix_states: dict[str, str], seed: int = 3) -> list[fl.Stream]:
     """Odometry, latitudes and longitudes once a second, and the truth in the plane HERE."""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(seed)
     poses, velocity = driven()
     density = {"forward_noise_density": "0.01", "turn_noise_density": "0.005"}
     noise = rng.normal(size=(STEPS, 2)) * [0.01, 0.005] / np.sqrt(STEP_S)
@@ -114,6 +114,9 @@ def test_a_truth_in_an_unknown_plane_is_not_judged_until_it_is_stated(
     estimates = log.with_suffix(".estimates.mcap")
     aligned = fuselog("evaluate", estimates, "--align", "se2", "--json")
     assert rmse_of(aligned) < SIGMA_M
+    bare = fuselog("evaluate", estimates, "--delta", "5")
+    assert bare.code == 2
+    assert "cannot be compared as it is: /car/truth does not state the origin" in bare.err
     for mend in (("--origin", "60,10"), ("--set", "/car/truth.plane=60,10,0")):
         assert rmse_of(fuselog("replay", log, "-e", "ekf", *mend, "--json")) < SIGMA_M
         # which evaluate does as the replay did

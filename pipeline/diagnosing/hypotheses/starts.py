@@ -9,6 +9,7 @@ from pipeline.altering.changes import bare
 from pipeline.diagnosing.advice import Advice, precise
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic
 from recorders.log import Stream
+from replay.engine.vectors.components import components_of, stated_components
 
 SIGMAS = (-1.0, 1.0, -4.0, 4.0)  # of a prior
 
@@ -19,7 +20,8 @@ def of_start(prior: Stream) -> Iterator[Hypothesis]:
         return
     covariance = prior["covariance"][0]
     size = round(len(covariance) ** 0.5)
-    kinds = prior.metadata.get("kinds", "").split(",")
+    names = components_of(prior.components)
+    kinds = list(stated_components(prior.metadata, names, f"topic {prior.topic}").values())
     variances = np.diagonal(covariance.reshape(size, size))
     has_rotation = "quaternion" in kinds
     column = 0
