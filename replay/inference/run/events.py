@@ -23,7 +23,7 @@ from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 from replay.inference.run.timing import last_of_stamps, select_events, where_wanted
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Points:
     """Holds the points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
 
@@ -77,6 +77,18 @@ def data_columns(stage: Stage) -> tuple[int, int]:
     )
     start = width if control is not None and control.interpolated else 0
     return max(width, start + stage.model.controls), start
+
+
+def events_of(
+    stage: Stage, found: Found, block: Block, context: Context, settings: Floats
+) -> tuple[FilterEvents, Booleans]:
+    """Return what `filter_events` does, which may be known from an earlier replay of the block."""
+    drives = () if found.control is None else (found.control.name,)
+    read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
+    origins = None if context.origins is None else context.origins.tobytes()
+    noise = settings.tobytes() if any(sensor.covariance for sensor in stage.sensors) else b""
+    key = stage, drives, *read, *context.points.values(), origins, noise
+    return block.once(key, lambda: filter_events(stage, found, block, context, settings))
 
 
 def filter_events(

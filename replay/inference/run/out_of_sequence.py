@@ -44,6 +44,7 @@ from replay.inference.run.recursion import (
     filled,
     processing,
 )
+from replay.inference.run.skipped import passed_over
 from replay.sampling.sets import sets_by_runs
 
 # The loop
@@ -250,7 +251,8 @@ class OutOfSequenceFilter:
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
-        made += [self.reprocessed(events, repeated), *inner.passed_over(block, without_covariance)]
+        skipped = passed_over(inner.name, inner.stage, inner.found, block, without_covariance)
+        made += [self.reprocessed(events, repeated), *skipped]
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:

@@ -7,6 +7,7 @@ belief is no Gaussian any more.
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
@@ -115,19 +116,10 @@ def no_results(
         model: the model, for the sizes of its state and tangent space.
         innovation_size: how many components the sensors measure together.
     """
-    n, t = model.size, model.tangent
-    shapes = [
-        *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
-        *(
-            (int(recorded[-1]), *shape)
-            for shape in ((), (), (innovation_size,), (innovation_size, innovation_size), (3,))
-        ),
-    ]
-    ends = list(accumulate(map(math.prod, shapes), initial=0))
-    memory = np.empty(ends[-1])
+    places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
+    memory = np.empty(places[-1][0].stop)
     time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
-        memory[begin:end].reshape(shape)
-        for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
+        memory[place].reshape(shape) for place, shape in places
     )
     estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
     reference = target_id.view(np.uint32)[: len(target_id)]
@@ -135,6 +127,19 @@ def no_results(
         recorded[:-1].copy(), noted_ns.view(np.int64), reference, difference, spread, numbers
     )
     return estimates, innovations
+
+
+@lru_cache(maxsize=64)
+def _places(
+    estimates: int, innovations: int, n: int, t: int, m: int
+) -> tuple[tuple[slice, tuple[int, ...]], ...]:
+    """Return where the columns of so many estimates and innovations lie in memory, and their shapes."""
+    shapes = (
+        *((estimates, *shape) for shape in ((), (n,), (t, t))),
+        *((innovations, *shape) for shape in ((), (), (m,), (m, m), (3,))),
+    )
+    ends = accumulate(map(math.prod, shapes), initial=0)
+    return tuple((slice(*both), shape) for both, shape in zip(pairwise(ends), shapes, strict=True))
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:
