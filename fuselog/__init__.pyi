@@ -64,6 +64,7 @@ from recorders.trajectories import read_trajectory as read_trajectory
 from replay.engine.api.functions import batch as batch
 from replay.engine.api.functions import each_run as each_run
 from replay.engine.api.functions import recursive as recursive
+from replay.engine.api.inputs import Binding as Binding
 from replay.engine.api.inputs import Floats as Floats
 from replay.engine.api.inputs import Given as Given
 from replay.engine.api.inputs import Integers as Integers

@@ -22,11 +22,13 @@ _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers tha
 class Parameters(BaseModel):
     """Base of all parameter types: immutable, no unknown names, no NaN and no infinity.
 
+    A default is of the declared type as what is given is: `sigma_m: float = 1` is 1.0.
+
     What a parameter means stands in one place, under `Attributes:` in the docstring of its type; its
     unit is the end of its name, or stands there too. `describe` has both.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
     @classmethod
     def __get_pydantic_json_schema__(

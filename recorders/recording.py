@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from recorders.errors import BadInput
 from recorders.log import LogWriter, RunMetadata, Stream
+from recorders.log.planes import in_plane_of_log
 from recorders.log.streams import concatenate
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
@@ -138,6 +139,7 @@ def record_run(
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run,)))
     with foreign_code(f"scenario {scenario}"):
         recording = simulator.simulate(parameters, generator)
+        recording = replace(recording, streams=in_plane_of_log(recording.streams))
         return recording, _metadata(scenario, parameters, seed, run, recording)
 
 

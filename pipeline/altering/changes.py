@@ -1,7 +1,7 @@
 """What `--set /TOPIC.WHAT=VALUE` does to a topic: which alteration, of which field, by how much."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,10 +13,11 @@ from pipeline.altering import alterations as alter
 from recorders.errors import BadInput, choices
 from recorders.importers.units import conversion, unit_of
 from recorders.log import Stream, Topic, schemas
-from replay.engine.streams.geodetic import ORIGIN
+from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
 from replay.engine.streams.sources import LogSource, MemorySource
 
 AXES = "xyz"
+ALL_TOPICS = "/*"
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
 WHATS = {
     "delay_s": "The stamps are so late, and are taken back by it.",
@@ -27,6 +28,8 @@ WHATS = {
     "heading_bias": "The heading of a Gaussian estimate, such as a prior, is too large by it (rad).",
     "origin": "Of geodetic fixes the origin of the plane: latitude and longitude in deg, altitude in m. "
     "Of positions where their zero lies in the plane, in m: it is added.",
+    "plane": "Of positions and states the origin of their plane, which counts as stated: latitude and "
+    "longitude in deg, altitude in m. /*.plane is of all topics of a plane that state none.",
     "exchanged": "Two numbers that stand for each other, as 3,9; or the topic that this one stands for.",
 }
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*")
@@ -148,7 +151,7 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
     Raises BadInput where there is no such topic or field, or a value makes no sense.
     """
     changes: dict[str, Change] = {}
-    for key, value in settings.items():
+    for key, value in _of_one_topic(source, settings):
         topic, dot, what = key.rpartition(".")
         if not dot or not what:
             raise BadInput(
@@ -169,6 +172,21 @@ def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) ->
     return changes
 
 
+def _of_one_topic(
+    source: LogSource | MemorySource, settings: Mapping[str, Any]
+) -> Iterator[tuple[str, Any]]:
+    """Settings of topics by their names; what is set of all is set of each that it is about."""
+    of_all = f"{ALL_TOPICS}.plane"
+    for key, value in settings.items():
+        if key != of_all:
+            yield key, value
+            continue
+        for name, topic in source.topics.items():
+            is_told = stated_in(name, topic.metadata) or f"{name}.plane" in settings
+            if is_planar(topic.schema_name, topic.metadata) and not is_told:
+                yield f"{name}.plane", value
+
+
 def _with(change: Change, given: _Setting) -> Change:
     """A change with one more setting of its topic."""
     what = given.what
@@ -182,6 +200,8 @@ def _with(change: Change, given: _Setting) -> Change:
         return replace(change, gain=change.gain + gain)
     if what == "origin":
         return _origin(change, given)
+    if what == "plane":
+        return _plane(change, given)
     if what == "exchanged":
         return _exchange(change, given)
     return replace(change, columns=(*change.columns, _of_column(given)))
@@ -246,13 +266,7 @@ def _field(given: _Setting, name: str) -> tuple[str, tuple[str, int | None]]:
 
 def _origin(change: Change, given: _Setting) -> Change:
     if given.empty.schema.full_name == schemas.GEODETIC_FIX.full_name:
-        example = "latitude and longitude in deg, and altitude in m, such as 49.01,8.4,115"
-        texts = given.several((2, 3), example)
-        place = [_plain(given, text, example) for text in texts]
-        if not (abs(place[0]) <= 90.0 and abs(place[1]) <= 360.0):
-            raise given.refused(example)
-        stated = dict(zip(ORIGIN, map(repr, place), strict=False))
-        return replace(change, metadata={**change.metadata, **stated})
+        return _plane(change, given)
     if "position_m" not in given.empty.columns:
         raise BadInput(
             f"--set {given.key}: only positions and geodetic fixes have an origin; leave it out"
@@ -263,6 +277,17 @@ def _origin(change: Change, given: _Setting) -> Change:
         partial(_by, alter.shifted("position_m", entry), value) for entry, value in enumerate(place)
     ]
     return replace(change, columns=(*change.columns, *added))
+
+
+def _plane(change: Change, given: _Setting) -> Change:
+    if not is_planar(given.empty.schema.full_name, given.empty.metadata):
+        raise BadInput(f"--set {given.key}: its messages are in no plane of positions; leave it out")
+    texts = given.several((2, 3), EXAMPLE)
+    origin = origin_of(texts)
+    if origin is None:
+        raise given.refused(EXAMPLE)
+    stated = dict(list(origin.metadata.items())[: len(texts)])
+    return replace(change, metadata={**change.metadata, **stated})
 
 
 def _plain(given: _Setting, text: str, example: str) -> float:

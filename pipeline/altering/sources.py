@@ -13,6 +13,7 @@ from typing import Any, overload
 import numpy as np
 
 from pipeline.altering.changes import Change, changes_of, is_of_topic
+from pipeline.altering.planes import in_one_plane
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream, Topic
 from recorders.parsing import parse_json
@@ -31,13 +32,15 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
     """A run with topics altered; of one that is altered already, more so.
 
+    Where its topics state different planes, it is read in one of them; see `in_one_plane`.
+
     Args:
         source: the run.
         settings: values by `/TOPIC.WHAT`, such as `{"/fix.delay_s": 0.3}`; see `changes_of`.
 
     Raises BadInput where the run has no such topic, the topic no such field, or a value makes no sense.
     """
-    if not settings:
+    if not settings and not in_one_plane(source.name, source.topics, {}):
         return source
     if isinstance(source, AlteredLog):
         made = replace(source, alterations={**source.alterations, **settings})
@@ -99,7 +102,7 @@ class AlteredRecording(MemorySource):
 
 
 def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
-    changes = changes_of(source, settings)
+    changes = in_one_plane(source.name, source.topics, changes_of(source, settings))
     streams = {
         topic: changes[topic].altered(source.streams[changes[topic].stored]) if topic in changes else own
         for topic, own in source.streams.items()
@@ -124,7 +127,8 @@ class AlteredLog(LogSource):
     @cached_property
     def changes(self) -> dict[str, Change]:
         """What is done to topics."""
-        return changes_of(LogSource(self.log), self.alterations)
+        changes = changes_of(LogSource(self.log), self.alterations)
+        return in_one_plane(self.name, self.log.topics, changes)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:

@@ -35,6 +35,7 @@ from recorders.log import Stream, write_log
 from recorders.parameters import merge
 from recorders.recording import import_run, record_run
 from replay.engine.streams.sources import MemorySource, memory_source
+from replay.foreign.naming import allowed
 
 
 def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters: Any) -> MemorySource:
@@ -142,7 +143,7 @@ def run(
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """
     stated = _stated(experiment)
-    found = stated.with_settings(set or {}, _given(runs=runs, seed=seed))
+    found = stated.with_settings(allowed(set or {}), _given(runs=runs, seed=seed))
     if workers not in (None, 1) or scheduler is not None or executor is not None:
         require_campaign(found, "leave out workers, scheduler and executor")
     folder = Path("out", stated.name) if out is None else Path(out)
@@ -198,10 +199,11 @@ def sweep(
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """
     stated, given = _stated(experiment), _given(runs=runs, seed=seed)
+    own = allowed(set or {})
     if isinstance(over, Mapping):
         over = [over_of(key, np.asarray(values).tolist()) for key, values in over.items()]
-    points = points_of(over, samples, sampling, stated.with_settings(set or {}, given).seed)
-    found = [stated.with_settings(merge(set or {}, nested(point)), given) for point in points]
+    points = points_of(over, samples, sampling, stated.with_settings(own, given).seed)
+    found = [stated.with_settings(merge(own, allowed(nested(point))), given) for point in points]
     folder = Path("out", f"{stated.name}-sweep") if out is None else Path(out)
     check_folder(folder, {"input": _inputs(stated, found[0])})
     open_pool = _pool(workers, scheduler, executor, found)

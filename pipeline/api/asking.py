@@ -14,7 +14,7 @@ from pipeline.logs.constraints import ConstraintParameters
 from pipeline.output.terminal import print_table
 from pipeline.runs.experiment import Experiment, Study, experiment_of_logs, read_experiment
 from pipeline.runs.inputs import load_scenario
-from pipeline.runs.settings import read_settings
+from pipeline.runs.settings import named_by, read_settings
 from recorders.errors import BadInput, choices
 from recorders.log import open_log
 from recorders.parameters import merge, parse_settings
@@ -98,11 +98,15 @@ def _estimators(options: Mapping[str, Any]) -> Iterator[Entries]:
     labels = options.get("names") or options.get("labels") or [options.get("label")]
     if not all(labels):
         raise BadInput(f"--set NAME{ASKED}: name an estimator, such as -e ekf")
-    tables = read_settings(options["settings_file"], labels)
+    programs = named_by(labels)
+    labels, tables = list(programs), read_settings(options["settings_file"], programs)
     given = parse_settings(text for text in options["settings"] if not text.endswith(ASKED))
     named = {label: given[label] for label in labels if isinstance(given.get(label), dict)}
     kinds = {label: {"kind": each["kind"]} for label, each in named.items() if "kind" in each}
-    chosen = {label: merge(tables.get(label, {}), kinds.get(label, {})) for label in labels}
+    chosen = {
+        label: merge(merge(tables.get(label, {}), own), kinds.get(label, {}))
+        for label, own in programs.items()
+    }
     yield from _by_label(chosen, options.get("model"))
 
 
@@ -121,6 +125,7 @@ def _of_estimator(label: str, values: Mapping[str, Any], model: str | None = Non
     own = {key: value for key, value in values.items() if key != "kind"}
     kind = values.get("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
+    estimator = estimator.specified(label, own)
     by_model = estimator.parameters_by_model(label, variant)
     if model is not None and by_model and model not in by_model:
         raise BadInput(f"estimator {label}: no model '{model}'; {choices(model, by_model)}")

@@ -112,7 +112,7 @@ def judge_estimates(
                 **setting_of(sources[0]),
                 **comparison,
             }
-            outcome = summarise(judge, coverage)
+            outcome = summarise(judge, coverage, estimators)
             outcome.metrics.update(compared.metrics)
             outcome.tables["summary"] = summary_table(outcome.metrics)
             outcome.figures.update(compared.figures)

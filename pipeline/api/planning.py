@@ -19,11 +19,13 @@ from recorders.recording import Recording
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.replaying.late import Late
 from replay.engine.streams.sources import LogSource, MemorySource, memory_source
+from replay.foreign.naming import allowed, shorthand
 from replay.inference.model.model import Model
 from replay.judging.metrics.measuring import find_metrics
 
 Log = str | Path | LogSource | MemorySource | Recording
 Kind = str | Estimator[Any] | Mapping[str, Any]
+Named = str | Estimator[Any] | Mapping[str, Kind]
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ class Plan:
 
 def plan_replay(
     logs: Log | Iterable[Log],
-    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+    estimators: Named | Iterable[Named],
     *,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -94,7 +96,7 @@ def plan_replay(
     arrival_order: bool = False,
     late: str | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
-    metrics: str | Sequence[str] = (),
+    metrics: str | Sequence[str] | None = None,
 ) -> Plan:
     """Check what a replay is asked for, and open its logs; see `pipeline.api.replays.replay`.
 
@@ -108,8 +110,8 @@ def plan_replay(
     alterations, given = split_settings(set or {})
     settings = settings_of(estimators)
     if given:
-        settings = with_settings(settings, given)
-    wanted = [metrics] if isinstance(metrics, str) else list(metrics)
+        settings = with_settings(settings, allowed(given))
+    wanted = [metrics] if isinstance(metrics, str) else list(metrics or [])
     find_metrics(wanted)
     sources = [span_of(source, start_s, end_s, order) for source in sources_of(logs, alterations)]
     origins = origins_of(sources, from_, start_sigma or {}, order, gap_limit_s)
@@ -163,13 +165,16 @@ def _source(log: Log) -> LogSource | MemorySource:
 
 
 def settings_of(
-    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+    estimators: Named | Iterable[Named],
 ) -> dict[str, dict[str, Any]]:
     """The settings of each estimator by its label; raises BadInput where they are none."""
-    listed = [estimators] if isinstance(estimators, str | Mapping) else list(estimators)
+    are_several = isinstance(estimators, Iterable) and not isinstance(estimators, str | Mapping)
+    listed: list[Any] = [*estimators] if are_several else [estimators]  # type: ignore[misc]
     chosen: dict[str, dict[str, Any]] = {}
     for each in listed:
-        if not isinstance(each, str | Mapping):
+        if isinstance(each, Model):
+            raise BadInput('an estimator is a model without a method; give modelled(model, "ekf")')
+        if not isinstance(each, str | Mapping | Estimator):
             raise BadInput(
                 f'an estimator is {type(each).__name__}; give its name, or {{"mine": it}} with a label'
             )
@@ -178,7 +183,7 @@ def settings_of(
                 f"{', '.join(each)}: these look like settings of one estimator; give them a label: "
                 '{"mine": {...}}'
             )
-        for label, what in ({each: {}} if isinstance(each, str) else each).items():
+        for label, what in _labelled(each).items():
             if label in chosen:
                 raise BadInput(f"estimator {label} is given twice; give the second another label")
             chosen[label] = dict(what) if isinstance(what, Mapping) else {"kind": what}
@@ -195,3 +200,10 @@ def settings_of(
     if not chosen:
         raise BadInput("there are no estimators to replay; give at least one")
     return chosen
+
+
+def _labelled(named: Named) -> Mapping[str, Kind]:
+    """What stands under which label; a name and an estimator are labels of their own."""
+    if isinstance(named, str):
+        return dict([shorthand(named)])
+    return {named.label: named} if isinstance(named, Estimator) else allowed(named)

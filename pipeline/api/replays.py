@@ -19,7 +19,9 @@ import pandas as pd
 
 from pipeline.altering.sources import setting_of
 from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Kind, Log, plan_replay
+from pipeline.api.planning import Log, Named, plan_replay
+from pipeline.output.alarming import alarms_of
+from pipeline.output.alarms import Alarm
 from pipeline.output.charts import draw
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 
 def replay(
     logs: Log | Iterable[Log],
-    estimators: str | Mapping[str, Kind] | Iterable[str | Mapping[str, Kind]],
+    estimators: Named | Iterable[Named],
     *,
     start_s: float | None = None,
     end_s: float | None = None,
@@ -52,15 +54,16 @@ def replay(
     arrival_order: bool = False,
     late: str | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
-    metrics: str | Sequence[str] = (),
+    metrics: str | Sequence[str] | None = None,
 ) -> "Replay":
     """Replay estimators over logs, and judge them where there is truth.
 
     Args:
         logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
-        estimators: registered names, or labels of your own with what they stand for: an `Estimator`, as
-            `recursive`, `batch` and `modelled` make them, or settings, whose `kind` is a name or an
-            `Estimator`: `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
+        estimators: registered names, an `Estimator`, as `recursive`, `batch` and `modelled` make them,
+            or labels of your own with what they stand for: an `Estimator`, or settings, whose `kind` is
+            a name or an `Estimator`:
+            `["ekf", {"mine": LOCATE, "wide": {"kind": "ekf", "sigma_range_m": 0.2}}]`.
         start_s: where the replayed span begins, in seconds since each run's epoch.
         end_s: where it ends.
         start_from: what filters begin with at `start_s`: "truth", or the estimates log of an earlier
@@ -134,7 +137,9 @@ class Replay:
 
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        said = [f"Replay of {runs} by {', '.join(self.settings)}", *self.judge.components_without_truth]
+        said = [f"Replay of {runs} by {', '.join(self.settings)}"]
+        said += [each.words for each in self.alarms[:1]]
+        said += self.judge.components_without_truth
         return "\n".join(
             [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
         )
@@ -196,6 +201,11 @@ class Replay:
     def losses(self) -> list[str]:
         """A sentence for what was not estimated throughout, and for measurements that were not used."""
         return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
+
+    @cached_property
+    def alarms(self) -> list[Alarm]:
+        """What makes the numbers doubtful, the worst first: each has a sentence, `words`."""
+        return alarms_of(self.judge, self.done.parameters, self.done.coverage)
 
     @property
     def coverage(self) -> pd.DataFrame:
@@ -265,7 +275,7 @@ class Replay:
         stated = {"arrival_order": self.arrival_order or None, "late": self.late}
         settings |= {name: value for name, value in stated.items() if value is not None}
         with result_folder(place) as part:
-            outcome = summarise(self.judge, self.done.coverage)
+            outcome = summarise(self.judge, self.done.coverage, self.done.parameters)
             outcome.input_sha256 = self.input_sha256
             return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
 

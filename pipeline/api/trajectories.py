@@ -17,7 +17,9 @@ from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.output.summary import summary_table
 from recorders.log import schemas
+from recorders.log.planes import stated_in
 from recorders.trajectories import Trajectory, read_trajectory
+from replay.engine.streams.planes import into_plane_of
 from replay.engine.streams.sources import LogSource, Source
 from replay.judging.errors.alignment import Align, AlignedEstimates
 from replay.judging.errors.evaluation import split_topic
@@ -71,8 +73,11 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """A sentence for what was mended in a trajectory."""
-        return [*self.estimate.notes, *self.truth.notes]
+        """A sentence for what was mended in a trajectory, and where no time offset helps."""
+        sought = self.comparison.time_offset_s == "estimate"
+        in_vain = "no time offset makes the error smaller; none was added"
+        told = [in_vain] if sought and not self.compared.time_offset_s else []
+        return [*self.estimate.notes, *self.truth.notes, *told]
 
     @property
     def poses(self) -> pd.DataFrame:
@@ -240,7 +245,10 @@ def compare_logs(
                 continue
             if not topic.startswith("/estimates/") or truth_topic not in source.topics:
                 continue
-            found, true = trajectory_of(of_run[topic]), trajectory_of(source[truth_topic])
+            true_states = source[truth_topic]
+            if plane := stated_in(topic, stated.metadata):
+                true_states = into_plane_of(true_states, plane)
+            found, true = trajectory_of(of_run[topic]), trajectory_of(true_states)
             if found is None or true is None or not len(found) or not len(true):
                 continue
             found = replace(found, name=f"{of_run.name}: topic {topic}")

@@ -16,6 +16,7 @@ from pipeline.runs.ensemble import Settings
 from recorders.errors import BadInput
 from recorders.log import open_log
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.foreign.naming import of_file
 
 Runs = Mapping[str, LogSource | MemorySource]
 
@@ -50,7 +51,7 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
         raise BadInput("the golden names no estimators; give those that it is of")
     replayed = make(
         runs,
-        stored["estimators"] if estimators is None else estimators,
+        of_file(stored["estimators"]) if estimators is None else estimators,
         late=stored["late"],
         arrival_order=stored["arrival_order"],
         columns=stored["columns"],
@@ -106,7 +107,7 @@ def update(
     stated: dict[str, Any] = {} if before is None else dict(before["settings"])
     if not stated and (path / RESULT_FILE).is_file():
         stated = read_result(path).settings
-    chosen = estimators or stated.get("estimators", {})
+    chosen = estimators or of_file(stated.get("estimators", {}))
     if not chosen:
         raise BadInput(f"{path}: name the estimators that the golden is to have, such as -e ekf")
     kept = None if before is None else before["tolerances"]

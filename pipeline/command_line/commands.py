@@ -4,11 +4,13 @@ Rerun, matplotlib, pandas and scipy take long to import: only what draws, tabula
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.api.planning import plan_replay
+from pipeline.output.alarming import alarms_of
+from pipeline.output.alarms import Alarm
 from pipeline.output.coverage import sentences
 from pipeline.output.outputs import ESTIMATES, PICTURE, TIMELINE, check_files
 from pipeline.output.results import (
@@ -19,9 +21,11 @@ from pipeline.output.results import (
 from pipeline.output.terminal import (
     print_json,
     print_metrics,
+    print_others,
     print_parameters,
     print_pose_errors,
     print_table,
+    print_worst,
     progress,
     say,
     warn,
@@ -97,8 +101,17 @@ def replay_logs(
         "parameters_of_log": done.stated,
         "coverage": [row._asdict() for row in done.coverage],
     }
+    alarms = alarms_of(done.judge, done.parameters, done.coverage)
     unused = sentences(done.coverage)
-    _print_outcome(done.judge, names, as_json=as_json, written=paths, told=told, unused=unused)
+    _print_outcome(
+        done.judge,
+        list(estimators),
+        alarms,
+        as_json=as_json,
+        written=paths,
+        told=told,
+        unused=unused,
+    )
 
 
 def companions_if(foxglove: bool) -> Companions | None:
@@ -166,6 +179,7 @@ def evaluate_logs(
     _print_outcome(
         found.judge,
         found.estimators,
+        alarms_of(found.judge, found.estimators, found.coverage),
         as_json=as_json,
         written=[out] if out else [],
         told={"coverage": [row._asdict() for row in found.coverage]},
@@ -225,6 +239,7 @@ def evaluate_trajectory(
 def _print_outcome(
     judge: Judge,
     estimators: Iterable[str],
+    alarms: Sequence[Alarm],
     *,
     as_json: bool,
     written: Sequence[Path],
@@ -242,14 +257,17 @@ def _print_outcome(
         outcome = {
             "metrics": values,
             "bounds": judge.bounds,
+            "alarms": [asdict(alarm) for alarm in alarms],
             "failures": failures,
             "losses": [*judge.notes_of_coverage, *unused],
             "written": [str(path) for path in written],
         }
         print_json(outcome | dict(told or {}))
         return
+    print_worst(alarms)
     runs = judge.runs_table if judge.runs >= FEWEST_RUNS else None  # of fewer it says nothing
     print_metrics(values, judge.bounds, runs)
+    print_others(alarms)
     if judge.runs == 1 and any(split_metric(key)[1] == "nees" for key in judge.bounds):
         say(
             "nees: of one run; its interval is that of a single step, so that a NEES within it does not "

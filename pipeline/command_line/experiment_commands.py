@@ -5,21 +5,32 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.api.api import run, sweep
-from pipeline.output.results import RUNS, read_table, split_metric
+from pipeline.output.results import RESULT_FILE, RUNS, read_table, split_metric
 from pipeline.output.terminal import (
+    has_many_cases,
     print_claims,
     print_json,
     print_metrics,
+    print_others,
     print_parameters,
     print_table,
+    print_worst,
     progress,
     say,
 )
-from pipeline.runs.experiment import Stated, experiment_of_logs, read_experiment, require_campaign
+from pipeline.runs.experiment import (
+    Experiment,
+    Stated,
+    experiment_of_logs,
+    read_experiment,
+    require_campaign,
+)
 from pipeline.runs.settings import read_settings
 from pipeline.runs.sweeps import DRAWN, Sampling, parse_over
 from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
+from replay.engine.replaying.estimator import configure
+from replay.foreign.naming import allowed
 
 
 def run_named(
@@ -38,10 +49,16 @@ def run_named(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Run an experiment, or replay logs as one, and print its metrics and claims."""
+    """Run an experiment, or replay logs as one, and print its metrics and claims.
+
+    With `tells_parameters` only print the parameters of its estimators.
+    """
     stated, values = _stated_experiment(named, labels, over, settings_file, settings)
     if data is not None and stated.source.endswith(".mcap"):
         raise BadInput(f"{stated.source}: logs are replayed as they are; leave out --data")
+    if tells_parameters:
+        _tell_parameters(stated.with_settings(values, {}), as_json=as_json)
+        return
     if workers is not None or scheduler is not None:
         experiment = stated.with_settings(values, {})
         require_campaign(experiment, "leave out --workers and --scheduler")
@@ -60,13 +77,33 @@ def run_named(
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
-    if tells_parameters:
-        print_parameters(result.settings["parameters"])
-        say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
+    print_worst(result.alarms)
+    if result.claims or has_many_cases(result.metrics):
+        from pipeline.output.report.verdict import verdict  # it takes long to import
+
+        say(" ".join(verdict(result)))
     runs = done.folder / RUNS
-    print_metrics(result.metrics, result.bounds, read_table(runs) if runs.is_file() else None)
+    details = done.folder / (
+        "tables/summary.csv" if "tables/summary.csv" in result.files else RESULT_FILE
+    )
+    table = read_table(runs) if runs.is_file() else None
+    print_metrics(result.metrics, result.bounds, table, str(details))
+    print_others(result.alarms)
     print_claims(result.claims)
     say(f"{done.folder}: {', '.join(result.contents)}")
+
+
+def _tell_parameters(experiment: Experiment, *, as_json: bool) -> None:
+    """Print the parameters of an experiment's estimators, defaults included."""
+    parameters = {
+        label: configure(label, values)[1].model_dump(mode="json", exclude_none=True)
+        for label, values in experiment.estimators.items()
+    }
+    if as_json:
+        print_json({"parameters": parameters})
+        return
+    print_parameters(parameters)
+    say("a parameter of a model that is not listed is taken from the log; see fuselog replay")
 
 
 def _stated_experiment(
@@ -83,7 +120,7 @@ def _stated_experiment(
     if not files and (len(named) > 1 or labels):
         raise BadInput(f"{named[0]}: one experiment runs at a time, with its own estimators")
     stated = experiment_of_logs(files, labels) if files else read_experiment(named[0])
-    values = merge(read_settings(settings_file, stated.labels), parse_settings(settings))
+    values = merge(read_settings(settings_file, stated.labels), allowed(parse_settings(settings)))
     files = [*stated.files, *filter(None, [settings_file])]
     return stated._replace(files=files), {**values, **over}
 

@@ -15,7 +15,7 @@ from pipeline.command_line.options import (
     errors_option,
     json_option,
     late_option,
-    parameters_option,
+    parameters_alone_option,
     scheduler_option,
     set_option,
     settings_option,
@@ -44,7 +44,7 @@ from recorders.errors import printable
 @click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT].")
 @workers_option
 @scheduler_option
-@parameters_option
+@parameters_alone_option
 @json_option
 @settings_option
 @set_option("experiment")

@@ -26,6 +26,14 @@ for each in (
     *(judging.evaluate, judging.compare, judging.diagnose, judging.observability),
     *(experiments.run, experiments.sweep, experiments.report),
     *(logs.info, logs.view, logs.export, logs.cut, logs.merge, logs.constrain, logs.relabel),
-    *(lists.scenarios, lists.models, lists.estimators, lists.metrics, lists.experiments, lists.cache),
+    *(
+        lists.scenarios,
+        lists.models,
+        lists.estimators,
+        lists.metrics,
+        lists.experiments,
+        lists.cache,
+        lists.header,
+    ),
 ):
     fuselog.add_command(each)

@@ -78,3 +78,18 @@ def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> Non
     from pipeline.logs.information import show_cache
 
     show_cache(clear=clear, as_json=as_json)
+
+
+@command(
+    "Print the folder of fuselog_filter.h, for a compiler.",
+    "fuselog header",
+    "fuselog replay run.mcap -e lib:./mine.so",
+)
+def header() -> None:
+    """Print the folder of the header that a filter of your own in C, C++ or Rust is compiled with.
+
+    cc -shared -fPIC -I "$(fuselog header)" mine.c -o mine.so
+    """
+    from replay.foreign.native.library import HEADER
+
+    click.echo(HEADER.parent)

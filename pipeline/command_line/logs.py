@@ -35,7 +35,10 @@ if TYPE_CHECKING:
 @recover_option
 @json_option
 def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
-    """Say what LOG holds: the run, its topics, schemas, message counts, the models that fit it."""
+    """Say what LOG holds: the run, its topics, schemas, message counts, the models that fit it.
+
+    LOG may be a log, an estimates log, a bag of ROS, a result folder or a timeline (.rrd).
+    """
     from pipeline.logs.information import show_log
 
     show_log(log, is_all=is_all, recover=recover, as_json=as_json)
@@ -87,9 +90,9 @@ def view(path: Path, **options: Any) -> None:
 def export(path: Path, to: Any, **options: Any) -> None:
     """Write streams of PATH, a log or an estimates log, for other tools.
 
-    To tum and kitti go the estimates and truths that state a position, as trajectories; to mot tracks
-    and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a table; to
-    foxglove one log of the messages that Foxglove and Rerun show.
+    To tum and kitti go the estimates and truths that state a position, and poses, as trajectories; to
+    mot tracks and truths frame by frame, as TrackEval reads them; to csv and parquet any stream, as a
+    table; to foxglove one log of the messages that Foxglove and Rerun show.
     """
     from pipeline.logs.exporting import export as export_log
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import click
 
+from replay.foreign.naming import allow_programs_of_files
+
 
 class Output(click.Path):
     """Declares what a command writes, by which the audit of outputs in tests finds it.
@@ -61,6 +63,22 @@ class TimeOffset(Seconds):
         return value if value == "estimate" else super().convert(value, param, ctx)
 
 
+class Place(click.ParamType):
+    """A place on the earth: latitude and longitude in deg, and perhaps the height in m."""
+
+    name = "place"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The place as a list of numbers."""
+        from recorders.log.planes import EXAMPLE, origin_of
+
+        found = origin_of(str(value).split(","))
+        if found is None:
+            self.fail(f"{value}: expected {EXAMPLE}", param, ctx)
+        return list(found)
+
+
+PLACE = Place()
 RESULT = Output(file_okay=False)
 LOG_OR_FOLDER = Output(".mcap")
 LOG, TIMELINE, PICTURE, PAGE = map(OutputFile, (".mcap", ".rrd", ".png", ".html"))
@@ -68,13 +86,32 @@ GOLDEN, JUNIT = map(OutputFile, (".xz", ".xml"))
 ANY_PATH = click.Path(path_type=Path)
 COUNT = click.IntRange(min=0)
 FORMAT = click.Choice(["tum", "kitti", "euroc"])
-settings_option = click.option(
-    "--settings",
-    "settings_file",
-    type=ANY_PATH,
-    metavar="FILE",
-    help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides it.",
-)
+
+
+def settings_option(function: Callable[..., None]) -> Callable[..., None]:
+    """The option --settings, and that on programs which files such as that one name."""
+
+    def allow(context: click.Context, parameter: click.Parameter, value: bool) -> None:  # noqa: ARG001
+        allow_programs_of_files(value)
+
+    file = click.option(
+        "--settings",
+        "settings_file",
+        type=ANY_PATH,
+        metavar="FILE",
+        help="Parameters of estimators from this TOML file, as fuselog tune writes it; --set overrides "
+        "it.",
+    )
+    programs = click.option(
+        "--allow-programs",
+        is_flag=True,
+        expose_value=False,
+        callback=allow,
+        help="Also run programs (lib:, exec:) that a golden, a result or a settings file names.",
+    )
+    return file(programs(function))
+
+
 errors_option = click.option(
     "--errors", is_flag=True, help="Keep every error of every estimate, as Parquet files."
 )
@@ -89,6 +126,12 @@ scheduler_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 parameters_option = click.option(
     "--parameters", "tells_parameters", is_flag=True, help="Print all parameters, defaults included."
+)
+parameters_alone_option = click.option(
+    "--parameters",
+    "tells_parameters",
+    is_flag=True,
+    help="Print all parameters of the estimators, defaults included, and run nothing.",
 )
 recover_option = click.option(
     "--recover", is_flag=True, help="Read the intact part of a log that was cut off or damaged."
@@ -113,6 +156,12 @@ late_option = click.option(
     help="With --arrival-order: process measurements in the order of their stamps all the same; drop "
     "late ones, wait SECONDS for them, or rewind by up to SECONDS to take them in.",
 )
+origin_option = click.option(
+    "--origin",
+    type=PLACE,
+    metavar="LATITUDE,LONGITUDE[,HEIGHT]",
+    help="The origin, in deg and m, of the plane of all topics that state none.",
+)
 foxglove_option = click.option(
     "--foxglove",
     is_flag=True,
@@ -123,8 +172,10 @@ foxglove_option = click.option(
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """The option --set of a command whose settings this takes, see `pipeline.api.asking.TAKERS`.
 
-    Where it asks, NAME=?, the command prints what that parameter means, and does nothing else.
+    Where it asks, NAME=?, the command prints what that parameter means, and does nothing else. A command
+    that replays logs has --origin too, which is a setting of all their topics.
     """
+    replays = takes in ("estimators", "experiment")
 
     def added(function: Callable[..., None]) -> Callable[..., None]:
         @click.option(
@@ -136,6 +187,8 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
         )
         @wraps(function)
         def asked_first(*arguments: Any, **options: Any) -> None:
+            if replays and (place := options.pop("origin")):
+                options["settings"] += (f"/*.plane={','.join(map(repr, place))}",)
             if any(text.endswith("=?") for text in options["settings"]):
                 from pipeline.api.asking import show_meanings
 
@@ -143,6 +196,6 @@ def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None
             else:
                 function(*arguments, **options)
 
-        return asked_first
+        return origin_option(asked_first) if replays else asked_first
 
     return added

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from pipeline.command_line.help import command
-from pipeline.command_line.options import ANY_PATH, COUNT, LOG, foxglove_option, set_option
+from pipeline.command_line.options import ANY_PATH, COUNT, LOG, PLACE, foxglove_option, set_option
 from recorders.errors import BadInput, printable
 
 
@@ -89,7 +89,16 @@ def record(
     "without it, import table lists these.",
 )
 @click.option(
-    "--guess", is_flag=True, help="For tables: write a mapping to start from to -o FILE.toml instead."
+    "--origin",
+    type=PLACE,
+    metavar="LATITUDE,LONGITUDE[,HEIGHT]",
+    help="For ROS and tables: the origin of the plane that positions are in, in deg and m.",
+)
+@click.option(
+    "--guess",
+    is_flag=True,
+    help="For tables: write a mapping to start from to -o FILE.toml instead; with -o FILE.mcap import "
+    "by it at once, and write it beside the log.",
 )
 @set_option("recorder")
 def import_(
@@ -98,6 +107,7 @@ def import_(
     out: Path | None,
     clock: str | None,
     mapping: str | None,
+    origin: list[float] | None,
     guess: bool,
     settings: tuple[str, ...],
 ) -> None:
@@ -105,30 +115,39 @@ def import_(
 
     Tables (SOURCE table) may be several files and folders, which become one log.
     """
+    from pipeline.logs.information import worst
     from pipeline.output.outputs import check_files, imported
+    from recorders.log import open_log
     from recorders.parameters import parse_settings
+    from recorders.plausibility.checks import findings_of
     from recorders.recording import import_log
 
     if guess:
         if source != "table":
             raise BadInput(f"--guess: is for tables, not for {source}; use: fuselog import table PATH")
-        _write_guess(paths, out or Path("mapping.toml"))
-        return
+        if out is None or out.suffix != ".mcap":
+            _write_guess(paths, out or Path("mapping.toml"))
+            return
+        check_files([(out, imported(source))], {"data": paths})
+        mapping = str(out.with_suffix(".toml"))
+        _write_guess(paths, Path(mapping), is_used=True)
     if len(paths) > 1 and source != "table":
         raise BadInput(f"{paths[1]}: {source} data are one file or folder; give the first alone")
     target = out or Path(f"{source}.mcap")
     check_files([(target, imported(source))], {"data": paths})
     more = [str(path) for path in paths[1:]]
-    chosen = {"clock": clock, "mapping": mapping, "more": more or None}
+    chosen = {"clock": clock, "mapping": mapping, "origin": origin, "more": more or None}
     given = {name: value for name, value in chosen.items() if value is not None}
     metadata, messages = import_log(source, paths[0], parse_settings(settings) | given, target)
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
+    for sentence in worst(findings_of(open_log(target)), target):
+        click.echo(printable(sentence))
 
 
-def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
-    """Write a mapping of tables to start from, and say how to go on."""
+def _write_guess(paths: tuple[Path, ...], mapping: Path, *, is_used: bool = False) -> None:
+    """Write a mapping of tables to start from, and say how to go on; or that it is used as it is."""
     from pipeline.output.outputs import MAPPING, check_files
     from recorders.atomic import whole_file
     from recorders.importers.tables.guessing import guess
@@ -137,6 +156,9 @@ def _write_guess(paths: tuple[Path, ...], mapping: Path) -> None:
     text = guess(paths)
     with whole_file(mapping) as file:
         file.write_text(text, encoding="utf-8")
+    if is_used:
+        click.echo(printable(f"{mapping}: what was guessed and is imported by; read it"))
+        return
     command = shlex.join(["fuselog", "import", "table", *map(str, paths), "--mapping", str(mapping)])
     click.echo(printable(f"{mapping}: read it, then: {command}"))
 

@@ -32,6 +32,7 @@ from replay.engine.replaying.estimator import configure
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
 from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource, MemorySource, Source
+from replay.foreign.naming import of_file
 from replay.judging.errors.evaluation import POSITION, split_topic
 from replay.judging.errors.trajectory_streams import estimates_of
 from replay.judging.errors.truths import Doubt
@@ -327,6 +328,7 @@ def _replayed(folder: Path, result: Result, progress: Progress, kept: Candidate)
         raise BadInput("its settings do not say how to replay it; estimates logs can be compared")
     fields = {each.alias or name for name, each in Experiment.model_fields.items()}
     entries = {key: value for key, value in result.settings.items() if key in fields}
+    entries["estimators"] = of_file(entries["estimators"])
     if "record" not in entries:  # recorded data have as many runs as there are
         entries = {key: value for key, value in entries.items() if key not in ("runs", "seed")}
     experiment = build(Experiment, entries, f"{folder / RESULT_FILE}: settings")

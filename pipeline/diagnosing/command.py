@@ -40,7 +40,7 @@ def diagnose_log(
     check_outputs(out, save, {"log": [log], "settings": list(filter(None, [settings_file]))})
     alterations, own = split_texts(settings)
     if label is not None:
-        given = settings_of_estimators([label], own, settings_file, model=model)[label]
+        [(label, given)] = settings_of_estimators([label], own, settings_file, model=model).items()
     elif settings_file is not None:
         raise BadInput(f"--settings {settings_file}: is for one estimator; name it with -e")
     else:

@@ -8,12 +8,12 @@ from pipeline.api.replays import Replay
 from pipeline.diagnosing.findings import Finding
 from pipeline.output.results import MetricValue, split_metric
 from recorders.log import Stream
+from replay.judging.consistency.consistency import CONSISTENT
 from replay.judging.consistency.whiteness import whitened
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 from replay.judging.metrics.measuring import metric_key
 
 SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
-CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval
 
 
 def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:

@@ -16,8 +16,7 @@ import pandas as pd
 
 from pipeline.altering.sources import alterations_of, setting_of, split_settings
 from pipeline.api.api import ResultFolder
-from pipeline.api.planning import Kind as EstimatorKind
-from pipeline.api.planning import Log, settings_of, sources_of
+from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, find_causes, least_gain
@@ -45,6 +44,7 @@ from recorders.parameters import merge
 from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.foreign.naming import allowed, of_file, refuse_programs
 from replay.judging.errors.evaluation import split_topic
 
 MOST_SENTENCES = 5
@@ -198,7 +198,8 @@ class Diagnosis:
         """
         place = Path(folder)
         check_folder(place, {"input": self.replay.paths})
-        outcome = summarise(self.replay.judge, self.replay.done.coverage)
+        done = self.replay.done
+        outcome = summarise(done.judge, done.coverage, done.parameters)
         outcome = replace_tables(outcome, {"diagnosis": self.causes, "components": self.components})
         outcome.figures |= self.profiles
         outcome.input_sha256 = self.replay.input_sha256
@@ -223,7 +224,7 @@ def replace_tables(outcome: Outcome, tables: Mapping[str, pd.DataFrame]) -> Outc
 
 def diagnose(
     log: Log,
-    estimator: str | Mapping[str, EstimatorKind] | None = None,
+    estimator: Named | None = None,
     *,
     set: Mapping[str, Any] | None = None,  # noqa: A002
     gap_limit_s: float = 0.2,
@@ -258,7 +259,7 @@ def diagnose(
         )
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
-    settings = merge(own, given)
+    settings = merge(own, allowed(given))
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
@@ -314,19 +315,21 @@ def diagnose(
 
 
 def _asked(
-    source: LogSource | MemorySource, estimator: str | Mapping[str, EstimatorKind] | None
+    source: LogSource | MemorySource, estimator: Named | None
 ) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
     """The log and the one estimator that are asked for; of estimates the log that they are of."""
     if any(topic.startswith("/estimates/") for topic in source.topics) and isinstance(source, LogSource):
         stated = stated_estimators(source.log)
-        labels = [estimator] if isinstance(estimator, str) else list(estimator or stated)
+        labels = list(stated if estimator is None else settings_of(estimator))
         for label in labels:
             if label not in stated:
                 raise BadInput(f"{source.name}: no estimates of {label}; {choices(label, stated)}")
         if len(labels) != 1:
             raise BadInput(f"{source.name}: has {', '.join(stated)}; name the one to diagnose with -e")
         own = {name: value for name, value in stated[labels[0]].items() if value is not None}
-        return source_of_estimates(source.log), {labels[0]: own}
+        chosen = of_file({labels[0]: own})
+        refuse_programs(chosen, source.name)
+        return source_of_estimates(source.log), chosen
     if estimator is None:
         raise BadInput(f"{source.name}: has no estimates; name the estimator to diagnose with -e")
     chosen = settings_of(estimator)

@@ -55,7 +55,7 @@ def export(
     Args:
         path: the log, or estimates log.
         to: the format; "tum" and "kitti" trajectories are of estimates and truths that state a
-            position; "mot" has a file of each tracker's tracks and one of all truths, see
+            position, and of poses; "mot" has a file of each tracker's tracks and one of all truths, see
             `pipeline.logs.mot`; "csv" and "parquet" are tables; "foxglove" is one log of what its
             viewers can show, see `pipeline.logs.foxglove`.
         out: the folder of the files, by default named after the log; of one topic (but to "mot"), or to
@@ -102,7 +102,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
             empty = read_empty(log, topic)
             if to in TRAJECTORIES and not _is_state(log, topic):
                 raise BadInput(
-                    f"{log.path}: topic {topic}: is neither an estimate nor a truth; export it as csv"
+                    f"{log.path}: topic {topic}: is no estimate, truth or Pose; export it as csv"
                 )
             if to in TRAJECTORIES and trajectory_of(empty) is None:
                 raise BadInput(f"{log.path}: topic {topic}: states no position; export it as csv")
@@ -114,7 +114,7 @@ def _chosen(log: Log, to: To, topics: Sequence[str], notes: list[str]) -> list[s
             continue
         chosen.append(topic)
     if not chosen:
-        what = "estimates or truth with a position" if to in TRAJECTORIES else "streams of columns"
+        what = "estimates, truth or poses" if to in TRAJECTORIES else "streams of columns"
         raise BadInput(f"{log.path}: has no {what} to export to {to}; export it as csv")
     return chosen
 
@@ -156,10 +156,10 @@ def _new(to: To) -> Kind:
 
 
 def _is_state(log: Log, topic: str) -> bool:
-    """Whether a topic holds estimates or a truth; a prior is neither."""
+    """Whether a topic holds estimates, a truth or poses; a prior is none of these."""
     schema = log.topics[topic].schema_name
     is_estimate = schema == schemas.GAUSSIAN_ESTIMATE.full_name and topic.startswith("/estimates/")
-    return is_estimate or schema == schemas.TRUTH_STATE.full_name
+    return is_estimate or schema in (schemas.TRUTH_STATE.full_name, schemas.POSE.full_name)
 
 
 def _file_name(topic: str, to: To) -> str:

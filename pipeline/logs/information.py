@@ -2,16 +2,19 @@
 
 import json
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pipeline.output.results import RESULT_FILE
 from pipeline.output.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
 from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from recorders.parameters import describe
+from recorders.plausibility.checks import findings_of
+from recorders.plausibility.finding import Finding
 from recorders.recording import Recorder
 from recorders.registry import load
 from replay.engine.compiling.cache import cache_folder, kept_files
@@ -22,11 +25,26 @@ from replay.inference.model.binding import topics_of
 from replay.inference.model.model import Model
 from replay.inference.requirements import OWN_MODEL, names_state, nearest, nearest_parts
 
+ESTIMATES = "/estimates/"  # what topics of estimates logs begin with
+
 
 def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
-    """Print what a log holds: the run, how long it is, its topics; of other data, how to import them."""
+    """Print what a log holds: the run, how long it is, its topics; of other data, how to import them.
+
+    Of a result folder or a timeline, what is in it.
+    """
     from recorders.importers.ros.files.bags import looks_like_bag
 
+    if path.suffix == ".rrd":
+        from pipeline.logs.made import show_timeline
+
+        show_timeline(path, as_json=as_json)
+        return
+    if (path / RESULT_FILE).is_file():
+        from pipeline.logs.made import show_result
+
+        show_result(path, as_json=as_json)
+        return
     if looks_like_bag(path):
         _show_bag(path, as_json=as_json)
         return
@@ -55,12 +73,32 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
     if log.companions:
         count = sum(topic.messages for topic in log.companions.values())
         say(f"beside them, for viewers: {count} messages on {len(log.companions)} topics of Foxglove")
+    for sentence in worst(_findings(log), path):
+        say(sentence)
     if any(topic.encoding in ("cdr", "ros1") for topic in log.topics.values()):
         _say_how_to_import(path)
+    elif any(topic.startswith(ESTIMATES) for topic in log.topics):
+        _say_what_to_do(path, log)
     elif log.topics:
         _say_what_fits(path, log, is_all=is_all)
     if log.loss_statement:
         warn(log.loss_statement)
+
+
+def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
+    """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
+    if found:
+        others = f"; {len(found) - 1} more: fuselog info {shlex.quote(str(path))} --json"
+        yield f"implausible: {found[0].mended}{others if len(found) > 1 else ''}"
+
+
+def _findings(log: Log) -> list[Finding]:
+    """What the log says of its own faults; of one that is damaged nothing, and that it is."""
+    try:
+        return findings_of(log)
+    except BadInput as error:
+        warn(f"{error}; what it holds is not looked at")
+        return []
 
 
 class Fitting(NamedTuple):
@@ -109,6 +147,22 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
         say(f"  {', '.join(others)}: do not fit; --all says what they need")
     for name, each in others.items() if is_all else ():
         say(f"  {name}: needs {'; '.join(each.lacks)}")
+
+
+def _say_what_to_do(path: Path, log: Log) -> None:
+    """Print whose estimates a log has, and what can be done with them."""
+    labels = dict.fromkeys(
+        topic.removeprefix(ESTIMATES).partition("/")[0]
+        for topic in log.topics
+        if topic.startswith(ESTIMATES)
+    )
+    place = log.run.notes.get("log") if log.run else None
+    of_log = f" of {place}" if place else ""
+    named = shlex.quote(str(path))
+    say(
+        f"Estimates by {', '.join(labels)}{of_log}; what can be done with them: "
+        f"fuselog evaluate {named}, and view, compare, diagnose, export"
+    )
 
 
 def _show_bag(path: Path, *, as_json: bool) -> None:
@@ -172,6 +226,7 @@ def _as_json(log: Log) -> dict[str, Any]:
         "last_log_time_ns": last_ns,
         "run": asdict(log.run) if log.run else None,
         "topics": topics,
+        "findings": [each._asdict() for each in _findings(log)],
         "models": {name: each._asdict() for name, each in fitting_of(log.topics).items()},
         "lost": log.loss_statement,
     }

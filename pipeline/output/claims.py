@@ -29,16 +29,23 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
 
 Verdict = Literal["confirmed", "refuted", "not shown", "not reproducible"]
+# What a claim has in place of one where the data are not those that it is made of.
+NO_VERDICT: Literal["no verdict"] = "no verdict"
+# The recording of a claim that is made of all there are.
+ANY = "any"
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a paper: what it prints, what we measured, our verdict and its reason."""
+    """A statement of a paper: what it prints, what we measured, our verdict and its reason.
+
+    There is no verdict on a claim that is made of another recording.
+    """
 
     claim: str
     paper: str
     ours: str
-    verdict: Verdict
+    verdict: Verdict | Literal["no verdict"]
     why: str = ""
 
 
@@ -53,7 +60,8 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
 
 def known(claim: Claim) -> Claim:
     """The claim; nothing is confirmed or refuted where a number of ours is missing: runs failed."""
-    if claim.verdict == "not reproducible" or not re.search(r"\bnan\b", claim.ours):
+    has_none = claim.verdict in ("not reproducible", NO_VERDICT)
+    if has_none or not re.search(r"\bnan\b", claim.ours):
         return claim
     why = "; ".join(filter(None, [claim.why, "estimates are missing"]))
     return replace(claim, verdict="not reproducible", why=why)
@@ -79,6 +87,8 @@ class StatedClaim(Parameters):
         given: numbers or expressions by the names that the texts and the comparison have for them.
         optional: whether it is left out where the result lacks one of its metrics, in place of not
             reproducible.
+        recording: of which of the experiment's recordings it is claimed, by default of the first; `any`
+            for all data there are. Of other data it has its numbers, and no verdict.
     """
 
     sentence: str
@@ -92,6 +102,7 @@ class StatedClaim(Parameters):
     each: dict[str, str | list[Any]] = {}
     given: dict[str, float | str] = {}
     optional: bool = False
+    recording: str = ""
 
     @model_validator(mode="after")
     def _can_be_read(self) -> Self:
@@ -100,6 +111,11 @@ class StatedClaim(Parameters):
         except BadInput as error:
             raise ValueError(str(error)) from None
         return self
+
+    @property
+    def recordings(self) -> set[str]:
+        """The recordings that it is of; `*` for those that a result will tell, "" for the first."""
+        return {_named(self, meant).recording for meant in _combinations(self.each)}
 
     @property
     def names(self) -> set[str]:
@@ -134,23 +150,47 @@ def require_names(stated: Sequence[StatedClaim], names: Collection[str], where: 
             )
 
 
+def require_recordings(stated: Sequence[StatedClaim], recordings: Collection[str], where: str) -> None:
+    """Raise BadInput that names `where` and the claim, where one is of a recording that is not there."""
+    if ANY in recordings:
+        raise BadInput(f"{where}: '{ANY}' stands for all recordings; give recordings.{ANY} another name")
+    known = {"", "*", ANY, *recordings}
+    for claim in stated if recordings else ():
+        for name in sorted(claim.recordings - known):
+            raise BadInput(
+                f"{where}: claim '{claim.sentence}': no recording '{name}'; {choices(name, recordings)}"
+            )
+
+
 def decide(
     stated: Sequence[StatedClaim],
     metrics: Mapping[str, Any],
     intervals: Mapping[str, Sequence[float | None]],
     names: Mapping[str, float],
+    recordings: Mapping[str, bool] | None = None,
 ) -> list[Claim]:
     """The claims with their verdicts by a result's metrics, their 95 % intervals, and numbers by name.
 
-    Raises BadInput where an expression of a claim cannot be evaluated.
+    `recordings` tells of each recording whether the result is of it: there is no verdict on claims of
+    others. Raises BadInput where an expression of a claim cannot be evaluated.
     """
     values = Values(metrics, intervals, {name: exactly(value) for name, value in names.items()})
-    return [
-        found
-        for claim in stated
-        for meant in _combinations(claim.each, metrics)
-        if (found := _decided(_named(claim, meant), values)) is not None
-    ]
+    found = []
+    for claim in stated:
+        for meant in _combinations(claim.each, metrics):
+            named = _named(claim, meant)
+            decided = _decided(named, values)
+            if decided is not None:
+                found.append(_if_claimed_of(named.recording, recordings or {}, decided))
+    return found
+
+
+def _if_claimed_of(recording: str, recordings: Mapping[str, bool], claim: Claim) -> Claim:
+    """The claim, without its verdict where it is of another recording; "" is the first one."""
+    name = recording or next(iter(recordings), ANY)
+    if name == ANY or recordings.get(name):
+        return claim
+    return replace(claim, verdict=NO_VERDICT, why=f"claimed of {name}, not of these data")
 
 
 def _combinations(
@@ -184,12 +224,14 @@ def _named(claim: StatedClaim, names: Mapping[str, Any]) -> StatedClaim:
         return Template(text).safe_substitute(names)
 
     given = {name: put(of) if isinstance(of, str) else of for name, of in claim.given.items()}
-    texts = {
-        name: put(text)
-        for name in ("sentence", "paper", "holds", "value", "ours", "why", "unless", "reproducible")
-        for text in [getattr(claim, name)]
-    }
+    texts = {name: put(getattr(claim, name)) for name in _TEXTS}
     return claim.model_copy(update={**texts, "given": given})
+
+
+_TEXTS = (
+    *("sentence", "paper", "holds", "value", "ours", "why", "unless", "reproducible"),
+    "recording",
+)
 
 
 def _decided(claim: StatedClaim, values: Values) -> Claim | None:

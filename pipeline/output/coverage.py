@@ -14,7 +14,17 @@ from recorders.log import Clock
 from recorders.parsing import parse_json
 from replay.engine.replaying.estimator import Bound, bind
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.replaying.usage import CONTROLS, INNOVATION, LANDMARK, SKIPPED, TRUTH, Row, Usage
+from replay.engine.replaying.usage import (
+    CONTROLS,
+    INNOVATION,
+    LANDMARK,
+    PRIOR,
+    SKIPPED,
+    TRUTH,
+    UNTAKEN,
+    Row,
+    Usage,
+)
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource, Source, is_sensed
 from replay.judging.errors.truths import Doubt
@@ -23,7 +33,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLUMNS = [*Row._fields]
-UNTAKEN = "the estimator does not take this topic"
 # An estimates log's note on the span and the clock of its replay, unless it is all by publish time.
 REPLAYED = "replayed"
 
@@ -33,9 +42,10 @@ def untaken(
 ) -> list[Row]:
     """The topics that an estimator does not take at all, in the replayed spans of all logs.
 
-    Truths, maps and controls are none.
+    Truths and maps are none, nor are controls but for those that it would take if told to.
     """
     taken: dict[str, set[str]] = {label: set() for label in labels}
+    offers: dict[str, dict[str, str]] = {}
     for each in bound:
         initialization = getattr(each, "initialization", None)
         own = {
@@ -44,22 +54,30 @@ def untaken(
             *each.priors,
             *(initialization.topics if initialization else ()),
         }
-        taken.setdefault(each.name.partition("/")[0], set()).update(own)
+        label = each.name.partition("/")[0]
+        taken.setdefault(label, set()).update(own)
+        offers.setdefault(label, {}).update(getattr(each, "offers", {}))
+    offered = {name for own in offers.values() for name in own}
     messages: Counter[str] = Counter()
     for source in sources:
         for name, topic in source.topics.items():
-            if topic.schema_name in (*CONTROLS, LANDMARK, TRUTH) or name.endswith("/prior"):
+            is_control = topic.schema_name in CONTROLS and name not in offered
+            if is_control or topic.schema_name in (LANDMARK, TRUTH) or name.endswith("/prior"):
                 continue
             if all(name in own for own in taken.values()) or not topic.messages:
                 continue
             if is_sensed(source, name):
                 messages[name] += _messages(source, name, order)
     return [
-        Row(label, name, count, 0, 0, 0, UNTAKEN)
+        Row(label, name, count, 0, 0, 0, _untaken(offers.get(label, {}).get(name, "")))
         for name, count in messages.items()
         for label, own in taken.items()
         if count and name not in own
     ]
+
+
+def _untaken(offer: str) -> str:
+    return f"{UNTAKEN}; with {offer} it does" if offer else UNTAKEN
 
 
 def _messages(source: Source, topic: str, order: Clock) -> int:
@@ -135,7 +153,7 @@ def _recounted(
     maps = {
         topic: gather([source.read([topic])[topic]])
         for topic in {topic for each in bound for topic in each.static}
-        if topic in source.topics and source.topics[topic].schema_name == LANDMARK
+        if topic in source.topics and source.topics[topic].schema_name in (LANDMARK, PRIOR)
     }
     own_maps = {
         each.name: {topic: maps[topic] for topic in each.static if topic in maps} for each in bound
@@ -232,6 +250,8 @@ def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
 
 def sentences(rows: Sequence[Row]) -> list[str]:
     """Say what was not used; that an estimator takes no measurements at all is its nature."""
-    measuring = {row.estimator for row in rows if row.used is not None and row.why != UNTAKEN}
+    measuring = {
+        row.estimator for row in rows if row.used is not None and not row.why.startswith(UNTAKEN)
+    }
     told = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
     return list(dict.fromkeys(row.sentence for row in told if row.sentence))

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
+from pipeline.output.alarms import Alarm
 from pipeline.output.charts import Chart, draw
 from pipeline.output.claims import Claim, known
 from recorders.atomic import whole_folder
@@ -47,7 +48,8 @@ class Outcome:
 
     `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one lies with
     95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
-    a hash of the data that went in, `parameters` are those of all estimators, defaults included.
+    a hash of the data that went in, `parameters` are those of all estimators, defaults included,
+    `alarms` what makes the metrics doubtful.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -58,6 +60,7 @@ class Outcome:
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     bounds: dict[str, Bounds] = field(default_factory=dict)
     intervals: dict[str, Bounds] = field(default_factory=dict)
+    alarms: list[Alarm] = field(default_factory=list)
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
         """Keep a metric with its 95 % interval."""
@@ -69,7 +72,8 @@ class Result(Parameters):
 
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
     without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
-    lies with 95 % if all is well, `intervals` where the true one lies with 95 %.
+    lies with 95 % if all is well, `intervals` where the true one lies with 95 %; `alarms` are what makes
+    the metrics doubtful, the worst first.
     """
 
     format: int = FORMAT
@@ -82,6 +86,7 @@ class Result(Parameters):
     files: dict[str, str | None] = {}
     bounds: dict[str, Bounds] = {}
     intervals: dict[str, tuple[float | None, float | None]] = {}
+    alarms: list[Alarm] = []
 
     @property
     def contents(self) -> list[str]:
@@ -332,6 +337,7 @@ def write_outcome(
                 key: (_number(low), _number(high)) for key, (low, high) in outcome.intervals.items()
             },
             claims=[known(claim) for claim in outcome.claims],
+            alarms=outcome.alarms,
             files={
                 path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else hash_of(path)
                 for path in written

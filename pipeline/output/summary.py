@@ -1,9 +1,11 @@
 """Summarises judged replays: metrics, tables, and figures of errors, modes, particles, late messages."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import pandas as pd
 
+from pipeline.output.alarming import alarms_of
 from pipeline.output.charts import Axis, Chart, Panel, Style, band, curve, thinned
 from pipeline.output.coverage import coverage_table
 from pipeline.output.results import MetricValue, Outcome, split_metric
@@ -13,9 +15,19 @@ from replay.judging.judge import Judge
 from replay.judging.metrics.means import INSERTED
 
 
-def summarise(judge: Judge, coverage: Sequence[Row] = ()) -> Outcome:
-    """Metrics, tables and figures of a judged replay, and what became of the log's topics in it."""
-    outcome = Outcome()
+def summarise(
+    judge: Judge,
+    coverage: Sequence[Row] = (),
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Outcome:
+    """Metrics, alarms, tables and figures of a judged replay, and what became of the log's topics in it.
+
+    Args:
+        judge: of all runs.
+        coverage: what became of the topics.
+        parameters: of the estimators by label, as far as they are known.
+    """
+    outcome = Outcome(alarms=alarms_of(judge, parameters or {}, coverage))
     if coverage:
         outcome.tables["coverage"] = coverage_table(coverage)
     outcome.metrics.update(judge.metrics)

@@ -10,18 +10,33 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from statistics import median
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.output.claims import Claim
-from pipeline.output.results import Bounds, Measured, MetricValue, metric_tables
+from pipeline.output.alarms import Alarm
+from pipeline.output.claims import NO_VERDICT, Claim
+from pipeline.output.results import (
+    Bounds,
+    Measured,
+    MetricTable,
+    MetricValue,
+    metric_tables,
+    split_metric,
+)
 from recorders.errors import printable
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# Metrics of more cases than these are summarised, and stand one by one in files alone.
+MOST_CASES = 6
+# Who is no terminal is told how long work goes so often.
+TOLD_EVERY_S = 60.0
 
 
 def _console(*, stderr: bool) -> Console:
@@ -32,17 +47,37 @@ def _console(*, stderr: bool) -> Console:
     return console
 
 
+MOST_ALARMS = 5  # that are printed
 out = _console(stderr=False)
 err = _console(stderr=True)
 
 
+class OnceAMinute:
+    """Tells on standard error how long work goes where no terminal shows it, a line a minute at most."""
+
+    def __init__(self) -> None:
+        self._last_s = monotonic()
+
+    def tell(self, text: str) -> None:
+        """Write a line, unless there was one within the last minute, or the program began in it."""
+        now_s = monotonic()
+        if now_s - self._last_s >= TOLD_EVERY_S:
+            self._last_s = now_s
+            warn(text)
+
+
+once_a_minute = OnceAMinute()
+
+
 def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:
-    """Pass items through with a progress bar on standard error; none where nobody watches.
+    """Pass items through with a progress bar on standard error; no terminal has a line a minute.
 
     The title is asked again after every item, as it may say how the work goes.
     """
     if not err.is_terminal:
-        yield from items
+        for done, item in enumerate(items, start=1):
+            yield item
+            once_a_minute.tell(f"{title}: {done}" + ("" if total is None else f" of {total}"))
         return
     from rich.progress import MofNCompleteColumn, Progress  # which take long to import
 
@@ -56,12 +91,14 @@ def progress(items: Iterable[Any], title: object, total: int | None) -> Iterable
 
 @contextmanager
 def status() -> Iterator[Callable[[str], None]]:
-    """Show how work goes, in one line on standard error; nothing where nobody watches."""
+    """Show how work goes, in one line on standard error; no terminal has a line a minute."""
     with err.status("", spinner="line") if err.is_terminal else nullcontext() as line:
 
         def show(text: str) -> None:
             if line is not None:
                 line.update(printable(text))
+            else:
+                once_a_minute.tell(text)
 
         yield show
 
@@ -121,22 +158,63 @@ def format_value(value: object) -> str:
     return f"{value:.4g}" if isinstance(value, float) else "" if value is None else str(value)
 
 
+def has_many_cases(metrics: Mapping[str, MetricValue]) -> bool:
+    """Tell whether metrics are of so many cases that they are summarised."""
+    return len({split_metric(key)[2] for key in metrics} - {""}) > MOST_CASES
+
+
 def print_metrics(
     metrics: Mapping[str, MetricValue],
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
+    details: str = "--json",
 ) -> None:
     """Metrics as tables: one per case, a row per quantity, a column per estimator.
 
     A value that has bounds stands before them: 95 % of all values lie there if all is well. With a table
-    of runs there is also the mean NEES over them, see `metric_tables`.
+    of runs there is also the mean NEES over them, see `metric_tables`. Of many cases there is one table
+    of their medians; `details` says where each of them is.
     """
-    for table in metric_tables(metrics, bounds, runs):
+    tables = metric_tables(metrics, bounds, runs)
+    cases = [table for table in tables if table.case]
+    summarised = has_many_cases(metrics)
+    for table in tables:
+        if table.case and summarised:
+            continue
         rows = []
         for quantity, values in table.quantities.items():
             cells = [values.get(estimator, Measured()) for estimator in table.estimators]
             rows.append([quantity, *map(_with_bounds, cells)])
         print_table(["", *table.estimators], rows, table.case)
+    if summarised:
+        _print_cases(cases)
+        say(f"each of the {len(cases)} cases by itself: {details}")
+
+
+def _print_cases(tables: Sequence[MetricTable]) -> None:
+    """The medians over cases, with the least and the greatest: a row per quantity that has numbers."""
+    found: dict[str, dict[str, list[float]]] = {}
+    for table in tables:
+        for quantity, values in table.quantities.items():
+            of = found.setdefault(quantity, {})
+            for estimator, measured in values.items():
+                if isinstance(measured.value, int | float) and math.isfinite(measured.value):
+                    of.setdefault(estimator, []).append(measured.value)
+    estimators = tables[0].estimators
+    rows = [
+        [quantity, *(_spread(of.get(estimator, [])) for estimator in estimators)]
+        for quantity, of in found.items()
+        if of
+    ]
+    title = f"{len(tables)} cases: the median of those that have it, and from the least to the greatest"
+    print_table(["", *estimators], rows, title)
+
+
+def _spread(values: Sequence[float]) -> str | None:
+    if not values:
+        return None
+    least, middle, greatest = map(format_value, (min(values), float(median(values)), max(values)))
+    return middle if least == greatest else f"{middle} ({least} to {greatest})"
 
 
 def _with_bounds(measured: Measured) -> object:
@@ -176,8 +254,28 @@ def print_parameters(
         print_parameters({f"{label}, from the log": values for label, values in stated.items()})
 
 
+def print_worst(alarms: Sequence[Alarm]) -> None:
+    """The worst of what makes the numbers below doubtful."""
+    for alarm in alarms[:1]:
+        say(f"doubtful: {alarm.words}")
+
+
+def print_others(alarms: Sequence[Alarm]) -> None:
+    """A few of the others."""
+    for alarm in alarms[1:MOST_ALARMS]:
+        say(f"also doubtful: {alarm.words}")
+    if len(alarms) > MOST_ALARMS:
+        say(f"and {len(alarms) - MOST_ALARMS} more, which --json lists")
+
+
 def print_claims(claims: Sequence[Claim]) -> None:
-    """Claims, each with what the paper says and what we found."""
+    """Claims, each with what the paper says and what we found; before them those that go undecided."""
+    elsewhere = sum(claim.verdict == NO_VERDICT for claim in claims)
+    if elsewhere:
+        say(
+            f"{elsewhere} of {len(claims)} claims are made of another recording than these data: their "
+            "numbers follow, and no verdict"
+        )
     for claim in claims:
         say(f"{claim.verdict}: {claim.claim}")
         say(f"  paper: {claim.paper}; ours: {claim.ours}" + (f"; {claim.why}" if claim.why else ""))

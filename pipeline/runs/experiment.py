@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self
@@ -10,13 +10,13 @@ from typing import Annotated, Any, NamedTuple, Self
 from pydantic import Field, NonNegativeFloat, PositiveInt, field_validator, model_validator
 
 from pipeline.altering.changes import is_of_topic
-from pipeline.output.claims import StatedClaim, decide, require_names
+from pipeline.output.claims import StatedClaim, decide, require_names, require_recordings
 from pipeline.output.results import Outcome, Result, plain, result_folder, write_outcome
 from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import PoolFactory
-from pipeline.runs.inputs import Import, Logs, Record, load_scenario, shipped
-from pipeline.runs.settings import parameters_by_label
+from pipeline.runs.inputs import Import, Logs, Record, Recording, holding, load_scenario, shipped
+from pipeline.runs.settings import named_by, parameters_by_label
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters, build, merge
 from recorders.parsing import read_toml
@@ -24,6 +24,7 @@ from recorders.recording import Recorder
 from recorders.registry import foreign_code, load
 from replay.engine.replaying.estimator import configure
 from replay.engine.replaying.late import parse_late
+from replay.foreign.naming import allowed_in
 from replay.judging.metrics.measuring import find_metrics
 
 
@@ -48,6 +49,7 @@ class Experiment(Parameters):
         arrival_order: whether messages are processed in the order in which they arrived.
         late: what becomes of late measurements, as `--late` of `fuselog replay` has it.
         options: the study's own.
+        recordings: which recordings claims are of, by name, where the runs are no simulated ones.
         claims: what is claimed of the metrics that it yields.
         claims_of: name of another experiment whose claims are tried first.
     """
@@ -67,6 +69,7 @@ class Experiment(Parameters):
     late: str | None = None
     options: dict[str, Any] = {}
     # what is claimed changes nothing in what is run, and a result has it with its verdict
+    recordings: Annotated[dict[str, Recording], Field(exclude=True)] = {}
     claims: Annotated[list[StatedClaim], Field(exclude=True)] = []
     claims_of: Annotated[str, Field(exclude=True)] = ""
 
@@ -97,6 +100,12 @@ class Experiment(Parameters):
         if (self.arrival_order or self.alterations) and self.study != "localization":
             which = "arrival_order, late and settings of topics"
             raise ValueError(f"study {self.study} replays in the order of the stamps; leave out {which}")
+        return self
+
+    @model_validator(mode="after")
+    def _has_the_recordings(self) -> Self:
+        if self.recordings and not (self.import_ or self.logs):
+            raise ValueError("recordings are what is imported or given as logs; leave out [recordings]")
         return self
 
     @property
@@ -180,15 +189,24 @@ class Stated(NamedTuple):
     files: Sequence[Path] = ()
 
     @property
-    def labels(self) -> Collection[str]:
-        """The labels of its estimators."""
+    def labels(self) -> Mapping[str, Mapping[str, Any]]:
+        """The labels of its estimators, with their settings."""
         return self.with_settings({}, {}).estimators
+
+    @property
+    def _values(self) -> dict[str, Any]:
+        """Its entries; the programs that it names may be run."""
+        estimators = self.values.get("estimators")
+        if not isinstance(estimators, Mapping):
+            return dict(self.values)
+        return {**self.values, "estimators": allowed_in(estimators, self.folder)}
 
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
         """The experiment with settings and then `over` over it; see `load_experiment`."""
         where = f"experiment {self.source}"
-        own = _settings_of_experiment(build(Experiment, self.values, where), settings)
-        experiment = build(Experiment, {**merge(self.values, own), **over}, where)
+        values = self._values
+        own = _settings_of_experiment(build(Experiment, values, where), settings)
+        experiment = build(Experiment, {**merge(values, own), **over}, where)
         if experiment.claims_of:
             shared = read_experiment(experiment.claims_of).with_settings({}, {}).claims
             experiment = experiment.model_copy(update={"claims": [*shared, *experiment.claims]})
@@ -231,7 +249,7 @@ def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
     values = {
         "title": title,
         "logs": {"files": [str(log) for log in logs]},
-        "estimators": {label: {} for label in labels},
+        "estimators": named_by(labels),
     }
     return Stated(title, str(logs[0]), values, Path())
 
@@ -250,6 +268,13 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
             )
         files |= dict.fromkeys(logs)
     return list(files)
+
+
+def _given(experiment: Experiment, data: Path | None) -> list[Path]:
+    """The files that an experiment imports, or among which those are, or the logs that it replays."""
+    if data is None or experiment.logs is not None:
+        return experiment.files
+    return sorted(path for path in data.rglob("*") if path.is_file()) if data.is_dir() else [data]
 
 
 def _settings_of_experiment(experiment: Experiment, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -337,8 +362,10 @@ def run_experiment(
     options = build(study.options, experiment.options, f"options of study {experiment.study}")
     numbers = numbers_of(experiment, options)
     require_names(experiment.claims, numbers, f"experiment {name}")
+    require_recordings(experiment.claims, experiment.recordings, f"experiment {name}")
     configured = {label: configure(label, values) for label, values in experiment.estimators.items()}
     find_metrics(experiment.metrics)
+    recordings = holding(experiment.recordings, _given(experiment, data), f"experiment {name}")
     with (
         checkpoints_of(folder) as checkpoints,
         result_folder(folder) as part,
@@ -360,7 +387,7 @@ def run_experiment(
         )
         outcome = study.run(experiment, setting)
         metrics = plain(outcome.metrics)
-        outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers)
+        outcome.claims += decide(experiment.claims, metrics, outcome.intervals, numbers, recordings)
         settings = experiment.model_dump(mode="json", by_alias=True, exclude_none=True)
         if data is not None:
             settings["data"] = str(data)

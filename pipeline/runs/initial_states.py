@@ -21,7 +21,7 @@ from replay.engine.replaying.late import Late, parse_late
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.engine.vectors.components import match_components, match_tangent, stated_components
-from replay.engine.vectors.tangent import tangent_components, truth_at
+from replay.engine.vectors.tangent import named_now, tangent_components, truth_at
 from replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
@@ -201,7 +201,8 @@ def _with_sigmas(prior: Stream, components: Mapping[str, Any], sigmas: Mapping[s
     """The covariance (t, t) of a prior with some of its components' standard deviations replaced."""
     names = [name for name, _ in tangent_components(list(components), list(components.values()))]
     covariance = prior["covariance"][0].reshape(len(names), len(names)).copy()
-    for name, sigma in sigmas.items():
+    given = named_now(sigmas, list(components), list(components.values()))
+    for name, sigma in given.items():
         if name not in names:
             raise BadInput(
                 f"--start-sigma {name}: {prior.topic} has no such component; {choices(name, names)}"

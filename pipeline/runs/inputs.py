@@ -1,8 +1,11 @@
 """Names where the runs of an experiment come from: a scenario, real data, or logs."""
 
+import hashlib
+from collections.abc import Mapping, Sequence
 from importlib import resources
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from recorders.errors import BadInput, choices
 from recorders.parameters import Parameters
@@ -43,6 +46,48 @@ class Logs(Parameters):
     """
 
     files: list[str] = []
+
+
+class Recording(Parameters):
+    """A recording that claims are of, told by what is in its files, wherever they lie.
+
+    Attributes:
+        files: pattern of its files, such as `*_detections.json` or `path_9/*.csv`; what lies beside them
+            counts for nothing.
+        sha256: of the files together; see `digest_of`.
+    """
+
+    files: str
+    sha256: str = ""
+
+    def digest_of(self, files: Sequence[Path]) -> str:
+        """SHA-256 over those of this recording's files, decompressed and sorted; "" without any file."""
+        digests = sorted(_digest(path) for path in files if path.match(self.files))
+        return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
+
+
+def _digest(path: Path) -> str:
+    from recorders.importers.tables.files import DAMAGED, open_decompressed  # Arrow takes long to import
+
+    try:
+        with open_decompressed(path) as file:
+            return hashlib.file_digest(cast(BufferedIOBase, file), "sha256").hexdigest()
+    except DAMAGED as error:
+        raise BadInput(f"{path}: cannot be read ({error}); give the file whole") from None
+
+
+def holding(recordings: Mapping[str, Recording], files: Sequence[Path], where: str) -> dict[str, bool]:
+    """Tell of each recording by its name whether these files are it.
+
+    Raises BadInput that names `where` where one states no hash.
+    """
+    digests = {name: recording.digest_of(files) for name, recording in recordings.items()}
+    for name, digest in digests.items():
+        if not recordings[name].sha256:
+            raise BadInput(
+                f"{where}: recordings.{name} has no sha256; that of these files is '{digest}'"
+            )
+    return {name: recording.sha256 == digests[name] for name, recording in recordings.items()}
 
 
 SHIPPED = resources.files("fuselog_data")

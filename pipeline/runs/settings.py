@@ -1,7 +1,7 @@
 """Parameters of estimators as commands take them: by --set, a settings file, options of their own."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,19 +9,24 @@ from pipeline.altering.changes import is_of_topic
 from recorders.errors import BadInput, choices
 from recorders.parameters import merge, parse_settings
 from recorders.parsing import read_toml
-from replay.engine.replaying.estimator import Estimator, find_estimator
+from replay.engine.replaying.estimator import specified
+from replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
 Settings = Mapping[str, Mapping[str, Any]]
 # Parameters of estimators that have an option of their own.
 OPTIONS = {"model": "--model", "every_s": "--every"}
 
 
-def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[str, Any]]:
+def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, Any]]:
     """Parameters by estimator label, from the tables of a TOML file; none without a file.
 
-    Raises BadInput where the file has settings of another estimator.
+    Args:
+        path: the file.
+        labels: what was named of each estimator, such as its program.
+
+    Raises BadInput where the file has settings of another estimator, or names another program.
     """
-    tables = {} if path is None else read_toml(path)
+    tables = {} if path is None else of_file(read_toml(path))
     for label, table in tables.items():
         if label not in labels or not isinstance(table, dict):
             raise BadInput(
@@ -29,6 +34,8 @@ def read_settings(path: Path | None, labels: Collection[str]) -> dict[str, dict[
                 "for each estimator "
                 f"that is replayed: {', '.join(labels)}"
             )
+    tables = {label: without_named(table, labels[label]) for label, table in tables.items()}
+    refuse_programs(tables, path)
     return tables
 
 
@@ -46,9 +53,23 @@ def settings_of_estimators(
     `ekf.gate_probability=1` goes to ekf, `gate_probability=1` to all that have such a parameter; so do
     options that are not None. Raises BadInput where none has.
     """
-    base = read_settings(file, labels)
+    named = named_by(labels)
+    base = read_settings(file, named)
     given = {key: value for key, value in options.items() if value is not None}
-    return with_settings({label: base.get(label, {}) for label in labels}, parse_settings(texts) | given)
+    own = {label: merge(base.get(label, {}), stated) for label, stated in named.items()}
+    return with_settings(own, allowed(parse_settings(texts)) | given)
+
+
+def named_by(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """The labels and settings that names stand for, such as `ekf` and `lib:./mine.so`.
+
+    Raises BadInput where two programs have the same label.
+    """
+    named: dict[str, dict[str, Any]] = {}
+    for label, settings in map(shorthand, names):
+        if named.setdefault(label, settings) != settings:
+            raise BadInput(f"-e {label}: two programs have this label; rename one, or use an experiment")
+    return named
 
 
 def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -84,9 +105,7 @@ def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str
     """
     names: dict[str, set[str]] = {}
     for label, settings in estimators.items():
-        kind = settings.get("kind", label)
-        estimator = kind if isinstance(kind, Estimator) else find_estimator(str(kind))[0]
-        names[label] = set(estimator.parameters.model_fields)
+        names[label] = set(specified(label, settings)[0].parameters.model_fields)
     return names
 
 

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pipeline.altering.sources import split_settings
-from pipeline.api.planning import Kind, Log, settings_of, sources_of
+from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
 from pipeline.tuning.objective import (
@@ -41,6 +41,7 @@ from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
 from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.streams.channels import stated
+from replay.foreign.naming import allowed
 
 Floats = NDArray[np.float64]
 REACH = 1e4  # a positive parameter without bounds is searched within its start times or divided by this
@@ -51,7 +52,7 @@ ENOUGH = 0.5 * QUANTILE**2  # of log-likelihood: what costs less is within the 9
 
 def tune(
     logs: Log | Iterable[Log],
-    estimator: str | Mapping[str, Kind],
+    estimator: Named,
     free: str | Sequence[str],
     *,
     by: By = "likelihood",
@@ -108,9 +109,10 @@ def tune(
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is tuned at a time; give one")
     [(label, own)] = chosen.items()
-    settings = {"kind": label, **merge(own, given)}
+    settings = {"kind": label, **merge(own, allowed(given))}
     bound = bind(label, sources, settings)
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
+    _refuse_random(label, bound, by)
     start = np.array([each.start for each in searched])
     runs = [in_memory(source, bound) for source in sources]
     others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
@@ -163,6 +165,16 @@ def _pool(
 def _gate(bound: Sequence[Bound]) -> float:
     """The probability that a measurement is let in by the gate, if there is one."""
     return float(getattr(bound[0].parameters, "gate_probability", 1.0))
+
+
+def _refuse_random(label: str, bound: Sequence[Bound], by: By) -> None:
+    """Raise BadInput where a search would follow the noise of an estimator's own random numbers."""
+    if CRITERIA[by].is_smooth and any(isinstance(each, Recursive) and each.is_random for each in bound):
+        raise BadInput(
+            f"estimator {label}: draws random numbers, so that its likelihood changes by chance from "
+            "one value to the next; tune another method, such as -e ukf, and replay this one with what "
+            "it finds, or tune --by rmse"
+        )
 
 
 def _searched(

@@ -24,6 +24,10 @@ from recorders.parameters import Parameters
 
 Floats = NDArray[np.float64]
 Value = TypeVar("Value")
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+# Latitude and longitude in deg, and perhaps the height above the ellipsoid in m.
+Place = tuple[Latitude, Longitude] | tuple[Latitude, Longitude, float]
 # The name of a source, or a number that stands for every message.
 Source = str | float
 OneOrMore: TypeAlias = Value | list[Value]

@@ -22,7 +22,8 @@ _LENGTH, _TIME, _ANGLE, _FLUX = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0,
 _ACCELERATION, _SPEED, _RATE = (1, -2, 0, 0), (1, -1, 0, 0), (0, -1, 1, 0)
 NAMED = {
     **{name: Unit(size, _LENGTH) for name, size in {"m": 1, "mm": 1e-3, "cm": 1e-2, "km": 1e3}.items()},
-    **{name: Unit(size, _LENGTH) for name, size in {"ft": 0.3048, "in": 0.0254, "NM": 1852}.items()},
+    **{name: Unit(size, _LENGTH) for name, size in {"ft": 0.3048, "mi": 1609.344, "NM": 1852}.items()},
+    "in": Unit(0.0254, _LENGTH),
     **{name: Unit(size, _TIME) for name, size in {"s": 1, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}.items()},
     **{name: Unit(size, _TIME) for name, size in {"min": 60, "h": 3600}.items()},
     **{name: Unit(size, _ANGLE) for name, size in {"rad": 1, "mrad": 1e-3, "deg": pi / 180}.items()},

@@ -36,13 +36,16 @@ class Field:
     """Describes one field of a message.
 
     `may_be_nan` says that NaN stands for a value that is missing, `may_be_absent` that logs written
-    before there was such a field lack it: who reads them asks whether the column is there.
+    before there was such a field lack it: who reads them asks whether the column is there. Of a
+    measurement that has several components `may_be_partial` says that NaN stands for one that was not
+    measured.
     """
 
     name: str
     kind: Kind
     may_be_nan: bool = False
     may_be_absent: bool = False
+    may_be_partial: bool = False
 
     @property
     def dtype(self) -> np.dtype:
@@ -115,6 +118,7 @@ def schema_of(message_type: type[message.Message]) -> Schema:
             entry.name,
             _KINDS[entry.type, entry.is_repeated],
             entry.name not in ours or ours[entry.name].may_be_nan,
+            may_be_partial=entry.name in ours and ours[entry.name].may_be_partial,
         )
         for entry in descriptor.fields
         if (entry.type, entry.is_repeated) in _KINDS
@@ -144,12 +148,12 @@ def _identifier(name: str) -> Field:
     return Field(name, "identifier")
 
 
-def _real(name: str, *, may_be_nan: bool = False) -> Field:
-    return Field(name, "real", may_be_nan)
+def _real(name: str, *, may_be_nan: bool = False, may_be_partial: bool = False) -> Field:
+    return Field(name, "real", may_be_nan, may_be_partial=may_be_partial)
 
 
-def _vector(name: str, *, may_be_nan: bool = False) -> Field:
-    return Field(name, "vector", may_be_nan)
+def _vector(name: str, *, may_be_nan: bool = False, may_be_partial: bool = False) -> Field:
+    return Field(name, "vector", may_be_nan, may_be_partial=may_be_partial)
 
 
 # What sensors say.
@@ -179,8 +183,8 @@ RANGE_BEARING = _declare(
     "RangeBearing",
     "Distance and angle to one target in the sensor's frame.",
     _identifier("target_id"),
-    _real("range_m"),
-    _real("bearing_rad"),
+    _real("range_m", may_be_partial=True),
+    _real("bearing_rad", may_be_partial=True),
 )
 LINE_OF_SIGHT = _declare(
     "LineOfSight",
@@ -232,13 +236,13 @@ POSITION_FIX = _declare(
     "PositionFix",
     "A position in the log's Cartesian frame, of two or three numbers, with its covariance, row-major "
     "or diagonal.",
-    _vector("position_m"),
+    _vector("position_m", may_be_partial=True),
     _vector("covariance_m2", may_be_nan=True),
 )
 VELOCITY_FIX = _declare(
     "VelocityFix",
     "A velocity in the log's Cartesian frame with its covariance, row-major.",
-    _vector("velocity_mps"),
+    _vector("velocity_mps", may_be_partial=True),
     _vector("covariance_m2ps2", may_be_nan=True),
 )
 GEODETIC_FIX = _declare(
@@ -256,15 +260,15 @@ POSE = _declare(
     "Where a body is in a frame: its position, and the rotation from the body's frame to it as a unit "
     "quaternion w, x, y, z. The covariance, row-major, is of x, y, z in m and of small rotations about "
     "the frame's x, y, z in rad. The channel's metadata names the frames.",
-    _vector("position_m"),
+    _vector("position_m", may_be_partial=True),
     _vector("quaternion"),
     _vector("covariance", may_be_nan=True),
 )
 TWIST = _declare(
     "Twist",
     "Velocity and turn rate of a body in its own frame, along x, y, z; their covariance, row-major.",
-    _vector("velocity_mps"),
-    _vector("turn_rate_radps"),
+    _vector("velocity_mps", may_be_partial=True),
+    _vector("turn_rate_radps", may_be_partial=True),
     _vector("covariance", may_be_nan=True),
 )
 DETECTION = _declare(

@@ -243,7 +243,13 @@ def check_stream(stream: Stream, where: str = "", *, allow_nan: bool = False) ->
             raise BadInput(
                 f"{label}: field {entry.name} has {len(column)} values for {len(stream)} messages"
             )
-        if allow_nan or entry.may_be_nan or column.dtype.kind != "f" or not column.size:
+        if (
+            allow_nan
+            or entry.may_be_nan
+            or entry.may_be_partial
+            or column.dtype.kind != "f"
+            or not column.size
+        ):
             continue
         if np.isnan(column.min()):  # the least of numbers with NaN among them is NaN: one quick pass
             bad = np.isnan(column).reshape(len(column), -1).any(axis=1)

@@ -13,9 +13,7 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic
 from recorders.parameters import Parameters, build, meanings
 from recorders.registry import available, load
-from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
-from replay.engine.streams.geodetic import stated_origin
 from replay.inference.kalman.methods import Method
 from replay.inference.model.augmentation import (
     Start,
@@ -25,7 +23,7 @@ from replay.inference.model.augmentation import (
     estimated,
     with_gauss_markov,
 )
-from replay.inference.model.binding import Found, roles_of, topics_of
+from replay.inference.model.binding import in_its_plane, offers_of, roles_of, topics_of
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.settings import (
@@ -96,6 +94,7 @@ def modelled_by(
         _with_defaults(combined(model, method), {each: getattr(values, each) for each in settings}),
         partial(bind_model, model=model, method=method),
         variant=method.variant,
+        label=name,
     )
 
 
@@ -167,7 +166,8 @@ def _any_parameters(method: Method) -> type[Parameters]:
                 kind = _accepted(field)
                 other = fields.get(name, (kind,))[0]
                 meaning = _of_models(told[name])
-                fields[name] = (kind if other == kind else Any, Field(None, description=meaning))
+                unset = Field(None, description=meaning, validate_default=False)
+                fields[name] = (kind if other == kind else Any, unset)
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)
 
 
@@ -253,7 +253,7 @@ def bind_model(
     _check_topics(label, model, topics, renamed)
     stages: dict[tuple[Sensor, ...], Stage] = {}  # one for all that have the same sensors
     for found in topics_of(model, topics, renamed):
-        found = found._replace(origin=_origin_of(label, model, found, topics))
+        found = in_its_plane(label, model, found, topics)
         own = Stage(model, motion, tuple(sensor for sensor, _ in found.sensors), modes)
         numbers = settings_of(label, own, found, parameters)
         if own.sensors not in stages:
@@ -277,7 +277,14 @@ def bind_model(
         begun = begin(label, found.prior.name, own, added, numbers)
         start, run, finish = begun(filtering.start), filtering.run, filtering.finish
         made = Recursive(name, streams, static, start, run, priors, finish=finish, parameters=parameters)
-        made = replace(made, initialization=initialization, assumed=assumed)
+        is_random = method.is_random or any(each.redrawn for each in samplers)
+        made = replace(
+            made,
+            initialization=initialization,
+            assumed=assumed,
+            offers=offers_of(model, found, topics),
+            is_random=is_random,
+        )
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound
 
@@ -298,28 +305,6 @@ def _check_topics(
                 f"estimator {label}: topics.{role} = {name}: the log has no such topic; "
                 f"{choices(name, topics)}"
             )
-
-
-def _origin_of(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Floats | None:
-    """Return the origin of the plane, where a fix needs it and a channel states it; see `Filter.start`.
-
-    Raises BadInput where channels state different ones, or the first fix would have to be the origin
-    though another sensor says where the thing is in a frame of its own.
-    """
-    origin = stated_origin(topics) if found.geodetic else None
-    if not found.geodetic or origin is not None:
-        return origin
-    for sensor, topic in found.sensors:
-        if topic not in found.geodetic and "x_m" in sensor.measured and "x_m" in model.state:
-            fix = found.geodetic[0].name
-            role = next(each.topic for each, of in found.sensors if of.name == fix)
-            raise BadInput(
-                f"estimator {label}: {fix} has latitudes and longitudes, {topic.name} positions in "
-                f"{topic.metadata.get('frame_id', 'a frame of its own')}, and no channel states where "
-                f"on earth that is (origin_latitude_deg, origin_longitude_deg); leave one of them out "
-                f"with --set topics.{role}= or --set topics.{sensor.topic}="
-            )
-    return None
 
 
 def _reprocessing(

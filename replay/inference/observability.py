@@ -22,11 +22,19 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.streams.blocks import Ragged, copied
-from replay.engine.vectors.tangent import tangent_components
+from replay.engine.vectors.tangent import named_now, tangent_components
 from replay.inference.estimators import modelled_by, of_any_model
 from replay.inference.kalman.methods import Method, MethodParameters
 from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.steps import NOTHING_MEASURED, InnovationRecord, Steps, Workspace, workspace
+from replay.inference.kalman.steps import (
+    NOTHING_MEASURED,
+    InnovationRecord,
+    Interval,
+    Measurement,
+    Steps,
+    Workspace,
+    workspace,
+)
 from replay.inference.kalman.update import (
     innovation_components,
     reading,
@@ -41,7 +49,14 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
 from replay.inference.run.filtering import FilterState
-from replay.inference.run.recursion import Estimates, filled, no_results, recursion
+from replay.inference.run.recursion import (
+    Estimates,
+    RunInputs,
+    RunResults,
+    filled,
+    no_results,
+    recursion,
+)
 from replay.inference.smoothing.affine import carrying
 from replay.inference.smoothing.iterated import ITERATED, IteratedSmoother, Way
 
@@ -102,15 +117,8 @@ def _carried_by_motion(stage: Stage) -> Function:
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     subtract, flat, carry = boxminus(model.kinds), is_flat(model.kinds), carrying(model.kinds)
 
-    def predict(
-        run: int,
-        belief: Gramian,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        event: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(run: int, belief: Gramian, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, event = interval
         trajectory, transition = work.samples[0], belief.transition[run]
         node = trajectory.node[event]
         linearise(
@@ -132,15 +140,9 @@ def _added_by_sensor(stage: Stage, number: int) -> Function:
     linearise, add_noise = sensor_derivative(model, sensor), sensor_noise(sensor)
 
     def update(
-        run: int,
-        belief: Gramian,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        event: int,
-        work: Workspace,
-        record: InnovationRecord,
+        run: int, belief: Gramian, measurement: Measurement, work: Workspace, record: InnovationRecord
     ) -> int:
+        data, parameters, _, event = measurement
         trajectory, innovation = work.samples[0], work.innovations[number]
         cross = innovation.cross_covariance
         linearise(
@@ -219,7 +221,8 @@ class Observability(IteratedSmoother):
     def _scales(self, state: FilterState) -> Floats:
         """Return what a scaled component of one stands for (runs, t)."""
         scales = np.sqrt(np.diagonal(state.carried.belief.covariance, axis1=1, axis2=2))
-        for name, scale in self.parameters.scales.items():
+        model = self.stage.model
+        for name, scale in named_now(self.parameters.scales, list(model.state), model.kinds).items():
             if name not in self.components:
                 raise BadInput(
                     f"estimator {self.name}: --scale {name}: the state has no such component; "
@@ -260,12 +263,13 @@ class Observability(IteratedSmoother):
                 belief=Gramian(unit, np.zeros((runs, t, t)), np.zeros(runs, np.int64))
             )
         )
-        settings = np.repeat(self.settings[None], runs, axis=0)
+        settings = self.settings_of_runs(state.context, runs)
 
         def memory() -> Any:
             return steps.memory((LinearizationTrajectory(way.states.mean, way.node, np.empty((1, t))),))
 
-        loop(runs, events, settings, self.gates, carried, found, innovations, scratch=memory)
+        inputs, results = RunInputs(events, settings, self.gates), RunResults(found, innovations)
+        loop(runs, inputs, carried, results, scratch=memory)
         return filled(found, due)
 
 

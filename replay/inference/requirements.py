@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from recorders.log import Schema, Topic, schemas
 from replay.engine.streams.channels import resolved
-from replay.inference.model.binding import UnderPrefix, measures_state, serving
+from replay.inference.model.binding import UnderPrefix, measures_state, serving, topics_of
 from replay.inference.model.model import (
     Model,
 )
@@ -45,7 +45,7 @@ def elsewhere(models: Mapping[str, Model], topics: Mapping[str, Topic], names: M
     """
     for name, model in models.items():
         control = model.control
-        if control is None or control.topic in names:
+        if control is None or control.topic in names or topics_of(model, topics, names):
             continue
         others = [
             each for each, topic in topics.items() if topic.schema_name == control.schema.full_name

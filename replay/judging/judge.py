@@ -4,29 +4,30 @@ What it keeps are sums: of every metric, by step over the runs, and for each run
 not grow with the length of a log, except by two numbers for each step of NEES.
 """
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import schemas
+from recorders.log.planes import Origin
 from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.diagnostics import LEAVES, Diagnostics
+from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
     Errors,
     Innovations,
     chi_square_interval,
-    components_without_truth,
     errors_at,
     errors_of,
     innovations_of,
     split_topic,
+    unjudged_sentence,
 )
+from replay.judging.errors.planes import first_fixes
 from replay.judging.errors.truths import Doubt, Truths
 from replay.judging.metrics.means import MeansOfAll
 from replay.judging.metrics.measuring import (
@@ -38,23 +39,19 @@ from replay.judging.metrics.measuring import (
     metric_key,
     plus,
 )
-from replay.judging.metrics.metrics import covered, estimated_share
+from replay.judging.metrics.metrics import innovation_sums
 from replay.judging.metrics.quantities import Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
+from replay.judging.tracks.errors import Judged as Targets
+from replay.judging.tracks.evaluation import targets_of, track_blocks
 
 if TYPE_CHECKING:
     import pandas as pd
 
+TRACK = schemas.TRACK_ESTIMATE.full_name
 GAUSSIAN, INNOVATION = schemas.GAUSSIAN_ESTIMATE.full_name, schemas.INNOVATION.full_name
 BOUND_STEP = schemas.BOUND_STEP.full_name
-FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
-STARTED = schemas.STARTED.full_name
-COVERAGE = schemas.COVERAGE.full_name
-# What a replay says of itself, leaves of topics: no estimates, nothing to judge.
-TOLD = ("failure", "skipped", "started", "coverage")
-# Less than this share of a span is said; a run's first measurements may well be before the prior.
-LEAST_SHARE = 0.995
 # A table has at most so many steps; of more, neighbours share a row.
 STEPS = 1 << 17
 # The sums over time of one run: at most so many bins, of a millisecond times a power of two.
@@ -72,26 +69,6 @@ class Judged(NamedTuple):
     innovations: list[Innovations]
 
 
-@dataclass
-class StreamDiagnostics:
-    """Collects what a stream says of the replay itself, for sentences."""
-
-    failed: dict[int, str] = field(default_factory=dict)
-    speaking: set[int] | None = None
-    skipped: Counter[str] = field(default_factory=Counter)
-    started: Counter[str] = field(default_factory=Counter)
-    covered: Sums = field(default_factory=dict)
-
-    def merge(self, other: "StreamDiagnostics") -> None:
-        """Take in what was said of other runs."""
-        self.failed |= other.failed
-        self.skipped.update(other.skipped)
-        self.started.update(other.started)
-        if other.speaking is not None:
-            self.speaking = other.speaking | (self.speaking or set())
-        self.covered = plus(self.covered, other.covered)
-
-
 class Judge:
     """Judges an ensemble, or a part of one, as its replay goes on.
 
@@ -102,6 +79,8 @@ class Judge:
         first_run: the number of the first run in the whole ensemble.
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
+
+    `innovations` are their sums by topic, see `innovation_sums`.
     """
 
     def __init__(
@@ -118,6 +97,7 @@ class Judge:
         self._sources = sources
         self._names = {first_run + run: source.name for run, source in enumerate(sources)}
         self._truths = [Truths(source) for source in sources]
+        self._targets: list[Targets | None] | None = None
         self._gap_limit_s = gap_limit_s
         self._first_run = first_run
         self._burn_in_s = burn_in_s
@@ -125,9 +105,10 @@ class Judge:
         self._measured = Measurement(find_metrics() if metrics is None else metrics)
         self._quantities: dict[str, Quantities] = {}
         self._steps: dict[str, NDArray[np.int64]] = {}
-        self._diagnostics: dict[str, StreamDiagnostics] = {}
+        self._diagnostics = Diagnostics(first_run)
         self._unjudged: dict[str, str] = {}
-        self._degrees: Counter[str] = Counter()
+        self._first_fixes: dict[str, list[Origin | None]] = {}
+        self.innovations: dict[str, Sums] = {}
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -135,6 +116,7 @@ class Judge:
     def add(self, outputs: Mapping[str, Ragged]) -> Judged:
         """Judge a block of a replay's outputs, by topic."""
         judged = Judged([], [], [])
+        self._first_fixes |= first_fixes(outputs)
         for topic, rows in outputs.items():
             schema = rows.stream.schema.full_name
             if schema == GAUSSIAN:
@@ -142,9 +124,11 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
-                self._degrees[topic] += int(innovations.degrees.sum())
+                self.innovations[topic] = plus(
+                    self.innovations.get(topic, {}), innovation_sums(innovations)
+                )
                 self._measured.add(topic, innovations)
-            self._listen(topic, rows)
+            self._diagnostics.add(topic, rows, self._sources)
             named = (*split_topic(topic), topic.rpartition("/")[2])
             output = Output(*named, rows, self._sources, self._first_run)
             if schema == BOUND_STEP:
@@ -157,13 +141,25 @@ class Judge:
         for topic, sets in found.items():
             judged.sets.append(sets)
             self._measured.add(topic, sets)
+        if any(rows.stream.schema.full_name == TRACK for rows in outputs.values()):
+            if self._targets is None:
+                self._targets = [targets_of(source) for source in self._sources]
+            for topic, tracks in track_blocks(outputs, self._targets, self._first_run).items():
+                self._measured.add(topic, tracks)
         return judged
 
     def _add_estimates(self, topic: str, rows: Ragged, judged: Judged) -> None:
         begun = self._steps.setdefault(topic, np.zeros(self.runs, np.int64))
         if topic not in self._unjudged:
-            self._unjudged[topic] = _unjudged_sentence(rows, self._sources)
-        errors = errors_of(rows, self._truths, self._gap_limit_s, steps=begun, first_run=self._first_run)
+            self._unjudged[topic] = unjudged_sentence(rows, self._sources, self._first_fixes)
+        errors = errors_of(
+            rows,
+            self._truths,
+            self._gap_limit_s,
+            steps=begun,
+            first_run=self._first_run,
+            first_fixes=self._first_fixes,
+        )
         self._steps[topic] = begun + np.diff(rows.offsets)
         if errors is None:
             return
@@ -182,35 +178,12 @@ class Judge:
         kept = self._quantities[topic]
         kept.by_step.add(errors.step, columns)
         kept.by_time.add(np.rint(errors.elapsed_s * 1e9).astype(np.int64), columns, errors.run)
-
-    def _listen(self, topic: str, rows: Ragged) -> None:
-        """Take in what a stream says of the replay itself."""
-        schema = rows.stream.schema.full_name
-        diagnostics = self._diagnostics.setdefault(topic, StreamDiagnostics())
-        speaking = np.flatnonzero(np.diff(rows.offsets)).tolist()
-        if schema == GAUSSIAN:
-            spoke = {self._first_run + run for run in speaking}
-            diagnostics.speaking = spoke | (diagnostics.speaking or set())
-        elif schema == FAILURE:
-            for run in speaking:
-                found = rows.of_run(run)
-                elapsed_s = (int(found.publish_time_ns[0]) - self._sources[run].epoch_ns) * 1e-9
-                reason = sentences_of(found.take(slice(0, 1)))[0]
-                sentence = f"{_what(topic)} failed at {elapsed_s:.3f} s: {reason}"
-                diagnostics.failed.setdefault(self._first_run + run, sentence)
-        elif schema == SKIPPED:
-            diagnostics.skipped.update(sentences_of(rows.stream))
-        elif schema == STARTED:
-            diagnostics.started.update(sentences_of(rows.stream))
-        elif schema == COVERAGE:
-            diagnostics.covered = plus(
-                diagnostics.covered, covered(Output("", "", "", rows, self._sources))
-            )
+        kept.constant.add(errors)
 
     def close(self) -> None:
         """Let go of the runs when they are judged: what is left are sums, which can be pickled."""
         self._doubts = self.doubts
-        self._sources, self._truths, self._on_errors = (), [], None
+        self._sources, self._truths, self._targets, self._on_errors = (), [], None, None
         self._steps.clear()
         for each in self._quantities.values():
             each.errors = errors_at(each.errors, np.zeros(len(each.errors.run), bool))
@@ -222,7 +195,8 @@ class Judge:
         self._doubts = other.doubts | self.doubts
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
-        self._degrees.update(other._degrees)
+        for topic, sums in other.innovations.items():
+            self.innovations[topic] = plus(self.innovations.get(topic, {}), sums)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -231,8 +205,7 @@ class Judge:
         self._means.merge(other._means)
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
-        for topic, theirs in other._diagnostics.items():
-            self._diagnostics.setdefault(topic, StreamDiagnostics()).merge(theirs)
+        self._diagnostics.merge(other._diagnostics)
 
     @property
     def metrics(self) -> dict[str, float]:
@@ -259,8 +232,8 @@ class Judge:
                 if runs and size:
                     key = metric_key(errors.estimator, name, errors.case)
                     found[key] = chi_square_interval(size, runs, probability)
-        for topic, degrees in self._degrees.items():
-            if degrees:
+        for topic, sums in self.innovations.items():
+            if degrees := sums["degrees"]:
                 low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
@@ -268,9 +241,15 @@ class Judge:
         return {key: found[key] for key in self.metrics if key in found}
 
     @property
+    def constants(self) -> dict[tuple[str, str], Constant]:
+        """Return by estimator and case the errors that stay, see `ConstantSums`."""
+        found = {split_topic(topic): each.constant.found() for topic, each in self._quantities.items()}
+        return {what: each for what, each in found.items() if each is not None}
+
+    @property
     def has_numbers(self) -> bool:
         """Tell whether there are numbers, but for what a replay says of itself."""
-        return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in TOLD))
+        return any(self._measured.finish(lambda topic: topic.rpartition("/")[2] not in LEAVES))
 
     @property
     def doubts(self) -> dict[str, Doubt]:
@@ -282,21 +261,13 @@ class Judge:
 
     @property
     def components_without_truth(self) -> list[str]:
-        """A sentence for every estimate of which the truth lacks components."""
+        """A sentence for every estimate of which the truth lacks components, or is in another plane."""
         return [sentence for sentence in self._unjudged.values() if sentence]
 
     @property
     def failures(self) -> list[str]:
         """A sentence for every run that an estimator could not follow to the end, or not at all."""
-        said: dict[tuple[str, int], str] = {}
-        for topic, diagnostics in self._diagnostics.items():
-            silent = (
-                self._names.keys() - diagnostics.speaking if diagnostics.speaking is not None else set()
-            )
-            said |= {(_what(topic), run): f"{_what(topic)} gave no estimates" for run in sorted(silent)}
-        for topic, diagnostics in self._diagnostics.items():
-            said |= {(_what(topic), run): sentence for run, sentence in diagnostics.failed.items()}
-        return [f"{self._names[run]}: {sentence}" for (_, run), sentence in said.items()]
+        return self._diagnostics.failures(self._names)
 
     @property
     def notes_of_coverage(self) -> list[str]:
@@ -304,23 +275,12 @@ class Judge:
 
         Those for what was assumed, as of where to begin, come first.
         """
-        said = []
-        for topic, diagnostics in self._diagnostics.items():
-            for reason, count in diagnostics.started.items():
-                runs = f" (in {count} runs)" if count > 1 else ""
-                said.append(f"{_what(topic)}: {reason}{runs}")
-        for topic, diagnostics in self._diagnostics.items():
-            share = estimated_share(diagnostics.covered)
-            if share is not None and share < LEAST_SHARE:
-                percent = f"{100 * share:.1f} % of the span was estimated"
-                said.append(f"{_what(topic)}: {percent}; its figures are of that")
-            for reason, count in diagnostics.skipped.items():
-                said.append(f"{_what(topic)}: {count} not used: {reason}")
-        for what, bounds in self._bounds.items():
-            if bounds.complaint:
-                name = " ".join(filter(None, what))
-                said.append(f"{name}: averaged along the true trajectories, since {bounds.complaint}")
-        return said
+        averaged = "averaged along the true trajectories, since"
+        return self._diagnostics.notes() + [
+            f"{' '.join(filter(None, what))}: {averaged} {bounds.complaint}"
+            for what, bounds in self._bounds.items()
+            if bounds.complaint
+        ]
 
     @property
     def steps(self) -> "dict[str, pd.DataFrame]":
@@ -371,16 +331,3 @@ class Judge:
     def judged(self) -> dict[str, Errors]:
         """Return by topic the last block of estimates that have errors: its names and kinds."""
         return {topic: each.errors for topic, each in self._quantities.items()}
-
-
-def _what(topic: str) -> str:
-    return " ".join(filter(None, split_topic(topic)))
-
-
-def _unjudged_sentence(estimates: Ragged, sources: Sequence[Source]) -> str:
-    names = components_without_truth(estimates, sources)
-    if not names:
-        return ""
-    verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
-    truth = estimates.stream.metadata["truth"]
-    return f"{_what(estimates.stream.topic)}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"

@@ -45,6 +45,7 @@ from replay.timeline.drawing.plane import (
 )
 from replay.timeline.drawing.plots import (
     POINTS,
+    below_legend,
     draw_components,
     draw_curve,
     draw_modes,
@@ -89,18 +90,22 @@ def draw(canvas: Canvas, scene: Scene) -> Board:
 def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
     sensed = [scene.read(topic) for topic in scene.topics_near(case)]
     sensed = [stream for stream in sensed if len(stream)]
-    boards: list[Board] = [
-        *draw_navigation(canvas, scene, case, sensed),
+    earth = [each for each in sensed if each.schema.full_name == GEODETIC]
+    in_space = draw_navigation(canvas, scene, case, sensed)
+    places: list[Board] = [
+        *in_space,
         *_draw_planes(canvas, scene, case, sensed),
-        *_draw_earth(
-            canvas, scene, case, [each for each in sensed if each.schema.full_name == GEODETIC]
-        ),
-        *_draw_space(canvas, case, [each for each in sensed if each.schema.full_name == ORIENTATION]),
-        *_draw_sensors(canvas, case, sensed),
+        *_draw_earth(canvas, scene, case, earth),
     ]
+    turned = [each for each in sensed if each.schema.full_name == ORIENTATION]
+    boards: list[Board] = [*_draw_space(canvas, case, turned), *_draw_sensors(canvas, case, sensed)]
     components = draw_components(canvas, scene, case)
-    if components:
-        boards.append(rrb.Vertical(*components, name="state"))
+    state: list[Board] = [rrb.Vertical(*components, name="state")] if components else []
+    # what is estimated is seen first, on a map where it has a place
+    is_estimated = bool(scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE))
+    is_placed = bool(in_space) or any(each.name != "truth" for each in tracks_of(scene, case))
+    first = is_estimated and not is_placed
+    boards = [*state, *places, *boards] if first else [*places, *boards, *state]
     modes = draw_modes(canvas, scene, case)
     if modes:
         boards.append(rrb.Vertical(*modes, name="modes"))
@@ -231,7 +236,9 @@ def _draw_field(
         named = stream.components
     for curve, values, colour in zip(named, scale * curves, cycle(PALETTE), strict=False):
         draw_curve(canvas, plot, curve, colour, stream.publish_time_ns, values, POINTS, most=KEPT_ROWS)
-    return plot_view(plot, f"{quantity.capitalize()} ({unit})", legend=len(curves) > 1)
+    title = f"{quantity.capitalize()} ({unit})"
+    extent = below_legend(list(scale * curves)) if len(curves) > 1 else None
+    return plot_view(plot, title, extent, legend=len(curves) > 1, zoom_lock=False)
 
 
 def _euler_deg(quaternions: Floats) -> Floats:

@@ -12,7 +12,7 @@ from replay.engine.replaying.estimator import Bound
 from replay.engine.replaying.replaying import replay
 from replay.engine.streams.sources import Source
 from replay.inference.run import filtering
-from replay.inference.run.recursion import Estimates, Innovations, filled
+from replay.inference.run.recursion import Estimates, Innovations, RunResults, filled
 
 Floats = NDArray[np.float64]
 
@@ -33,9 +33,14 @@ class Call(NamedTuple):
             type(each)(each.end.copy(), *(np.empty_like(column) for column in each[1:]))
             for each in self.results
         )
-        arguments = (*columns, copy.deepcopy(carried), estimates, innovations)
+        arguments = (*columns, copy.deepcopy(carried), *handed_over(estimates, innovations))
         self.loop(self.runs, *arguments, scratch=self.scratch)
         return filled(estimates, np.append(self.results[0].end, len(estimates.mean)))[0].mean
+
+
+def handed_over(estimates: Estimates, innovations: Innovations) -> tuple[Any, ...]:
+    """What a loop fills, as it takes it."""
+    return (RunResults(estimates, innovations),)
 
 
 def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
@@ -47,7 +52,7 @@ def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
         loop, steps = compiled(*key)
 
         def record(runs: int, *arguments: Any, scratch: Callable[[], Any]) -> None:
-            *before, estimates, innovations = arguments
+            *before, (estimates, innovations) = arguments
             kept = copy.deepcopy((estimates.end, innovations.end, before[-1]))
             results = (estimates._replace(end=kept[0]), innovations._replace(end=kept[1]))
             calls.append(Call(loop, runs, (*before[:-1], kept[2]), results, scratch))

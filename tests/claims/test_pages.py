@@ -50,7 +50,8 @@ def test_verdicts_follow_from_the_numbers_that_are_kept() -> None:
         _, experiment = load_experiment(name, {}, {})
         study = load("studies", experiment.study, Study)
         numbers = numbers_of(experiment, build(study.options, experiment.options, name))
-        found = decide(experiment.claims, result.metrics, result.intervals, numbers)
+        recordings = dict.fromkeys(experiment.recordings, True)
+        found = decide(experiment.claims, result.metrics, result.intervals, numbers, recordings)
         assert [vars(claim) for claim in map(known, found)] == result.stated_claims, name
 
 

@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import rerun.chunk
 
+from pipeline.output.claims import decide
 from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
@@ -40,7 +41,8 @@ def test_from_table_to_claims_and_timeline(tmp_path: Path):
     result = run(table(tmp_path, far=True), tmp_path / "out")
     assert result.metrics["report-tracker.judged_targets"] == 2
     assert result.metrics["report-tracker.own_track_mean_percent"] == pytest.approx(100 * 119 / 120)
-    assert [claim.verdict for claim in result.claims] == ["confirmed", "confirmed"]
+    assert [claim.verdict for claim in result.claims] == ["no verdict"] * 2  # it is not the Solent
+    assert result.claims[0].ours == "100.0 %"
     vessels = pd.read_csv(tmp_path / "out" / "tables" / "vessels.csv")
     own = vessels[vessels["estimator"] == "report-tracker"].set_index("mmsi")
     assert own["tracks"].to_dict() == {1: 1, 2: 2}
@@ -57,7 +59,9 @@ def test_from_table_to_claims_and_timeline(tmp_path: Path):
 
 def test_few_reports_decide_nothing(tmp_path: Path):
     """Nothing is confirmed or refuted of vessels that nobody heard often enough."""
-    claims = run(table(tmp_path, reports=20), tmp_path / "out").claims
+    result = run(table(tmp_path, reports=20), tmp_path / "out")
+    _, experiment = load_experiment("ais", {}, {})
+    claims = decide(experiment.claims, result.metrics, {}, {})
     assert [claim.verdict for claim in claims] == ["not reproducible", "not reproducible"]
 
 

@@ -8,8 +8,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from pipeline.runs.experiment import load_experiment, run_experiment
+import fuselog as fl
+from pipeline.runs.experiment import Experiment, load_experiment, run_experiment
+from pipeline.runs.inputs import Recording
 from recorders.errors import BadInput
+from recorders.parameters import build
 from tests.claims.pages import FOLDER
 
 STORED = json.loads((FOLDER / "autoferry.json").read_text(encoding="utf-8"))
@@ -71,6 +74,37 @@ def test_one_scenario_is_as_stored(autoferry: Path, tmp_path: Path) -> None:
     table = pd.read_csv(tmp_path / "out" / "tables" / "scenarios.csv")
     assert len(table) == len(experiment.estimators)
     assert (tmp_path / "out" / "timeline.rrd").exists()
+
+
+def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, tmp_path: Path) -> None:
+    """A limit that the published tracker itself misses elsewhere; its numbers are those of the study."""
+    label = "hungarian-radar-lidar"
+    _, whole = load_experiment("autoferry", {}, {})
+    files = {"files": "*.json"}
+    digest = Recording(**files).digest_of(sorted((autoferry / "scenario5").iterdir()))
+    limit = 1.01 * STORED["metrics"][f"{label}.gospa_m.scenario5"]
+    claim = {"sentence": "s", "paper": "p", "value": f"gospa_m[{label}]", "holds": f"value < {limit}"}
+    own = {
+        "estimators": {label: whole.estimators[label]},
+        "recordings": {"scenario5": {**files, "sha256": digest}},
+        "claims": [claim, {**claim, "recording": "any"}],
+    }
+    values = {"title": "mine", "study": "autoferry", "import": {"source": "autoferry"}, **own}
+    experiment = build(Experiment, values, "experiment mine.toml")
+    found = {}
+    for scenario in sorted(autoferry.glob("scenario*")):
+        result = run_experiment("mine", experiment, tmp_path / scenario.name, data=scenario, logs=0)
+        found[scenario.name] = [each.verdict for each in result.claims]
+        gospa_m = STORED["metrics"][f"{label}.gospa_m.{scenario.name}"]
+        assert float(result.claims[0].ours) == pytest.approx(gospa_m, rel=0.01)
+    log = fl.import_("autoferry", autoferry / "scenario5")
+    metrics = fl.replay(log, {label: whole.estimators[label]}).judge.metrics
+    stored = STORED["metrics"][f"{label}.gospa_m.scenario5"]
+    assert metrics[f"{label}.gospa_m"] == pytest.approx(stored, rel=1e-6)
+    assert found.pop("scenario5") == ["confirmed", "confirmed"]
+    assert len(found) == 5
+    assert {first for first, _ in found.values()} == {"no verdict"}
+    assert "refuted" in {other for _, other in found.values()}
 
 
 def test_other_estimators_are_refused(autoferry: Path, tmp_path: Path):

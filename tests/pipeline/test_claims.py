@@ -1,15 +1,19 @@
 """Claims as data: what expressions say of metrics and intervals, which verdicts follow."""
 
+import gzip
 import math
+from pathlib import Path
 
 import pytest
 
-from pipeline.output.claims import StatedClaim, decide, judged, known, require_names
+from pipeline.output.claims import StatedClaim, decide, judged, known, require_names, require_recordings
 from pipeline.output.expressions import Values, evaluate, formatted, truth
 from pipeline.output.numbers import Number, exactly
-from pipeline.runs.experiment import Experiment
+from pipeline.runs.experiment import Experiment, load_experiment
+from pipeline.runs.inputs import Recording, holding, shipped
 from recorders.errors import BadInput
 from recorders.parameters import build
+from tests.goldens.recipes import DATA, importer_of, unpack
 
 METRICS = {
     "ekf.nees.robot1": 2.0,
@@ -191,3 +195,64 @@ def test_a_name_that_is_nowhere_and_what_is_no_comparison_name_the_claim() -> No
     for holds in wrong:
         with pytest.raises(BadInput, match="claim 's': "):
             decide([claim(holds=holds)], METRICS, {}, {})
+
+
+def test_a_claim_has_no_verdict_on_another_recording() -> None:
+    """By default it is of the first one; `any` is decided of all data, a name that nothing has never."""
+    stated = [
+        claim(value="rmse_m[ekf]", holds="value < 1", recording=name, ours="{value:.1f} m")
+        for name in ("", "first", "second", "any", "third")
+    ]
+    found = decide(stated, METRICS, INTERVALS, {}, {"first": False, "second": True})
+    confirmed, none = "confirmed", "no verdict"
+    assert [each.verdict for each in found] == [none, none, confirmed, confirmed, none]
+    assert {each.ours for each in found} == {"0.5 m"}
+    assert found[0].why == "claimed of first, not of these data"
+    lost = claim(value="rmse_m[nobody]", holds="value < 1")
+    assert decide([lost], METRICS, {}, {}, {"first": False})[0].verdict == none
+    require_recordings(stated[:4], {"first", "second"}, "experiment x")
+    with pytest.raises(BadInput, match="experiment x: claim 's': no recording 'third'"):
+        require_recordings(stated, {"first", "second"}, "experiment x")
+
+
+def test_a_recording_is_told_by_what_is_in_its_files(tmp_path: Path) -> None:
+    """Names of folders, compression, and what lies beside them count for nothing; a byte more counts."""
+    for folder in ("here/a", "elsewhere/b"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "drive.csv").write_bytes(b"1,2")
+        (tmp_path / folder / "README").write_text(folder)
+    packed = tmp_path / "drive.csv.gz"
+    packed.write_bytes(gzip.compress(b"1,2"))
+    of = Recording(files="drive.csv*", sha256="")
+    digests = {of.digest_of(_files(tmp_path / each)) for each in ("here", "elsewhere")}
+    digests.add(of.digest_of([packed]))
+    assert len(digests) == 1
+    with pytest.raises(BadInput, match=f"recordings.drive has no sha256; .* '{(*digests,)[0]}'"):
+        holding({"drive": of}, [packed], "experiment x")
+    known = {"drive": of.model_copy(update={"sha256": digests.pop()})}
+    assert holding(known, _files(tmp_path / "here"), "x") == {"drive": True}
+    (tmp_path / "here" / "a" / "drive.csv").write_bytes(b"1,2\n")
+    assert holding(known, _files(tmp_path / "here"), "x") == {"drive": False}
+    assert holding(known, [tmp_path / "here" / "a" / "README"], "x") == {"drive": False}
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file()]
+
+
+def test_claims_of_shipped_experiments_are_bound_to_the_data_they_were_made_of(
+    real_data: Path, tmp_path: Path
+) -> None:
+    places = unpack(real_data, DATA, tmp_path)
+    bound = 0
+    for name in shipped("experiments"):
+        _, experiment = load_experiment(name, {}, {})
+        if experiment.import_ and experiment.claims:
+            place = places[importer_of(experiment)]
+            files = _files(place) if place.is_dir() else [place]
+            found = holding(experiment.recordings, files, name)
+            assert found, name
+            assert all(found.values()), name
+            require_recordings(experiment.claims, found, name)
+            bound += 1
+    assert bound == 16

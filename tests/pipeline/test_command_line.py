@@ -512,6 +512,25 @@ def test_a_full_standard_output_is_said(world: Path, start_fuselog: Callable[...
 
 
 @pytest.mark.usefixtures("here")
+def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
+    """Of an estimates log, of a result folder and of its timeline."""
+    estimates, result = world / "log.estimates.mcap", world / "result"
+    said = fuselog("info", str(estimates)).out.splitlines()[-1]
+    assert said.startswith("Estimates by ekf of log.mcap; what can be done with them: fuselog evaluate ")
+    said = fuselog("info", str(result)).out
+    assert "a result of landmarks (" in said
+    assert "dead-reckoning, ekf, ukf over 2 runs of landmarks" in said
+    assert fuselog("info", str(result), "--json").json["experiment"] == "landmarks"
+    timeline = result / "timeline.rrd"
+    assert "a timeline of fuselog-landmarks" in fuselog("info", str(timeline)).out
+    entities = fuselog("info", str(timeline), "--json").json["entities"]
+    assert entities["/map/robot1/truth/path"] > 1
+    Path("none.rrd").write_text("no timeline")
+    refused = fuselog("info", "none.rrd")
+    assert (refused.code, "none.rrd: is no timeline that can be read" in refused.err) == (2, True)
+
+
+@pytest.mark.usefixtures("here")
 def test_parameters_are_printed_on_request(world: Path, fuselog: Fuselog) -> None:
     """Defaults too, and those that were given."""
     log = str(world / "log.mcap")
@@ -527,6 +546,10 @@ def test_parameters_are_printed_on_request(world: Path, fuselog: Fuselog) -> Non
     assert told["ukf"] == {**told["ekf"], "kappa": 1.0}
     said = fuselog("run", log, "-e", "ukf", "--parameters", "--out", "d").out
     assert "kappa" in said
+    assert not Path("d").exists()  # nothing was run
+    assert "position_rmse_m" not in said
+    alone = fuselog("run", "landmarks", "--set", "ukf.kappa=2", "--parameters", "--json").json
+    assert alone["parameters"]["ukf"]["kappa"] == 2.0
 
 
 @pytest.mark.usefixtures("here")

@@ -13,7 +13,7 @@ from pipeline.diagnosing.causes import find_causes
 from pipeline.diagnosing.hypotheses import Hypothesis, hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from replay.engine.replaying.estimator import bind
-from tests.pipeline.car import car
+from tests.pipeline.car_d import car
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}

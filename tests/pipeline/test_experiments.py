@@ -100,7 +100,7 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     values = json.loads(text)
     assert list(values) == [
         *["format", "experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"],
-        *["bounds", "intervals"],
+        *["bounds", "intervals", "alarms"],
     ]
     assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
     assert values["experiment"] == "landmarks"

@@ -45,6 +45,21 @@ def test_trajectories_for_evo(world: Path, fuselog: Fuselog) -> None:
     assert_allclose(np.arctan2(matrix[:, 1, 0], matrix[:, 0, 0]), state[:, 2], atol=1e-15)
 
 
+def test_poses_are_trajectories(fuselog: Fuselog) -> None:
+    """Of any topic; what is not finite is left out, and said."""
+    turn = np.array([[0.5, 0.5, -0.5, 0.5], [1.0, 0.0, 0.0, 0.0], [0.6, 0.0, 0.0, 0.8]])
+    place = np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0], [4.0, 5.0, 6.0]])
+    columns = {"position_m": place, "quaternion": turn, "covariance": np.zeros((3, 36))}
+    poses = fl.make_stream("/mocap/body", fl.schemas.POSE, np.arange(3) * 10**9, **columns)
+    fl.write("log.mcap", [poses])
+    said = fuselog("export", "log.mcap", "--to", "tum")
+    assert "1 poses are not finite" in said.err
+    assert_allclose(
+        np.loadtxt("log-tum/mocap-body.txt"),
+        [[0, 1, 2, 3, 0.5, -0.5, 0.5, 0.5], [2, 4, 5, 6, 0.0, 0.0, 0.8, 0.6]],
+    )
+
+
 @pytest.mark.parametrize("to", ["csv", "parquet"])
 def test_tables(to: Any, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every column of every stream, over many blocks; an empty one has a header."""
@@ -99,7 +114,7 @@ def test_nothing_is_replaced(world: Path, fuselog: Fuselog) -> None:
         (("--topic", "/robot1/trth"), ("no topic /robot1/trth", "did you mean '/robot1/truth'")),
         (
             ("--topic", "/robot1/odometry"),
-            ("/robot1/odometry", "neither an estimate nor a truth", "csv"),
+            ("/robot1/odometry", "is no estimate, truth or Pose", "csv"),
         ),
         (("--to", "tmu"), ("'tmu'", "'kitti'")),
     ):
@@ -109,5 +124,5 @@ def test_nothing_is_replaced(world: Path, fuselog: Fuselog) -> None:
         assert said.err.count("\n") == 1
         assert all(word in said.err for word in words), said.err
     said = fuselog("export", world / "no-truth.mcap", "--to", "tum")
-    assert (said.code, "no estimates or truth with a position" in said.err) == (2, True)
+    assert (said.code, "no estimates, truth or poses" in said.err) == (2, True)
     assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before

@@ -154,7 +154,7 @@ def test_a_raw_recording_with_another_mounting_takes_settings_alone(navigation: 
     found = run_experiment(name, experiment, tmp_path / "out", data=tmp_path, logs=0)
     assert found.metrics["ekf.over_rmse_m.15s"] == pytest.approx(1.71, rel=0.03)
     assert found.metrics["smoother.over_rmse_m.15s"] == pytest.approx(0.141, rel=0.03)
-    assert len(found.claims) == 3  # none of the walk's own
+    assert {claim.verdict for claim in found.claims} == {"no verdict"}  # they are the walk's own
 
 
 @pytest.mark.parametrize(("delays_s", "taken_back"), [({}, -0.125), ({"/velocity": 0.1}, -0.1)])

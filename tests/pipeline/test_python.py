@@ -243,6 +243,33 @@ def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -
     assert "reckoned" in repr(done)
 
 
+def test_an_estimator_needs_no_label(recordings: list[fl.MemorySource]) -> None:
+    """In replay, tune and diagnose it has the name of its method."""
+    bare = fl.modelled(robot(), "ekf")
+    done, by_name = (fl.replay(recordings, each, metrics=None) for each in (bare, "ekf"))
+    pd.testing.assert_frame_equal(done.metrics, by_name.metrics)
+    with pytest.raises(fl.BadInput, match="estimator ekf is given twice"):
+        fl.replay(recordings, [bare, bare])
+    with pytest.raises(fl.BadInput, match="a model without a method; give modelled"):
+        fl.replay(recordings, robot())
+    assert fl.diagnose(recordings[0], bare).label == "ekf"
+    assert fl.tune(recordings, bare, "sigma_range_m", grid=1).label == "ekf"
+
+
+def test_a_component_that_was_not_measured_is_nan(recordings: list[fl.MemorySource]) -> None:
+    """Of a schema that ships, as of one of one's own: the other component is used."""
+    log, topic = recordings[0], "/robot1/range_bearing"
+    sightings = log[topic]
+    bearing = np.where(np.arange(len(sightings)) % 2, sightings["bearing_rad"], np.nan)
+    half = replace(sightings, columns={**sightings.columns, "bearing_rad": bearing})
+    fl.write("half.mcap", [*(log[each] for each in log if each != topic), half])
+    done = fl.replay("half.mcap", "ekf")
+    row = done.coverage.iloc[0]
+    assert row["used"] + row["gated"] == len(sightings)
+    innovation = done.estimates[0]["/estimates/ekf/robot1/innovation"]["innovation"]
+    assert np.isnan(innovation).sum(axis=0).tolist() == [0, (len(sightings) + 1) // 2]
+
+
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     "method",

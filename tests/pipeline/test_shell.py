@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.output import terminal
 from tests.pipeline.conftest import Said
 
 ROOT = Path(__file__).parents[2]
@@ -67,6 +68,42 @@ def test_progress_is_shown_in_a_terminal(tmp_path: Path, start_fuselog: Callable
         out, _ = process.communicate()
     assert b"%" in shown
     assert json.loads(out)["experiment"] == "landmarks"
+
+
+def test_who_is_no_terminal_has_a_line_a_minute(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever the loops are that share the minute; nothing in the first one."""
+    now_s = 100.0
+    monkeypatch.setattr(terminal, "monotonic", lambda: now_s)
+    monkeypatch.setattr(terminal, "once_a_minute", terminal.OnceAMinute())
+    for _ in terminal.progress(range(5), "replaying", 5):
+        now_s += 25.0
+    with terminal.status() as show:
+        for number in range(3):
+            show(f"{number} evaluations")
+            now_s += 25.0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == "fuselog: replaying: 3 of 5\nfuselog: 1 evaluations\n"
+
+
+@pytest.mark.parametrize("count", [terminal.MOST_CASES, 142])
+def test_many_cases_are_one_table(count: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """Medians with the least and the greatest; a number that is missing is none of these."""
+    metrics: dict[str, Any] = {f"ekf.rmse_m.trial{each}": float(each) for each in range(count)}
+    metrics |= {"ukf.rmse_m.trial0": None, "ekf.rmse_m": 0.5, "ekf.by_noise.trial1": [1.0, 2.0]}
+    terminal.print_metrics(metrics, {}, details="summary.csv")
+    said = capsys.readouterr().out
+    assert "0.5" in said
+    if count == 142:
+        assert "142 cases: the median" in said
+        assert re.search(r"rmse_m +70\.5 \(0 to 141\)", said)
+        assert "each of the 142 cases by itself: summary.csv" in said
+        assert said.count("rmse_m") == 2
+    else:
+        assert said.count("rmse_m") == 1 + count
+        assert "median" not in said
 
 
 @pytest.mark.unix

@@ -71,7 +71,11 @@ def test_two_files(fuselog: Fuselog) -> None:
     assert fuselog("report", "judged", "-o", "page.html").code == 0
     assert "ape_translation_rmse_m" in Path("page.html").read_text(encoding="utf-8")
     options = ("--align", "sim3", "--time-offset", "estimate")
-    table = fuselog("evaluate", "estimate.txt", "--truth", "truth.txt", *options).out
+    in_time = fuselog("evaluate", "estimate.txt", "--truth", "truth.txt", *options)
+    assert "no time offset makes the error smaller; none was added" in in_time.err
+    late = replace(moved, time_ns=moved.time_ns + 300_000_000)
+    Path("late.txt").write_text("\n".join(tum_lines(late)))
+    table = fuselog("evaluate", "late.txt", "--truth", "truth.txt", *options).out
     for words in ("APE translation (m)", " poses, ", "s were added to the stamps", "was scaled by "):
         assert words in table
 

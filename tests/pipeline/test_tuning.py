@@ -216,6 +216,12 @@ def test_what_cannot_be_searched_is_refused(
         fl.tune(short, "ekf", free, **given)
 
 
+@pytest.mark.parametrize("method", ["particles:100", "lrkf:rukf-3"])
+def test_a_likelihood_that_is_random_is_not_searched(method: str) -> None:
+    with pytest.raises(fl.BadInput, match=f"{method}: draws random numbers, so that its likelihood"):
+        fl.tune(fl.record("landmarks", duration_s=2.0), method, "sigma_range_m")
+
+
 def test_a_parameter_that_no_message_depends_on_is_refused(short: fl.MemorySource) -> None:
     given = of_sigmas(0.1, 0.05, 0.2, 0.03)
     sights = short.streams["/robot/range_bearing"]

@@ -240,3 +240,15 @@ def test_what_types_say_of_their_parameters() -> None:
         "left., right.": "Of all sensors.\n\nOf this one.",
         "more[].": "Of all sensors.",
     }
+
+
+def test_a_number_that_is_declared_float_is_float() -> None:
+    """A default too: `1` of a person is no integer."""
+
+    class Own(Parameters):
+        sigma_m: float = 1
+        limits_m: tuple[float, float] = (0, 1)
+
+    assert [type(number) for number in (Own().sigma_m, *Own().limits_m, Own(sigma_m=2).sigma_m)] == [
+        float
+    ] * 4

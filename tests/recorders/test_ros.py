@@ -254,6 +254,12 @@ def test_poses_that_are_the_truth(tmp_path: Path) -> None:
     names = "x_m,y_m,z_m,heading_rad,orientation_w,orientation_x,orientation_y,orientation_z"
     assert truth.metadata["components"] == names
     assert_allclose(truth["state"], [[3, 4, 5, 0.5, np.cos(half), 0, 0, np.sin(half)]], atol=1e-12)
+    placed = imported(path, truth="/r1/mocap", origin=[48.0, 11.0])[0]
+    stated = {topic for topic, each in placed.items() if "origin_latitude_deg" in each.metadata}
+    assert stated == {"/r1/truth"}
+    assert placed["/r1/truth"].metadata["origin_longitude_deg"] == "11.0"
+    adrift = imported(path, origin=[48.0, 11.0])[0]["/r1/odometry_pose"]
+    assert "origin_latitude_deg" not in adrift.metadata
     level: list[Sent] = [*sent, ("/level", START_NS, make("std_msgs/msg/Float64", data=0.75))]
     other = write_bag(tmp_path / "other", "mcap", level, make.store)
     for name, words in (
@@ -540,6 +546,45 @@ def test_what_stands_beside_the_messages_is_told(tmp_path: Path) -> None:
     _, notes = imported(path)
     assert "its name is not whole" in notes["lost (1)"]
     assert notes["not taken, attachment camera.yaml"].startswith("1, ")
+
+
+def test_noise_densities_are_those_of_stated_covariances(tmp_path: Path) -> None:
+    """By the step of 10 ms; zeros, -1 and what no sensor has state nothing, and the last is told."""
+    make, stamps = Maker(), [START_NS + number * STEP_NS for number in range(9)]
+    twist = np.diag([0.04, 1.0, 1.0, 1.0, 1.0, 0.0009]).ravel()
+    own, absurd, zeros = np.diag([0.01, 0.01, 0.04]).ravel(), 1e6 * np.eye(3).ravel(), [0.0] * 9
+    cases: list[tuple[str, str, dict[str, Any]]] = [
+        ("/a/odom", "nav_msgs/msg/Odometry", {"twist__covariance": twist}),
+        ("/b/odom", "nav_msgs/msg/Odometry", {"twist__covariance": [0.0] * 36}),
+        ("/a/imu", "sensor_msgs/msg/Imu",
+         {"linear_acceleration_covariance": own, "angular_velocity_covariance": absurd}),
+        ("/b/imu", "sensor_msgs/msg/Imu",
+         {"linear_acceleration_covariance": zeros, "angular_velocity_covariance": [-1.0, *zeros[1:]]}),
+    ]  # fmt: skip
+    sent = [
+        (topic, stamp, make(kind, stamp, **given)) for stamp in stamps for topic, kind, given in cases
+    ]
+    streams, notes = imported(write_bag(tmp_path / "bag", "mcap", sent, make.store))
+    stated = {
+        topic: {
+            name: float(value) for name, value in streams[topic].metadata.items() if "density" in name
+        }
+        for topic in ("/a/odometry", "/b/odometry", "/a/inertial", "/b/inertial")
+    }
+    assert stated == {
+        "/a/odometry": {
+            "forward_noise_density": pytest.approx(0.02),
+            "turn_noise_density": pytest.approx(0.003),
+        },
+        "/b/odometry": {},
+        "/a/inertial": {"force_noise_density": pytest.approx(0.1 * 0.02**0.5, rel=1e-5)},
+        "/b/inertial": {},
+    }
+    assert notes["/a/odometry: forward_noise_density"] == (
+        "0.02, of a standard deviation of 0.2 m/s every 0.01 s"
+    )
+    absurd_note = "not stated, since a standard deviation of 1e+03 rad/s is no sensor's"
+    assert notes["/a/inertial: gyro_noise_density"] == absurd_note
 
 
 def test_frames_and_constants_that_change(tmp_path: Path) -> None:

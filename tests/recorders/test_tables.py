@@ -387,6 +387,9 @@ only_first = true
     truth, prior = streams["/truth"], streams["/prior"]
     assert_allclose(truth["state"], [[0, 0, 10], [0, 222.459, 10 - 0.004]], atol=1e-2)
     assert truth.metadata["origin_altitude_m"] == "100.0"
+    assert prior.metadata["origin_latitude_deg"] == "50.0"
+    moved, _ = imported(text, origin + mapping, origin=[50.0, 9.0, 0.0])
+    assert_allclose(moved["/truth"]["state"][:, 2] - truth["state"][:, 2], 100.0, atol=1e-2)
     assert_allclose(prior["mean"], [[0, 0, np.pi / 2]], atol=1e-8)
     assert_allclose(prior["covariance"][0, [0, 4, 8]], [1, 4, np.pi**2 / 4])
     on_map, _ = imported(text, origin + 'projection = "EPSG:25832"\n' + mapping)

@@ -4,9 +4,10 @@ import math
 from collections import Counter
 from textwrap import shorten
 
+from pipeline.output.claims import NO_VERDICT
 from pipeline.output.results import MetricTable, Result, metric_tables
 from pipeline.output.terminal import format_value
-from replay.judging.judge import LEAST_SHARE
+from replay.judging.diagnostics import LEAST_SHARE
 
 # More estimators than these are counted, and more claims than these are in the table below alone.
 MOST_NAMED = 6
@@ -58,6 +59,8 @@ def _of_claims(result: Result) -> str:
     for other in ("not shown", "not reproducible"):
         if counts[other]:
             said.append(f"{counts[other]} {other}")
+    if counts[NO_VERDICT]:
+        said.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
     return "; ".join(said) + "."
 
 

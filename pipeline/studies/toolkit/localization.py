@@ -13,7 +13,7 @@ from pipeline.runs.experiment import Experiment, Setting, Study
 def study(experiment: Experiment, setting: Setting) -> Outcome:
     """Run the experiment; see `pipeline.runs.experiment.Study`."""
     done = judge(experiment, setting)
-    outcome = summarise(done.judge, done.coverage)
+    outcome = summarise(done.judge, done.coverage, done.parameters)
     outcome.input_sha256, outcome.parameters = done.input_sha256, done.parameters
     return outcome
 

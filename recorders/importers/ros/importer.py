@@ -19,6 +19,7 @@ from recorders.importers.ros.parameters import RosParameters
 from recorders.importers.ros.streams import Frames, Sent, StreamMaker, in_words
 from recorders.importers.ros.transforms import Chain, Pair, Transforms, transforms_of
 from recorders.log import Stream, schemas
+from recorders.log.planes import Origin
 from recorders.recording import Blocks, Importer
 
 # A block ends when it has so many messages, or bytes.
@@ -42,7 +43,8 @@ class _Import:
         self.path, self._bag, self._parameters = bag.path, bag, parameters
         self._readers, self._not_taken = choose(bag, parameters)
         names = stream_names(self._readers, parameters)
-        self._streams = StreamMaker(bag.path, parameters.clock, names)
+        origin = None if parameters.origin is None else Origin(*parameters.origin)
+        self._streams = StreamMaker(bag.path, parameters.clock, names, origin)
         self._pending: dict[tuple[Connection, int], _Pending] = defaultdict(_Pending)
         self._waiting_messages = self._waiting_bytes = 0
         self._read: Counter[str] = Counter()
@@ -205,6 +207,7 @@ class _Import:
                 notes[":".join(chain.pair)] = (
                     f"{chain.left_out} stamps left out at which a transform of the chain is not known"
                 )
+        notes |= self._streams.noise
         for (subject, fact), count in self._streams.told.items():
             notes[f"{subject}: {fact}"] = str(count)
         for topic, why in sorted(self._not_taken.items()):

@@ -20,6 +20,15 @@ STAMP, FRAME, CHILD_FRAME = "header.stamp", "header.frame_id", "child_frame_id"
 _NO_FIX = -1  # sensor_msgs/NavSatStatus
 # A motion in the plane has less than this of the rest, in m/s and rad/s.
 _PLANAR = 1e-6
+_DIAGONAL = [0, 4, 8]
+# Standard deviations that readings can have, by the noise density that is stated of them, and their
+# unit: drivers write variances such as 1e-9 and 1e6 where they know nothing.
+SIGMAS = {
+    "forward_noise_density": (1e-4, 10.0, "m/s"),
+    "turn_noise_density": (1e-5, 10.0, "rad/s"),
+    "force_noise_density": (1e-4, 10.0, "m/s2"),
+    "gyro_noise_density": (1e-6, 1.0, "rad/s"),
+}
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,7 @@ class Part:
         columns: the fields (k,) or (k, width) of the stream's schema.
         metadata: what the channel states.
         constants: columns (k, width) of which the channel states the first value, by their names there.
+        noise: variances (k,) of readings, by the noise density that the channel states of them.
         rows: of which message each is; None where there is one of each.
         dropped: by reason, which (k,) are left out.
         doubtful: by reason, which (k,) are kept all the same.
@@ -41,6 +51,7 @@ class Part:
     columns: Mapping[str, NDArray]
     metadata: Mapping[str, str] = field(default_factory=dict)
     constants: Mapping[str, Floats] = field(default_factory=dict)
+    noise: Mapping[str, Floats] = field(default_factory=dict)
     rows: NDArray[np.int64] | None = None
     dropped: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     doubtful: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
@@ -114,6 +125,8 @@ def _fix(messages: Messages) -> Iterator[Part]:
 
 
 def _inertial(messages: Messages) -> Iterator[Part]:
+    force = covariance(messages, "linear_acceleration_covariance")
+    rate = covariance(messages, "angular_velocity_covariance")
     yield Part(
         "inertial",
         schemas.INERTIAL_SAMPLE,
@@ -123,8 +136,12 @@ def _inertial(messages: Messages) -> Iterator[Part]:
             "magnetic_field_ut": _unknown(messages, 3),
         },
         constants={
-            "specific_force_covariance_m2ps4": covariance(messages, "linear_acceleration_covariance"),
-            "turn_rate_covariance_rad2ps2": covariance(messages, "angular_velocity_covariance"),
+            "specific_force_covariance_m2ps4": force,
+            "turn_rate_covariance_rad2ps2": rate,
+        },
+        noise={
+            "force_noise_density": force[:, _DIAGONAL].mean(axis=1),
+            "gyro_noise_density": rate[:, _DIAGONAL].mean(axis=1),
         },
     )
     orientation = quaternion(messages, "orientation")
@@ -155,10 +172,12 @@ def _odometry(messages: Messages) -> Iterator[Part]:
     """The twist, as a body's in the plane and in full, and the pose that the robot made of it."""
     velocity, turn = vector(messages, "twist.twist.linear"), vector(messages, "twist.twist.angular")
     beside = np.abs(np.concatenate([velocity[:, 1:], turn[:, :2]], axis=1)).max(axis=1)
+    spread = covariance(messages, "twist.covariance")
     yield Part(
         "odometry",
         schemas.ODOMETRY,
         {"forward_mps": velocity[:, 0], "turn_radps": turn[:, 2]},
+        noise={"forward_noise_density": spread[:, 0], "turn_noise_density": spread[:, 35]},
         doubtful={
             "with a motion sideways, up or down, rolling or pitching, which it leaves out": beside
             > _PLANAR

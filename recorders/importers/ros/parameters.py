@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, PositiveFloat
 
+from recorders.importers.mapping import Place
 from recorders.parameters import Parameters
 
 Clock = Literal["header", "bag"]
@@ -34,6 +35,9 @@ class RosParameters(Parameters):
         mapping: a TOML file for messages of your own.
         distribution: which one's definitions hold for messages that the bag does not define.
         clock_tolerance_s: headers that differ by more are refused as those of several clocks.
+        origin: latitude and longitude (deg) and perhaps height (m) of the origin of the plane that poses
+            and positions are in, whatever their frames are called; not that of transforms, nor of what
+            an odometry adds up to.
     """
 
     clock: Clock = "header"
@@ -44,3 +48,4 @@ class RosParameters(Parameters):
     mapping: str | None = None
     distribution: Distribution = "ros2_humble"
     clock_tolerance_s: PositiveFloat = 60.0
+    origin: Place | None = None

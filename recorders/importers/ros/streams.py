@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.importers.mapping import checked, not_finite
-from recorders.importers.ros.messages import Part
+from recorders.importers.ros.messages import SIGMAS, Part
 from recorders.importers.ros.parameters import Clock
 from recorders.log import Schema, Stream, make_stream
+from recorders.log.planes import Origin, is_planar
 
 # Names of frames, and which messages (n,) name them.
 Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
@@ -45,6 +46,7 @@ class _Written:
     metadata: dict[str, str]
     widths: dict[str, int]
     constants: Mapping[str, NDArray]
+    noise: dict[str, NDArray[np.float64]]
     messages: int = 0
     last_ns: int = -1
     pieces: list[_Piece] = field(default_factory=list)
@@ -57,13 +59,22 @@ class StreamMaker:
         told: how many, by subject and fact.
         came_of: what has come of a topic, in the order in which it came.
         first_ns: the first publish time of all.
+        noise: what is stated of the noise of a topic, or why nothing is.
     """
 
-    def __init__(self, path: Path, clock: Clock, names: Mapping[tuple[str, str], str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        clock: Clock,
+        names: Mapping[tuple[str, str], str],
+        origin: Origin | None = None,
+    ) -> None:
         self.told: Counter[tuple[str, str]] = Counter()
         self.came_of: dict[str, dict[str, None]] = defaultdict(dict)
         self.first_ns: int | None = None
+        self.noise: dict[str, str] = {}
         self._path, self._clock, self._names = path, clock, names
+        self._origin = origin
         self._written: dict[str, _Written] = {}
         self._streams: dict[tuple[str, ...], str] = {}
 
@@ -116,6 +127,13 @@ class StreamMaker:
             self._streams[key] = name if is_first else "/".join([name, *filter(None, frame.values())])
         return self._streams[key]
 
+    def _plane_of(self, topic: str, part: Part, metadata: Mapping[str, str]) -> dict[str, str]:
+        """The origin that a stream states: not one of transforms, nor of what an odometry adds up to."""
+        is_own = part.kind == "odometry_pose" or (topic, part.kind) not in self._names
+        if self._origin is None or is_own or not is_planar(part.schema.full_name, metadata):
+            return {}
+        return self._origin.metadata
+
     def _put(
         self,
         name: str,
@@ -134,8 +152,10 @@ class StreamMaker:
         if name not in self._written:
             stated = {key: in_words(value[0]) for key, value in constants.items()}
             metadata = {**{key: each for key, each in frame.items() if each}, **part.metadata, **stated}
+            metadata |= self._plane_of(sent.topic, part, metadata)
             first = {key: value[:1].copy() for key, value in constants.items()}
-            self._written[name] = _Written(part.schema, metadata, widths, first)
+            noise = {key: each[which] for key, each in part.noise.items()}
+            self._written[name] = _Written(part.schema, metadata, widths, first, noise)
         written = self._written[name]
         if widths != written.widths:
             self.tell(sent.topic, f"{part.kind} dropped: of another length than the first", len(rows))
@@ -152,6 +172,22 @@ class StreamMaker:
         written.pieces.append(_Piece(sent.rows[of], published, log_time_ns, sensed, columns))
         self.came_of[sent.topic][name] = None
 
+    def _state_noise(self, topic: str, written: _Written, steps_ns: NDArray[np.int64]) -> None:
+        """State the noise densities of a stream by the first of its variances that is known."""
+        step_s = 1e-9 * float(np.median(steps_ns[steps_ns > 0])) if (steps_ns > 0).any() else 0.0
+        for name, variances in written.noise.items():
+            known = variances[variances > 0.0]  # not zero, NaN or negative
+            if not len(known) or not step_s:
+                continue
+            sigma, (least, most, unit) = float(np.sqrt(known[0])), SIGMAS[name]
+            of = f"a standard deviation of {sigma:.3g} {unit}"
+            if least <= sigma <= most:
+                written.metadata[name] = f"{sigma * step_s**0.5:.6g}"
+                said = f"{written.metadata[name]}, of {of} every {step_s:.3g} s"
+            else:
+                said = f"not stated, since {of} is no sensor's"
+            self.noise[f"{topic}: {name}"] = said
+
     def _stream(self, topic: str, written: _Written) -> Stream:
         """What waits for a stream, in the order in which the bag has it."""
         parts = written.pieces
@@ -165,6 +201,8 @@ class StreamMaker:
         )
         self.tell(topic, "stamps repeat, and are kept", int((steps_ns == 0).sum()))
         self.tell(topic, "stamps go back, and are sorted", int((steps_ns < 0).sum()))
+        if not written.messages:
+            self._state_noise(topic, written, np.diff(np.sort(published)))
         written.last_ns = int(published[-1])
         written.messages += len(published)
         first_ns = int(published.min())

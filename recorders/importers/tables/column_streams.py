@@ -1,13 +1,14 @@
 """Guesses which streams the columns of a table are: inertial, fix, pose, odometry and others."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from recorders.importers.tables.columns import (
     GuessedColumn,
     GuessedTable,
+    direction_of,
     largest_of,
     length_of,
     name_of,
@@ -39,6 +40,8 @@ _YAW_RATE = (
 
 
 _HEADING = r"(.*_)?(heading|hdg|yaw|theta|psi|orientation)"
+_HEADING_ALONE = r"(.*_)?(compass(_course|_heading)?|heading|hdg|yaw)"
+_ACCURACY = r"(.*_)?(accuracy|eph|h_?acc)"
 _EAST, _NORTH = "(x_)?east(ing)?|e", "(y_)?north(ing)?|n"
 _TARGET = (
     r"(.*_)?(target|landmark|subject|barcode|beacon|anchor|marker|feature)(_?(id|number|nr|no))?|id"
@@ -94,6 +97,10 @@ def _fix(table: GuessedTable) -> Iterator[str]:
         return
     fields = ("latitude_deg", "longitude_deg")
     lines = [f"fields.{field} = {name_of(each)}" for field, each in zip(fields, place, strict=True)]
+    north, east = place[0].values, place[1].values * np.cos(np.radians(np.nanmedian(place[0].values)))
+    table.places.extend(
+        each._replace(values=values) for each, values in zip(place[::-1], (east, north), strict=True)
+    )
     latitude, longitude = (largest_of([column]) for column in place)
     if place[0].unit == "rad" or (latitude < np.pi / 2 and longitude <= np.pi):
         lines += [f'units.{field} = "rad"   # latitudes up to {latitude:.4g}' for field in fields]
@@ -105,9 +112,21 @@ def _fix(table: GuessedTable) -> Iterator[str]:
     height = take(table.columns, r"(.*_)?(alt|altitude|height|ellipsoidal_height|ele|elevation|h)")
     if height:
         lines.append(f"fields.altitude_m = {name_of(height[0])}")
+        if (length := stated_unit(height[0], "m")) not in ("", "m"):
+            lines.append(f'units.altitude_m = "{length}"   # as its name says')
     deviations = take(table.columns, r"sd_?e", r"sd_?n", r"sd_?u")
     if deviations:
         lines.append(f"deviations.covariance_m2 = {names_of(deviations)}")
+        if (length := stated_unit(deviations[0], "m")) not in ("", "m"):
+            lines.append(f'units.covariance_m2 = "{length}"   # as its name says')
+    elif accuracy := take(table.columns, _ACCURACY):
+        lines += [
+            "# The standard deviation of each axis, upwards twice that:",
+            f"deviations.covariance_m2 = {names_of(3 * accuracy)}",
+            "factors.covariance_m2 = [1, 1, 2]",
+        ]
+        if (length := stated_unit(accuracy[0], "m")) not in ("", "m"):
+            lines.append(f'units.covariance_m2 = "{length}"   # as its name says')
     elif dilution := take(table.columns, r"(.*_)?hdop"):
         lines += [
             "# Standard deviations, east, north, up: the dilution times the receiver's range error,",
@@ -220,6 +239,8 @@ def _pose(table: GuessedTable) -> Iterator[str]:
     if place:
         lines.append(f"fields.position_m = {names_of(place)}")
         lines += [f"factors.position_m = {factors}"] * (-1 in factors)
+        if (length := _length(place)) != "m":
+            lines.append(f'units.position_m = "{length}"   # as its name says')
     if turn:
         lines.append(f"fields.quaternion = {names_of(turn)}")
     else:
@@ -267,6 +288,11 @@ def _quaternion(columns: list[GuessedColumn]) -> list[GuessedColumn]:
     return found
 
 
+def _length(place: list[GuessedColumn]) -> str:
+    """The unit that a position's names state, else m."""
+    return stated_unit(place[0], "m") or "m" if place else "m"
+
+
 def _truth(
     place: list[GuessedColumn],
     factors: list[int],
@@ -277,20 +303,22 @@ def _truth(
     names = [f"{axis}_m" for axis, _ in zip("xyz", place, strict=False)]
     names += [f"orientation_{part}" for part, _ in zip("wxyz", turn, strict=False)]
     kinds = ["linear"] * len(place) + ["quaternion"] * len(turn)
-    lines, signs = [], [*factors, *[1] * len(turn)]
+    lines, signs, length = [], [*factors, *[1] * len(turn)], _length(place)
     if heading:
         names, kinds = [*names, "heading_rad"], [*kinds, "angle"]
-        in_unit, why = unit_by_largest(heading[0], "rad", "deg", 2 * np.pi)
+        in_unit, is_compass, why = direction_of(heading[0], place)
         lines.append(
-            f"units.state = {json.dumps([*['m'] * len(place), in_unit])}   # the heading: {why}"
+            f"units.state = {json.dumps([*[length] * len(place), in_unit])}   # the heading: {why}"
         )
-        if _is_compass(place, heading[0], unit(in_unit).size):
+        if is_compass:
             quarter = round(np.pi / 2 / unit(in_unit).size, 9)
             lines.append("# By the path, the heading is clockwise from north; fuselog's is from east:")
             lines.append(f"offsets.state = {[*[0] * len(place), quarter]}")
             signs.append(-1)
         else:
             signs.append(1)
+    elif length != "m":
+        lines.append(f"units.state = {json.dumps([*[length] * len(place), *[''] * len(turn)])}")
     if -1 in signs:
         lines.append(f"factors.state = {signs}")
     return [
@@ -301,16 +329,23 @@ def _truth(
     ]
 
 
-def _is_compass(place: Sequence[GuessedColumn], heading: GuessedColumn, size_rad: float) -> bool:
-    """Whether a body that goes where it heads does so rather with a heading clockwise from north."""
-    steps = np.diff(place[0].values), np.diff(place[1].values)
-    course_rad = np.arctan2(steps[1], steps[0])
-    heading_rad = size_rad * heading.values[:-1]
-    length = np.hypot(*steps)
-    as_is, compass = (
-        np.nansum(length * np.cos(course_rad - each)) for each in (heading_rad, np.pi / 2 - heading_rad)
+def _heading(table: GuessedTable) -> Iterator[str]:
+    """Headings beside fixes; a course over ground alone is none, it has no direction at rest."""
+    if not table.places or not (found := take(table.columns, _HEADING_ALONE)):
+        return
+    direction = direction_of(found[0], table.places)
+    angle = "heading" if direction.is_compass else "yaw"
+    what = "clockwise from north" if direction.is_compass else "anticlockwise from east"
+    table.made.append(f"# {found[0].name}: {what}, {direction.unit}: {direction.why}.")
+    table.made.append(f'attitude = {{ {angle} = {name_of(found[0])}, unit = "{direction.unit}" }}')
+    quaternion = [f"quaternion_{part}" for part in "wxyz"]
+    yield from stream_lines(
+        f"{table.prefix}/heading",
+        "Orientation",
+        "the name is that of a heading or compass",
+        f"fields.quaternion = {json.dumps(quaternion)}",
+        "states.covariance_rad2 = 0.003   # 3 deg; fill in the variance",
     )
-    return bool(compass > as_is and compass > 0.5 * np.nansum(length))
 
 
 def _velocity(table: GuessedTable) -> Iterator[str]:
@@ -326,5 +361,5 @@ def _velocity(table: GuessedTable) -> Iterator[str]:
 
 
 GUESSES: tuple[Callable[[GuessedTable], Iterator[str]], ...] = (
-    _inertial, _magnetic, _fix, _target, _twist, _velocity, _odometry, _pose,
+    _inertial, _magnetic, _fix, _target, _twist, _velocity, _odometry, _pose, _heading,
 )  # fmt: skip

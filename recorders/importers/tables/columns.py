@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.errors import BadInput
 from recorders.importers.units import unit
 
 
@@ -21,11 +22,16 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """The columns that no stream has yet, how topics begin, and whether the file's name says truth."""
+    """The columns that no stream has yet, how topics begin, and whether the file's name says truth.
+
+    `places` are all columns, by which courses are told, and `made` lines of the table itself.
+    """
 
     columns: list[GuessedColumn]
     prefix: str
     is_reference: bool
+    places: list[GuessedColumn]
+    made: list[str]
 
 
 def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
@@ -84,6 +90,101 @@ def unit_by_largest(column: GuessedColumn, usual: str, other: str, limit: float)
 def largest_of(columns: Sequence[GuessedColumn]) -> float:
     """Return the largest magnitude among some columns."""
     return float(np.nanmax(np.abs([column.values for column in columns])))
+
+
+# Words of other languages in names, by what they are called here.
+_WORDS = {
+    "geschwindigkeit": "speed", "gierrate": "yaw_rate", "drehrate": "turn_rate", "breite": "latitude",
+    "breitengrad": "latitude", "laenge": "longitude", "laengengrad": "longitude", "hoehe": "altitude",
+    "kompass": "compass", "kompasskurs": "compass_course", "kurs": "course", "genauigkeit": "accuracy",
+    "zeit": "time", "uhrzeit": "time", "zeitstempel": "time", "datum": "date",
+}  # fmt: skip
+_UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})
+# Units at the end of a name, as they are written there.
+_ENDINGS = {
+    "mps": "m/s", "m_s": "m/s", "kmh": "km/h", "kph": "km/h", "km_h": "km/h", "mph": "mi/h",
+    "fps": "ft/s", "ft_s": "ft/s", "kn": "kn", "kts": "kn", "knots": "kn",
+    "radps": "rad/s", "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "dps": "deg/s",
+    "mps2": "m/s^2", "m_s2": "m/s^2", "ut": "uT", "rad": "rad", "deg": "deg", "m": "m",
+    "ft": "ft", "feet": "ft", "ns": "ns", "us": "us", "ms": "ms", "s": "s",
+}  # fmt: skip
+# Units in brackets that others write otherwise than we do.
+_WRITTEN = {
+    "degrees": "deg", "degree": "deg", "grad": "deg", "°": "deg", "meters": "m", "feet": "ft",
+    "fuss": "ft", "knots": "kn", "kts": "kn", "kmh": "km/h", "kph": "km/h", "mph": "mi/h",
+}  # fmt: skip
+
+
+def parted(name: str) -> tuple[str, str]:
+    """A name without its unit, in lower case with underlines; and the unit, from brackets or its end.
+
+    >>> parted("Höhe [ft]"), parted("speed_kmh")
+    (('altitude', 'ft'), ('speed', 'km/h'))
+    """
+    match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]", name)
+    if match:
+        parts = re.split(r"(\W)", match[1].replace("°", "deg"))
+        given = "".join(_WRITTEN.get(part.lower().translate(_UMLAUTS), part) for part in parts)
+        return underlined(name[: match.start()]), given if _is_unit(given) else ""
+    plain = underlined(name)
+    ending = next((each for each in _ENDINGS if plain.endswith(f"_{each}")), "")
+    return plain.removesuffix(f"_{ending}"), _ENDINGS.get(ending, "")
+
+
+def _is_unit(text: str) -> bool:
+    try:
+        return bool(unit(text))
+    except BadInput:
+        return False
+
+
+def underlined(name: str) -> str:
+    """A name in lower case, its English words with underlines between them."""
+    plain = re.sub(r"[^a-z0-9]+", "_", name.lower().translate(_UMLAUTS)).strip("_")
+    return "_".join(_WORDS.get(word, word) for word in plain.split("_"))
+
+
+class Direction(NamedTuple):
+    """What a heading is in, whether it is clockwise from north, and why."""
+
+    unit: str
+    is_compass: bool
+    why: str
+
+
+def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Direction:
+    """A heading's unit and convention, by the course of places east and north, else by its numbers.
+
+    A heading may be unwrapped, so that its largest value says little.
+    """
+    stated = stated_unit(heading, "rad")
+    units = [stated] if stated else ["rad", "deg"]
+    course = _course(places) if places else None
+    if course is not None:
+        rows, angle_rad, length = course
+        known = np.flatnonzero(np.isfinite(heading.values))
+        if len(known):
+            at = known[np.clip(np.searchsorted(known, rows, side="right") - 1, 0, None)]
+            likeness = {}
+            for name in units:
+                own_rad = unit(name).size * heading.values[at]
+                for is_compass, turned in ((False, own_rad), (True, np.pi / 2 - own_rad)):
+                    likeness[name, is_compass] = np.sum(length * np.cos(angle_rad - turned))
+            best = max(likeness, key=lambda each: likeness[each])
+            if likeness[best] > 0.5 * np.sum(length):
+                return Direction(*best, "so it goes with the course")
+    in_unit, why = unit_by_largest(heading, "rad", "deg", 2 * np.pi)
+    return Direction(in_unit, bool(re.search("compass|course", heading.plain)), why)
+
+
+def _course(places: Sequence[GuessedColumn]) -> tuple[NDArray, NDArray, NDArray] | None:
+    """Rows from which places move, in which direction (rad) and how far; None where they do not."""
+    east, north = (each.values for each in places[:2])
+    rows = np.flatnonzero(np.isfinite(east) & np.isfinite(north))
+    if len(rows) < 3:
+        return None
+    steps = np.diff(east[rows]), np.diff(north[rows])
+    return rows[:-1], np.arctan2(steps[1], steps[0]), np.hypot(*steps)
 
 
 def stream_lines(topic: str, becomes: str, why: str, *lines: str) -> list[str]:

@@ -43,7 +43,7 @@ _BLOCK_ROWS = 1 << 17
 MOST_COLUMNS = 10_000
 # Of JSON, such as a quotation mark that ends no string.
 _ESCAPED = re.compile(rb"\\.", re.DOTALL)
-_DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
+DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowException)
 
 
 @dataclass
@@ -76,7 +76,7 @@ class Table:
             yield from self._read(dict.fromkeys(numbers, False) | dict.fromkeys(texts, True))
         except BadInput:
             raise
-        except _DAMAGED as error:
+        except DAMAGED as error:
             raise BadInput(f"{self.path}: {_said(error, self)}") from None
 
 
@@ -112,7 +112,7 @@ def open_table(
             found = {"parquet": _open_parquet, "json": _open_json, "npz": _open_npz}.get(
                 format, _open_trajectory
             )(path)
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise BadInput(f"{path}: cannot be read as {format} ({_first_line(error)})") from None
     return found
 
@@ -130,7 +130,8 @@ def _said(error: Exception, table: Table) -> str:
     return f"column {name} holds '{found[2]}'; expected numbers: mend the cell, or empty it"
 
 
-def _open(path: Path) -> BinaryIO:
+def open_decompressed(path: Path) -> BinaryIO:
+    """Open the bytes of a file; .gz, .bz2 and .xz are decompressed."""
     opener = _OPENERS.get(path.suffix)
     return cast(BinaryIO, opener(path, "rb")) if opener else path.open("rb")
 
@@ -148,7 +149,7 @@ def _open_text(
 ) -> Table:
     comments: list[str] = []
     skipped = 0
-    with _open(path) as file:
+    with open_decompressed(path) as file:
         for line in lines_of(file):
             text = line.decode("utf-8-sig" if skipped == 0 else "utf-8").strip("\r\n")
             if text.strip() and not line.startswith(COMMENTS):
@@ -175,7 +176,7 @@ def _open_text(
     columns, left_out = _unique(names or named, width, path), Counter[str]()
 
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        with _open(path) as file:
+        with open_decompressed(path) as file:
             for _ in range(skipped):
                 file.readline()
             yield from _text_batches(file, columns, wanted, delimiter, decimal, left_out)
@@ -233,10 +234,11 @@ def _text_batches(
         ),
     )
     for batch in map(_by_name, batches):
-        if decimal != ".":  # Arrow minds it in numbers alone
+        if decimal != ".":  # Arrow minds it in numbers alone; of texts only those are mended
+            number = rf"^\s*([-+]?\d*){re.escape(decimal)}(\d+(?:[eE][-+]?\d+)?)\s*$"
             for name in wanted:
                 if wanted[name]:
-                    batch[name] = pc.replace_substring(batch[name], decimal, ".")
+                    batch[name] = pc.replace_substring_regex(batch[name], number, r"\1.\2")
         for name in wanted:
             if wanted[name] and pc.any(pc.match_substring(batch[name], "\ufffd")).as_py():
                 raise ValueError(f"column {name} holds text that is not UTF-8")
@@ -246,7 +248,7 @@ def _text_batches(
 def _open_rtklib(path: Path) -> Table:
     """A solution of RTKLIB: its header names two columns, date and time, by one word."""
     named: list[str] = []
-    with _open(path) as file:
+    with open_decompressed(path) as file:
         for line in lines_of(file):
             if not line.startswith(b"%"):
                 break
@@ -281,7 +283,7 @@ def _open_parquet(path: Path) -> Table:
 
 def _open_json(path: Path) -> Table:
     def read(wanted: Mapping[str, bool]) -> Iterator[Batch]:
-        with _open(path) as file:
+        with open_decompressed(path) as file:
             for block in blocks_of(file):
                 _check_depth(block)
                 for batch in _flat_batches(pyarrow.json.read_json(pa.BufferReader(block))):

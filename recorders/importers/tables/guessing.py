@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -17,10 +18,23 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.tables.column_streams import GUESSES
-from recorders.importers.tables.columns import GuessedColumn, GuessedTable, names_of, stream_lines
-from recorders.importers.tables.files import Batch, open_table
-from recorders.importers.tables.times import NOT_A_TIME, TimeMapping, stamps_ns
-from recorders.importers.units import unit
+from recorders.importers.tables.columns import (
+    GuessedColumn,
+    GuessedTable,
+    names_of,
+    parted,
+    stream_lines,
+    underlined,
+)
+from recorders.importers.tables.files import Batch, Table, open_table
+from recorders.importers.tables.times import (
+    ISO,
+    NOT_A_TIME,
+    TimeMapping,
+    formats_of,
+    offset_of,
+    stamps_ns,
+)
 
 # How many rows are read.
 _ROWS = 100_000
@@ -31,13 +45,6 @@ _EPOCHS = (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8))
 _UNKNOWN_ZERO = "2026-01-01"
 # Names of files with the truth.
 _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|optitrack)([^a-z]|$)"
-# Units at the end of a name, as they are written there.
-_ENDINGS = {
-    "mps": "m/s", "m_s": "m/s", "kmh": "km/h", "kph": "km/h", "km_h": "km/h",
-    "radps": "rad/s", "rad_s": "rad/s", "degps": "deg/s", "deg_s": "deg/s", "dps": "deg/s",
-    "mps2": "m/s^2", "m_s2": "m/s^2", "ut": "uT", "rad": "rad", "deg": "deg", "m": "m",
-    "ns": "ns", "us": "us", "ms": "ms", "s": "s",
-}  # fmt: skip
 
 
 def guess(paths: Sequence[Path]) -> str:
@@ -92,25 +99,23 @@ def _warnings(text: str) -> Iterator[str]:
 
 def _table(path: Path, name: str, *, is_alone: bool) -> str:
     """One [[tables]] of a mapping, with its streams."""
-    table = open_table(path)
-    batch = next(table.batches((), table.columns), None)
-    if batch is None:
-        raise BadInput(f"{path}: has no rows")
-    batch = {column: cells[:_ROWS] for column, cells in batch.items()}
+    table, batch, decimal = _first_rows(path)
     columns, texts = [], []
     for column in table.columns:
         values = _numbers(batch[column])
         if values is None:
             texts.append(column)
         else:
-            columns.append(GuessedColumn(column, *_parted(column), values))
-    time, used, told = _time(batch, columns, texts)
+            columns.append(GuessedColumn(column, *parted(column), values))
+    time, used, told = _time(path, batch, columns, texts)
     if not columns or (not used and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
             "mapping by hand, as docs/your-log.md says"
         )
-    lines = ["[[tables]]", f"files = {json.dumps(name)}", *told, f"time = {time}"]
+    lines = ["[[tables]]", f"files = {json.dumps(name)}"]
+    lines += [f'decimal = "{decimal}"'] * (decimal != ".")
+    lines += [*told, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):
         blanks = ", ".join(f'"{column}"' for column in table.columns)
         lines.append(f"# The file does not name its columns; to name them: columns = [{blanks}]")
@@ -120,10 +125,38 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
         "" if is_alone else "/" + re.sub(r"\W+", "_", Path(name).with_suffix("").as_posix()).strip("_")
     )
     left = [column for column in columns if column.name not in used]
-    rest = GuessedTable(left, prefix, bool(re.search(_REFERENCE, path.stem)))
-    for guessed in GUESSES:
-        lines += guessed(rest)
-    return "\n".join([*lines, *_rest(rest)]) + "\n"
+    rest = GuessedTable(left, prefix, bool(re.search(_REFERENCE, path.stem)), [], [])
+    streams = [line for guessed in GUESSES for line in guessed(rest)]
+    return "\n".join([*lines, *rest.made, *streams, *_rest(rest)]) + "\n"
+
+
+def _first_rows(path: Path) -> tuple[Table, Batch, str]:
+    """A table, its first rows as texts, and the mark before fractions: by the cells, if they are so."""
+    decimal = "."
+    table, batch = _opened(path, decimal)
+    if any(_has_commas(cells) for cells in batch.values()):
+        decimal = ","
+        table, batch = _opened(path, decimal)
+    return table, batch, decimal
+
+
+def _opened(path: Path, decimal: str) -> tuple[Table, Batch]:
+    table = open_table(path, decimal=decimal)
+    batch = next(table.batches((), table.columns), None)
+    if batch is None:
+        raise BadInput(f"{path}: has no rows")
+    return table, {column: cells[:_ROWS] for column, cells in batch.items()}
+
+
+def _has_commas(cells: pa.Array) -> bool:
+    """Whether all cells are numbers, and some have a fraction after a comma."""
+    if not pa.types.is_string(cells.type):
+        return False
+    known = pc.utf8_trim_whitespace(cells).drop_null()
+    known = known.filter(pc.not_equal(known, ""))
+    numbers = pc.match_substring_regex(known, r"^[-+]?\d*(,\d+)?([eE][-+]?\d+)?$")
+    with_comma = pc.match_substring(known, ",")
+    return bool(pc.all(numbers).as_py() and pc.any(with_comma).as_py())
 
 
 def _numbers(cells: pa.Array) -> NDArray | None:
@@ -137,40 +170,31 @@ def _numbers(cells: pa.Array) -> NDArray | None:
     return found if np.isfinite(found).any() else None
 
 
-def _parted(name: str) -> tuple[str, str]:
-    """A name without its unit, in lower case with underlines; and the unit, from brackets or its end."""
-    match = re.search(r"[\[(]\s*([^\])]+?)\s*[\])]", name)
-    if match:
-        given = match[1].replace("degrees", "deg").replace("°", "deg").replace("meters", "m")
-        return _underlined(name[: match.start()]), given if _is_unit(given) else ""
-    plain = _underlined(name)
-    ending = next((each for each in _ENDINGS if plain.endswith(f"_{each}")), "")
-    return plain.removesuffix(f"_{ending}"), _ENDINGS.get(ending, "")
-
-
-def _is_unit(text: str) -> bool:
-    try:
-        return bool(unit(text))
-    except BadInput:
-        return False
-
-
-def _underlined(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-
-
 # The time.
 
 
 def _time(
-    batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
+    path: Path, batch: Batch, columns: Sequence[GuessedColumn], texts: Sequence[str]
 ) -> tuple[str, set[str], list[str]]:
-    """The time as TOML, the columns that it is of, and what was seen."""
+    """The time as TOML, the columns that it is of, and what was seen.
+
+    Raises BadInput where a column of texts holds times that cannot be read: no rate stands for them.
+    """
+    plain = {name: parted(name)[0] for name in texts}
+    days = [name for name in texts if re.fullmatch("(.*_)?(date|day)", plain[name])]
+    hours = [name for name in texts if re.fullmatch("(.*_)?(time|clock|utc)", plain[name])]
+    pairs = [[day, hour] for day in days for hour in hours]
+    for names in (*pairs, *([name] for name in texts)):
+        if found := _dated(batch, names):
+            return found
     for name in texts:
-        names = ["date", "time"] if name == "date" and "time" in texts else [name]
-        if found := _seen(TimeMapping(column=names, unit="date"), batch):
-            zone = "# If its clock is not UTC: utc_offset_h = 8 is one 8 hours ahead."
-            return f'{{ column = {json.dumps(names)}, unit = "date" }}', set(names), [*found, zone]
+        cell = _first_cell(batch[name])
+        if re.search(r"\d{1,2}:\d{2}|\d{1,4}[./-]\d{1,2}[./-]\d{1,4}", cell):
+            raise BadInput(
+                f"{path}: column {name} holds times such as '{cell}', whose format is not known; write "
+                f'a mapping by hand, with time = {{ column = "{name}", unit = "date", format = ... }}, '
+                "as docs/your-log.md says"
+            )
     named = [column for column in columns if re.search("time|stamp|utc|^t$|^sec", column.plain)]
     first = [columns[0]] if columns else []
     for column in (*named, *first):
@@ -196,6 +220,50 @@ def _time(
         set(),
         ["# No column looks like a time: give the rate of the rows."],
     )
+
+
+def _first_cell(cells: pa.Array) -> str:
+    texts = pc.utf8_trim_whitespace(cells.cast(pa.string()))
+    return next((text for text in texts.to_pylist() if text), "")
+
+
+def _dated(batch: Batch, names: Sequence[str]) -> tuple[str, set[str], list[str]] | None:
+    """The time as TOML of columns of texts, these, and what was seen; None where they hold none."""
+    cell = " ".join(_first_cell(batch[name]) for name in names)
+    is_of_day = re.match(r"\d{1,2}:\d{2}", cell) is not None
+    given: dict[str, Any] = {"column": list(names), "unit": "date"}
+    told = ['# If its clock is not UTC: zone = "Europe/Berlin", or utc_offset_h = 8.']
+    if zone := _zone(names):
+        given["zone"], told = zone, []
+    if is_of_day:
+        given["zero"] = _UNKNOWN_ZERO
+        told.append("# These times have no date: give the day in zero.")
+    fitting = {}
+    for pattern in formats_of(cell):
+        mapping = TimeMapping.model_validate({**given, "format": pattern})
+        if seen := _seen(mapping, batch):
+            fitting[pattern] = seen
+    if not fitting:
+        return None
+    (pattern, seen), *others = fitting.items()
+    if others:
+        told.append(f"# Day and month may be exchanged: {others[0][0]} fits as well.")
+    if pattern != ISO:
+        given["format"] = pattern
+    given["column"] = names[0] if len(names) == 1 else list(names)
+    parts = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in given.items()]
+    return f"{{ {', '.join(parts)} }}", set(names), [*seen, *told]
+
+
+def _zone(names: Sequence[str]) -> str:
+    """The zone that a column's name states in brackets."""
+    for text in re.findall(r"[\[(]\s*([^\])]+?)\s*[\])]", " ".join(names)):
+        try:
+            offset_of(text)
+        except ValueError:
+            continue
+        return str(text)
+    return ""
 
 
 def _seen(mapping: TimeMapping, batch: Batch) -> list[str]:
@@ -233,7 +301,7 @@ def _rest(table: GuessedTable) -> list[str]:
         return []
     plain = [
         name if re.match("[a-z]", name) else f"column_{name}"
-        for name in (_underlined(column.name) for column in table.columns)
+        for name in (underlined(column.name) for column in table.columns)
     ]
     counts = Counter(plain)
     names = [name if counts[name] == 1 else f"{name}_{number}" for number, name in enumerate(plain, 1)]

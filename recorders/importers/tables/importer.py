@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 
 from recorders.errors import BadInput, some_of
-from recorders.importers.mapping import checked, mapped, schema_of
+from recorders.importers.mapping import Place, checked, mapped, schema_of
 from recorders.importers.tables.mapping import (
     ConstantStream,
     LogMapping,
+    Origin,
     adapted,
     find_files,
     read_mapping,
@@ -37,6 +38,8 @@ class TableParameters(Parameters):
         delays_s: how long before its stamp a topic's message was measured, in s, in place of what the
             mapping states; by topic.
         seed: seed of the noise that a mapping adds.
+        origin: latitude and longitude (deg) and perhaps height (m) of the plane's origin, in place of
+            that which the mapping states.
     """
 
     mapping: str = ""
@@ -44,6 +47,7 @@ class TableParameters(Parameters):
     mounting_deg: tuple[float, float, float] | None = None
     delays_s: dict[str, float] = {}
     seed: NonNegativeInt = 0
+    origin: Place | None = None
 
 
 def read(path: Path, parameters: TableParameters) -> Blocks:
@@ -63,6 +67,9 @@ def read(path: Path, parameters: TableParameters) -> Blocks:
             raise BadInput(f"{each}: no such file or folder; give the tables to import")
     found = Blocks(iter(()))
     mapping = adapted(read_mapping(parameters.mapping), parameters.mounting_deg, parameters.delays_s)
+    if parameters.origin is not None:
+        origin = Origin(**dict(zip(Origin.model_fields, parameters.origin, strict=False)))
+        mapping = mapping.model_copy(update={"origin": origin})
     found.blocks = _blocks(paths, mapping, np.random.default_rng(parameters.seed), found)
     return found
 
@@ -86,7 +93,8 @@ def _blocks(
     told.epoch_ns = min(firsts.values())
     _check_clocks({sources[number].path: first for number, first in firsts.items()}, mapping)
     origin = mapping.origin or next(filter(None, (source.first_fix() for source in sources)), None)
-    plane = None if origin is None else Plane(origin, mapping.projection)
+    is_stated = mapping.origin is not None
+    plane = None if origin is None else Plane(origin, mapping.projection, is_stated)
     yield [_constant(each, told.epoch_ns) for each in mapping.constants]
     # the file that is furthest behind comes next, so that the log is nearly in the order of time
     queue = [(first, number) for number, first in firsts.items()]

@@ -22,7 +22,14 @@ from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt, model_va
 
 from recorders.atomic import is_being_written
 from recorders.errors import BadInput, choices, some_of
-from recorders.importers.mapping import OneOrMore, Source, StreamMapping, schema_of
+from recorders.importers.mapping import (
+    Latitude,
+    Longitude,
+    OneOrMore,
+    Source,
+    StreamMapping,
+    schema_of,
+)
 from recorders.importers.tables.files import Format
 from recorders.importers.tables.patterns import fitted, names_in
 from recorders.importers.tables.times import TimeMapping
@@ -30,9 +37,6 @@ from recorders.parameters import Parameters, build
 from recorders.parsing import read_toml
 
 _SHIPPED = resources.files("fuselog_data") / "mappings"
-
-Latitude = Annotated[float, Field(ge=-90, le=90)]
-Longitude = Annotated[float, Field(ge=-180, le=180)]
 
 
 class Origin(Parameters):

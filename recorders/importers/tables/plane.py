@@ -15,10 +15,14 @@ Floats = NDArray[np.float64]
 
 
 class Plane(NamedTuple):
-    """East, north and up from an origin: tangent to the ellipsoid, or on the map of a projection."""
+    """East, north and up from an origin: tangent to the ellipsoid, or on the map of a projection.
+
+    Where the mapping states the origin, all positions of the log are in this plane.
+    """
 
     origin: Origin
     projection: str | None = None
+    is_stated: bool = False
 
     @property
     def metadata(self) -> dict[str, str]:

@@ -17,11 +17,10 @@ from recorders.importers.tables.plane import Plane
 from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping, read_counter, stamps_ns
 from recorders.importers.units import conversion
 from recorders.log import Stream, make_stream
+from recorders.log.planes import is_planar
 
 PLACE = ("east_m", "north_m", "up_m")
 QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
-# Messages whose vectors are in the axes of the plane.
-_IN_PLANE = {"PositionFix", "VelocityFix", "TruthState", "Pose"}
 
 ReadCounts = Counter[tuple[str, str]]
 
@@ -282,9 +281,9 @@ class Rows:
         metadata = own.metadata
         if own.delay_s:
             metadata["delay_s"] = repr(own.delay_s)
-        is_in_plane = self.mapping.geodetic is not None and own.becomes in _IN_PLANE
-        if plane is not None and (is_in_plane or own.becomes == "GeodeticFix"):
-            metadata |= plane.metadata
+        if plane is not None and is_planar(schema_of(own, where).full_name, metadata):
+            is_geodetic = self.mapping.geodetic is not None or own.becomes == "GeodeticFix"
+            metadata |= plane.metadata if plane.is_stated or is_geodetic else {}
         columns = {name: checked(where, name, column[rows]) for name, column in found.columns.items()}
         for name, sigma in own.noise.items():
             columns[name] = columns[name] + sigma * self._generator.normal(size=columns[name].shape)

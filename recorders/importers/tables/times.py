@@ -1,9 +1,11 @@
 """Stamps of tables: numbers since some zero, dates, GPS weeks, or none but a rate; exact to the ns."""
 
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 import pandas as pd
@@ -20,6 +22,19 @@ Stamps = NDArray[np.int64]
 _DIGITS = {"s": 9, "ms": 6, "us": 3, "ns": 0}
 _GPS_ZERO = "1980-01-06"
 _WEEK_NS = 7 * 86400 * 10**9
+ISO = "ISO8601"
+# Hours ahead of UTC of zones by their short names, as far as these mean one zone.
+ZONES = {
+    "UTC": 0.0, "GMT": 0.0, "WET": 0.0, "WEST": 1.0, "CET": 1.0, "MEZ": 1.0, "CEST": 2.0, "MESZ": 2.0,
+    "EET": 2.0, "EEST": 3.0, "EST": -5.0, "EDT": -4.0, "CDT": -5.0, "MST": -7.0, "MDT": -6.0,
+    "PST": -8.0, "PDT": -7.0, "JST": 9.0, "AEST": 10.0, "AEDT": 11.0,
+}  # fmt: skip
+# The name of a zone at the end of a cell.
+ZONED = r"\s+([A-Z]{2,5}|[A-Z]\w+/\w+)$"
+_WRITTEN = re.compile(
+    r"(?:(\d{1,4})([./-])(\d{1,2})\2(\d{1,4}))?(?:([ T,]*)"
+    r"(\d{1,2}:\d{2})(:\d{2})?(?:([.,])\d+)?( ?[AaPp][Mm])?)?"
+)
 # A stamp that is missing.
 NOT_A_TIME = np.iinfo(np.int64).min
 
@@ -34,7 +49,9 @@ class TimeMapping(Parameters):
         week: column of GPS weeks; `column` then has the seconds of the week.
         rate_hz: rows per second of files without stamps, from `zero` on.
         utc_offset_h: how far clocks of this place are ahead of UTC, for dates that do not say it.
-        format: format of dates that are not as ISO 8601 has them, in the letters of strptime.
+        zone: name of the zone of these clocks, such as Europe/Berlin, which knows summer time, or CET.
+        format: format of dates that are not as ISO 8601 has them, in the letters of strptime; of times
+            without a date, the day is that of `zero`.
         leap_seconds: leap seconds that are subtracted, in s; GPS time is otherwise kept as it is
             written.
         tag: suffix of a file beside each file that says when its counter started, and how fast it goes
@@ -47,7 +64,8 @@ class TimeMapping(Parameters):
     week: str | None = None
     rate_hz: PositiveFloat | None = None
     utc_offset_h: Annotated[float, Field(ge=-15, le=15)] = 0.0
-    format: str = "ISO8601"
+    zone: str | None = None
+    format: str = ISO
     leap_seconds: float = 0.0
     tag: str | None = None
 
@@ -57,6 +75,10 @@ class TimeMapping(Parameters):
             raise ValueError("give either `column`, which has the times, or `rate_hz`")
         if len(self.columns) > 1 + bool(self.week) and self.unit != "date":
             raise ValueError('several columns together are a date; give unit = "date", or one column')
+        if self.zone is not None:
+            offset_of(self.zone)
+            if self.utc_offset_h or self.unit != "date":
+                raise ValueError("`zone` is for dates, and in place of `utc_offset_h`; give one of them")
         try:
             _date_ns(self.zero)
         except ValueError:
@@ -76,6 +98,52 @@ class TimeMapping(Parameters):
         """Return what numbers count from, less leap seconds and the offset from UTC."""
         since = _date_ns(_GPS_ZERO if self.week else self.zero)
         return since - round((self.leap_seconds + 3600 * self.utc_offset_h) * 1e9)
+
+
+def offset_of(zone: str) -> float | ZoneInfo:
+    """How many hours a zone is ahead of UTC, or its rules where these are not always the same.
+
+    Raises ValueError where there is no such zone.
+    """
+    if zone in ZONES:
+        return ZONES[zone]
+    try:
+        return ZoneInfo(zone)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError(
+            f"no time zone '{zone}'; give one such as Europe/Berlin, or one of {', '.join(ZONES)}"
+        ) from None
+
+
+def formats_of(cell: str) -> Iterator[str]:
+    """The formats that a date or time of day as text may have, the likeliest first.
+
+    >>> list(formats_of("05.10.2026 14:03:07,25"))
+    ['%d.%m.%Y %H:%M:%S,%f']
+    """
+    found = _WRITTEN.fullmatch(cell) or _WRITTEN.fullmatch(re.sub(ZONED, "", cell))
+    if not (cell and found):
+        yield ISO
+        return
+    first, mark, _, third, between, clock, second_of, point, half = found.groups()
+    of_day = ""
+    if clock:
+        of_day = ("%I" if half else "%H") + ":%M" + ":%S" * bool(second_of)
+        of_day += f"{point}%f" * bool(point) + (" %p" if half and half[0] == " " else "%p" * bool(half))
+    if not first:
+        yield of_day
+        return
+    if len(first) == 4:
+        if mark == "-":
+            yield ISO
+        dates = [("%Y", "%m", "%d")]
+    else:
+        year = "%Y" if len(third) == 4 else "%y"
+        day_first, month_first = ("%d", "%m", year), ("%m", "%d", year)
+        is_day_first = mark == "." or int(first) > 12
+        dates = [day_first] if is_day_first else [month_first, day_first]
+    for parts in dates:
+        yield mark.join(parts) + (between or "") + of_day
 
 
 def _date_ns(text: str) -> int:
@@ -154,15 +222,41 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
         return _counted_ns(cells[0], 0, label)
     texts = [pc.utf8_trim_whitespace(each.cast(pa.string())) for each in cells]
     joined = pc.binary_join_element_wise(*texts, " ") if len(texts) > 1 else texts[0]
-    series = joined.to_pandas()
+    if mapping.format == ISO:  # pandas knows no fractions after a comma
+        joined = pc.replace_substring_regex(joined, r"(:\d\d),(\d)", r"\1.\2")
+    zones = pd.Series([mapping.zone or "UTC"]).repeat(len(joined)).to_numpy()
+    if "%p" not in mapping.format and pc.any(pc.match_substring_regex(joined, ZONED)).as_py():
+        named = joined.to_pandas().str.extract(ZONED, expand=False)
+        zones = named.fillna(mapping.zone or "UTC").to_numpy()
+        joined = pc.replace_substring_regex(joined, ZONED, "")
     try:
-        dates = pd.to_datetime(series, format=mapping.format, utc=True)
+        dates = pd.to_datetime(joined.to_pandas(), format=mapping.format, utc=True)
+        since_ns = _since_ns(dates.dt.tz_localize(None))
+        if mapping.format != ISO and not re.search("%[YyGcxs]", mapping.format):
+            since_ns[since_ns != NOT_A_TIME] -= _date_ns("1900-01-01")
+        for zone in pd.unique(zones):
+            rows = (zones == zone) & (since_ns != NOT_A_TIME)
+            since_ns[rows] = _from_zone(since_ns[rows], offset_of(zone))
     except ValueError as error:
         said = str(error).splitlines()[0]
         raise BadInput(
             f"{label} has cells that are not dates ({said}); give their `format`, or the unit of numbers"
         ) from None
-    return dates.dt.tz_localize(None).to_numpy().astype("datetime64[ns]").astype(np.int64)
+    return since_ns
+
+
+def _since_ns(dates: pd.Series) -> Stamps:
+    return dates.to_numpy().astype("datetime64[ns]").astype(np.int64)
+
+
+def _from_zone(local_ns: Stamps, zone: float | ZoneInfo) -> Stamps:
+    """Stamps (n,) by the clocks of a zone as UTC; an hour that comes twice is taken for its first."""
+    if not isinstance(zone, ZoneInfo):
+        return local_ns - round(3600e9 * zone)
+    local = pd.Series(local_ns.astype("datetime64[ns]"))
+    first = np.ones(len(local), bool)
+    placed = local.dt.tz_localize(zone, ambiguous=first, nonexistent="shift_forward")
+    return _since_ns(placed.dt.tz_convert("UTC").dt.tz_localize(None))
 
 
 class Counter(NamedTuple):

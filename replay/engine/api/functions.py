@@ -6,8 +6,8 @@ that has them, name the outputs, and tell of a run that failed while the others 
 """
 
 import copy
-from collections.abc import Callable, Collection, Mapping
-from functools import cache
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from functools import cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Schema, Topic, schemas
 from recorders.parameters import Parameters, ParametersType
-from replay.engine.api.inputs import Given, Messages, OneRun, generator_of, messages_of
+from replay.engine.api.inputs import Binding, Given, Messages, OneRun, generator_of, messages_of
 from replay.engine.api.outputs import Estimates, Outputs, Solved
 from replay.engine.compiling.compile import compile_over_runs, uncompiled_over_runs
 from replay.engine.renamed import renamed
@@ -29,6 +29,7 @@ from replay.engine.streams.measurements import Vectors
 from replay.engine.vectors.components import Components
 
 Generators = tuple[np.random.Generator | None, ...]
+Find = Callable[[str, Mapping[str, Topic], Any], Iterable[Binding]]
 
 
 @renamed(whole="static")
@@ -36,9 +37,12 @@ def recursive(
     summary: str,
     *,
     parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
-    streams: Mapping[str, Schema],
-    static: Mapping[str, Schema],
-    components: Components,
+    streams: Mapping[str, Schema] = MappingProxyType({}),
+    static: Mapping[str, Schema] = MappingProxyType({}),
+    find: Find | None = None,
+    requirements: str = "",
+    variant: str | None = None,
+    components: Components = MappingProxyType({}),
     truth: str = "",
     measured: Components | None = None,
     vectors: Mapping[str, Vectors] | None = None,
@@ -48,6 +52,7 @@ def recursive(
     start: Callable[[Given[ParametersType]], tuple[Any, Any]],
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
+    advance: Callable[[Any, Any, Block], tuple[Any, list[Ragged]]] | None = None,
     compiled: bool = True,
     allocates: bool = True,
 ) -> Estimator[ParametersType]:
@@ -59,6 +64,11 @@ def recursive(
         streams: the topics to follow, with their schemas; see `bindings` for their names.
         static: the topics that `start` needs from beginning to end, such as a map or a prior. Gaussian
             estimates among them are priors: of the estimate's components, see `Given.prior`.
+        find: in place of `streams` and `static`, where their names depend on the log or the parameters:
+            find(name, topics, parameters) gives a `Binding` for everything that can be estimated there;
+            none where the log does not fit. The name is the estimator's, for errors.
+        requirements: with `find`, what a log has to have, in words.
+        variant: the parameter that the rest of a name such as `shooter:bearings-only` sets.
         components: the estimate's components by name, with their kinds.
         truth: the topic with the truth of what is estimated.
         measured: the components of the innovations, where `follow` fills them.
@@ -75,6 +85,10 @@ def recursive(
             messages: it changes that run's rows of `state`, and fills `results`, in place.
         follow_all: in place of `follow`: follow_all(settings, messages, state, results) takes all runs
             at once, and is called as it is. For NumPy with an axis of runs, or a loop compiled already.
+        advance: in place of both, where the outputs are other than one Gaussian estimate:
+            advance(settings, state, block) -> the state after a block, and the output streams, whose
+            topics are /estimates/ + `Given.name` and more. There are no `components` then; the state is
+            of any type, and is not changed.
         compiled: whether `follow` is compiled; plain Python is a hundred times slower.
         allocates: whether `follow` makes arrays, see
             `replay.engine.compiling.compile.compile_over_runs`.
@@ -110,10 +124,8 @@ def recursive(
     >>> estimates["/estimates/nearest/state"]["mean"].ravel().tolist()
     [5.0, 3.0, 3.0]
     """
-    if (follow is None) == (follow_all is None):
-        raise BadInput(
-            f"estimator '{summary}': neither follow nor follow_all is given; give one of them"
-        )
+    if sum(each is not None for each in (follow, follow_all, advance)) != 1:
+        raise BadInput(f"estimator '{summary}': give one of follow, follow_all and advance")
     for leaf, schema in outputs.items():
         _require_numbers(summary, leaf, schema)
 
@@ -130,24 +142,34 @@ def recursive(
         else:
             loop()(len(generators), *arguments, per_run=generators if draws else None)
 
-    def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
+    def bind(name: str, bound: Binding, values: ParametersType) -> Bound:
+        found = {**bound.streams, **bound.static}
         made = Outputs(
-            name, f"/estimates/{name}", resolved(truth, prefix), components, measured or {}, outputs
+            name,
+            f"/estimates/{name}",
+            resolved(truth, bound.suffix),
+            components,
+            measured or {},
+            outputs,
         )
         wanted = {found[topic].name: each for topic, each in (vectors or {}).items() if topic in found}
         numbers = np.array([number for number, each in enumerate(streams) if each in found])
 
         def started(maps: Mapping[str, Ragged], runs: int) -> _Carried:
-            settings, state = start(Given(values, found, maps, runs))
+            settings, state = start(Given(values, found, maps, runs, name, bound.setup))
             return _Carried(settings, state, np.zeros(runs, bool), (None,) * runs)
 
         def begin(given: dict[str, Ragged]) -> _Carried | None:
-            maps = {each: given[found[each].name] for each in static if each in found}
+            maps = {each: given[topic.name] for each, topic in bound.static.items()}
             return started(maps, next(iter(maps.values())).runs) if maps else None
 
-        def advance(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
+        def run(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
             # without static topics, the first block is what tells how many runs there are
-            settings, before, told, generators = carried or started({}, len(block.events.offsets) - 1)
+            carried = carried or started({}, len(block.events.offsets) - 1)
+            settings, before, told, generators = carried
+            if advance is not None:
+                state, outcome = advance(settings, before, block)
+                return carried._replace(state=state), outcome
             state = type(before)(*(array.copy() for array in before))
             messages, skipped = messages_of(block, wanted, values)
             messages = messages._replace(topic=numbers[messages.topic])
@@ -160,10 +182,11 @@ def recursive(
             outcome = made.of_block(messages, results, np.flatnonzero(failing))
             return _Carried(settings, state, told, generators), [*outcome, *made.of_skipped(skipped)]
 
-        read, needed = _topics(found, streams), _topics(found, static)
-        return Recursive(name, read, needed, begin, advance, _priors(found, static, components))
+        return Recursive(name, *_topics(bound), begin, run, _priors(bound))
 
-    return _estimator(summary, parameters, {**streams, **static}, optional, bind)
+    where = find or partial(_named, streams, static, optional, components)
+    needs = requirements or _needs({**streams, **static}, optional)
+    return _estimator(summary, needs, parameters, variant, where, bind)
 
 
 def _require_numbers(summary: str, leaf: str, schema: Schema) -> None:
@@ -195,21 +218,26 @@ def batch(
     summary: str,
     *,
     parameters: type[ParametersType] = Parameters,  # type: ignore[assignment]
-    streams: Mapping[str, Schema],
-    static: Mapping[str, Schema],
-    components: Components,
+    streams: Mapping[str, Schema] = MappingProxyType({}),
+    static: Mapping[str, Schema] = MappingProxyType({}),
+    find: Find | None = None,
+    requirements: str = "",
+    variant: str | None = None,
+    components: Components = MappingProxyType({}),
     truth: str = "",
     measured: Components | None = None,
     optional: Collection[str] = (),
     outputs: Mapping[str, Schema] = MappingProxyType({}),
-    solve: Callable[[Given[ParametersType]], Solved],
+    solve: Callable[[Given[ParametersType]], Solved | list[Ragged]],
 ) -> Estimator[ParametersType]:
     """Make an estimator that solves whole streams.
 
     Args as for `recursive`, and:
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
         solve: solve(given) gets the streams and static topics of all runs, by the names asked for;
-            `each_run` makes it of a function of one run.
+            `each_run` makes it of a function of one run. Where the outputs are other than Gaussian
+            estimates there are no `components`, and it returns the output streams, whose topics are
+            /estimates/ + `Given.name` and more.
 
     The mean of all ranges:
 
@@ -235,20 +263,28 @@ def batch(
     [[4.0]]
     """
 
-    def bind(name: str, prefix: str, found: Mapping[str, Topic], values: ParametersType) -> Bound:
+    def bind(name: str, bound: Binding, values: ParametersType) -> Bound:
+        found = {**bound.streams, **bound.static}
         made = Outputs(
-            name, f"/estimates/{name}", resolved(truth, prefix), components, measured or {}, outputs
+            name,
+            f"/estimates/{name}",
+            resolved(truth, bound.suffix),
+            components,
+            measured or {},
+            outputs,
         )
 
         def solve_all(given: dict[str, Ragged]) -> list[Ragged]:
             streams_of = {each: given[topic.name] for each, topic in found.items()}
             runs = next(iter(streams_of.values())).runs
-            return made.of_solved(solve(Given(values, found, streams_of, runs)), runs)
+            solved = solve(Given(values, found, streams_of, runs, name, bound.setup))
+            return made.of_solved(solved, runs) if isinstance(solved, Solved) else solved
 
-        read, needed = _topics(found, streams), _topics(found, static)
-        return Batch(name, read, needed, solve_all, _priors(found, static, components))
+        return Batch(name, *_topics(bound), solve_all, _priors(bound))
 
-    return _estimator(summary, parameters, {**streams, **static}, optional, bind)
+    where = find or partial(_named, streams, static, optional, components)
+    needs = requirements or _needs({**streams, **static}, optional)
+    return _estimator(summary, needs, parameters, variant, where, bind)
 
 
 def each_run(
@@ -281,38 +317,54 @@ def each_run(
     return solve_all
 
 
-def _priors(
-    found: Mapping[str, Topic], static: Mapping[str, Schema], components: Components
-) -> dict[str, Components]:
-    return {
-        found[name].name: components
-        for name, schema in static.items()
-        if schema is schemas.GAUSSIAN_ESTIMATE and name in found
-    }
+def _named(
+    streams: Mapping[str, Schema],
+    static: Mapping[str, Schema],
+    optional: Collection[str],
+    components: Components,
+    _name: str,
+    topics: Mapping[str, Topic],
+    _values: Parameters,
+) -> Iterator[Binding]:
+    """Find topics by their names, under every prefix that has them."""
+    for prefix, found in bindings(topics, {**streams, **static}, optional):
+        followed, needed = (
+            {name: found[name] for name in names if name in found} for names in (streams, static)
+        )
+        priors = [name for name in needed if static[name] is schemas.GAUSSIAN_ESTIMATE]
+        yield Binding(followed, needed, prefix, dict.fromkeys(priors, components))
 
 
-def _topics(found: Mapping[str, Topic], names: Mapping[str, Schema]) -> tuple[str, ...]:
-    return tuple(found[name].name for name in names if name in found)
+def _needs(asked: Mapping[str, Schema], optional: Collection[str]) -> str:
+    return ", ".join(
+        f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
+        for name, schema in asked.items()
+    )
+
+
+def _topics(bound: Binding) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    streams, static = (
+        tuple(topic.name for topic in each.values()) for each in (bound.streams, bound.static)
+    )
+    return streams, static
+
+
+def _priors(bound: Binding) -> dict[str, Components]:
+    return {bound.static[name].name: components for name, components in bound.priors.items()}
 
 
 def _estimator(
     summary: str,
+    requirements: str,
     parameters: type[ParametersType],
-    asked: Mapping[str, Schema],
-    optional: Collection[str],
-    bind_one: Callable[[str, str, Mapping[str, Topic], ParametersType], Bound],
+    variant: str | None,
+    find: Find,
+    bind_one: Callable[[str, Binding, ParametersType], Bound],
 ) -> Estimator[ParametersType]:
     def bind(label: str, topics: Mapping[str, Topic], values: ParametersType) -> list[Bound]:
-        return [
-            bind_one(f"{label}{prefix}", prefix, found, values)
-            for prefix, found in bindings(topics, asked, optional)
-        ]
+        return [bind_one(f"{label}{each.suffix}", each, values) for each in find(label, topics, values)]
 
-    requirements = [
-        f"{resolved(name, '...')} ({schema.full_name}{', optional' if name in optional else ''})"
-        for name, schema in asked.items()
-    ]
-    return Estimator(summary, ", ".join(requirements), parameters, bind)
+    return Estimator(summary, requirements, parameters, bind, variant)
 
 
 class _Carried(NamedTuple):

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple
 
 import numpy as np
@@ -15,9 +16,27 @@ from replay.engine.streams.blocks import Block, Ragged, ragged_rows
 from replay.engine.streams.channels import given_or_stated
 from replay.engine.streams.measurements import Vectors, numbers_of
 from replay.engine.streams.priors import gaussians
+from replay.engine.vectors.components import Components
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+
+
+class Binding(NamedTuple):
+    """Says what one estimator is bound to, where a log may have several.
+
+    Attributes:
+        streams, static: the topics by the names under which its functions know them, see `recursive`.
+        suffix: what its name ends with, such as `/robot1`.
+        priors: the components wanted of the static topics that are Gaussian priors, by the same names.
+        setup: what else its functions get, as `Given.setup`.
+    """
+
+    streams: Mapping[str, Topic]
+    static: Mapping[str, Topic] = MappingProxyType({})
+    suffix: str = ""
+    priors: Mapping[str, Components] = MappingProxyType({})
+    setup: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,12 +45,22 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
 
     It maps the static topics to their streams: of a recursion what it starts from, of a batch
     all. A topic that is optional and that the log lacks is not in it.
+
+    Attributes:
+        parameters: the estimator's.
+        topics: all that it is bound to.
+        static: see above.
+        runs: how many.
+        name: the estimator's, with the suffix of its binding.
+        setup: see `Binding`.
     """
 
     parameters: ParametersType
     topics: Mapping[str, Topic]
     static: Mapping[str, Ragged]
     runs: int
+    name: str = ""
+    setup: Any = None
 
     def stated(self, topic: str, name: str) -> float:
         """Return the parameter `name`, or where it is None the number that the topic's channel states.

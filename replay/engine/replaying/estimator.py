@@ -74,6 +74,9 @@ class Recursive:
             where its parameters do not let it.
         initialization: how it finds what a log does not state; None where that states all.
         assumed: the parameters that are assumed, since the log does not state them.
+        is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
+            parameters.
+        offers: by topic that it does not take, the setting with which it would.
     """
 
     name: str
@@ -88,6 +91,8 @@ class Recursive:
     out_of_sequence: "Callable[[int], Recursive] | None" = None
     initialization: Initialization | None = None
     assumed: Mapping[str, float] = field(default_factory=dict)
+    is_random: bool = False
+    offers: Mapping[str, str] = field(default_factory=dict)
 
 
 @renamed(whole="static")
@@ -117,7 +122,8 @@ class Estimator(Generic[ParametersType]):
 
     `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
     for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
-    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets. `label` is what it is called
+    where it is given without one.
     """
 
     summary: str
@@ -125,9 +131,14 @@ class Estimator(Generic[ParametersType]):
     parameters: type[ParametersType]
     bind: Callable[[str, Mapping[str, Topic], ParametersType], list[Bound]]
     variant: str | None = None
+    label: str = "own"
 
     def __str__(self) -> str:
         return self.summary
+
+    def specified(self, label: str, settings: Mapping[str, Any]) -> "Estimator[Any]":  # noqa: ARG002
+        """The estimator that settings make of it: another where they name a foreign filter."""
+        return self
 
     # one of any model has these by what the name says: `_OfAnyModel`
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:  # noqa: ARG002
@@ -179,10 +190,19 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
             f"estimator '{label}': a label may have letters, digits and '-', '_', ':', '=' alone; "
             "choose another"
         )
+    estimator, values = specified(label, settings)
+    return estimator, build(estimator.parameters, values, f"estimator {label}")
+
+
+def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], dict[str, Any]]:
+    """Return the estimator of a label and the values of its parameters, which are not checked yet.
+
+    Raises BadInput where the name is unknown, or a foreign filter may not be run or does not answer.
+    """
     values = dict(settings)
     kind = values.pop("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
-    return estimator, build(estimator.parameters, {**values, **variant}, f"estimator {label}")
+    return estimator.specified(label, values), {**values, **variant}
 
 
 @contextmanager

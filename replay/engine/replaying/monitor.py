@@ -8,6 +8,7 @@ time that the estimator took.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial, reduce
 from math import isqrt
 from typing import TypeVar
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Clock, make_stream, schemas
+from recorders.log.planes import Origin, in_plane
 from replay.engine.replaying.coverage import Coverage
 from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
 from replay.engine.replaying.usage import Usage
@@ -47,6 +49,7 @@ class RunMonitor:
         usage: what became of its measurements; None where that is not counted.
         static: the streams that it begins with.
         refused: what all runs of a part of an ensemble raised.
+        plane: the origin of the plane that its estimates are in, where the runs state one.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class RunMonitor:
             self.usage = Usage(name)
             self.usage.note_start(static)
         self.refused: BadInput | None = None
+        self.plane: Origin | None = None
         self.name = name
         self.runs = runs
         self._order: Clock = order
@@ -124,7 +128,10 @@ class RunMonitor:
             if schema == FAILURE:
                 self._told.setdefault(topic, []).append(each)
                 continue
-            passed.append(each)
+            if schema == GAUSSIAN:
+                passed.append(replace(each, stream=in_plane(each.stream, self.plane)))
+            else:
+                passed.append(each)
             self._speaks = True
             if schema in ESTIMATES:
                 case = topic.rpartition("/")[0]

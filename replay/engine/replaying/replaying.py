@@ -13,6 +13,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock
+from recorders.log.planes import Origin, common_origin
 from replay.engine.replaying.estimator import Batch, Bound, Initialized, Recursive, code_of
 from replay.engine.replaying.late import Late, taking_late
 from replay.engine.replaying.monitor import RunMonitor
@@ -101,11 +102,13 @@ def replay(
         )
         for bound, static in zip(estimators, statics, strict=True)
     ]
+    plane = ensemble.findings.once("plane", partial(_plane_of, ensemble[0]))
     starts = [
         _kept_start(ensemble, bound, static, order, stamps)
         for bound, static in zip(estimators, statics, strict=True)
     ]
     for monitor, start in zip(monitors, starts, strict=True):
+        monitor.plane = plane
         monitor.exclude(start.unable)
     refused = _refused(estimators, starts)
     if refused and not is_part:
@@ -141,6 +144,10 @@ def replay(
             report.coverage += monitor.coverage()
             if monitor.usage is not None:
                 report.usages[monitor.name] = monitor.usage
+
+
+def _plane_of(source: Source) -> Origin | None:
+    return common_origin({name: topic.metadata for name, topic in source.topics.items()})
 
 
 class _Start(NamedTuple):

@@ -19,7 +19,10 @@ from replay.engine.streams.failures import sentences_of
 # What drives a motion is no measurement, and has no innovation.
 CONTROLS = {schemas.ODOMETRY.full_name, schemas.INERTIAL_SAMPLE.full_name}
 INNOVATION, SKIPPED = schemas.INNOVATION.full_name, schemas.SKIPPED.full_name
+UNTAKEN = "the estimator does not take this topic"
+SILENT = "they gave no innovation"
 LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
+PRIOR = schemas.GAUSSIAN_ESTIMATE.full_name
 
 
 class Row(NamedTuple):
@@ -71,6 +74,7 @@ class Usage:
         speaks: whether it gives innovations.
         doubtful: a sentence on a topic that it begins with.
         shares: the innovations by topic.
+        begins_ns: (runs,) the stamps of the priors; None where there are none.
     """
 
     name: str
@@ -83,10 +87,15 @@ class Usage:
     speaks: bool = False
     doubtful: dict[str, str] = field(default_factory=dict)
     shares: Attribution = field(default_factory=Attribution)
+    begins_ns: np.ndarray | None = None
 
     def note_start(self, static: Mapping[str, Ragged]) -> None:
         """Look at the streams that the estimator begins with."""
         for topic, ragged in static.items():
+            if ragged.stream.schema.full_name == PRIOR:
+                there = np.diff(ragged.offsets) > 0
+                self.begins_ns = np.zeros(ragged.runs, np.int64)
+                self.begins_ns[there] = ragged.stream.publish_time_ns[ragged.offsets[:-1][there]]
             if ragged.stream.schema.full_name == LANDMARK:
                 self.given[topic] += len(ragged)
                 for run in range(ragged.runs):
@@ -121,6 +130,9 @@ class Usage:
                 continue
             self.measured.add(topic)
             facts = self.facts.setdefault(topic, Counter())
+            if self.begins_ns is not None:
+                begins_ns = np.repeat(self.begins_ns, np.diff(ragged.offsets))
+                facts["come before the prior"] += int((stream.times(order) < begins_ns).sum())
             facts["are infinite"] += int(_infinite(stream).sum())
             facts["repeat the message before"] += int(_repeated(stream).sum())
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
@@ -182,7 +194,7 @@ class Usage:
             if self.speaks and len(group) < len(topics):
                 row = row._replace(used=self.shares.used[group[0]], gated=self.shares.gated[group[0]])
             if row.unused > 0 and not facts and not told:
-                told = ["they gave no innovation"]
+                told = [SILENT]
             yield row._replace(why="; ".join([*told, *facts]))
 
     @property

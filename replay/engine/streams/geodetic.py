@@ -11,17 +11,13 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Stream, Topic, schemas
+from recorders.log.planes import ALTITUDE, LATITUDE, LONGITUDE
 from recorders.models.geodesy import into_tangent_plane, tangent_axes
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.channels import stated
 
 Floats = NDArray[np.float64]
 GEODETIC = schemas.GEODETIC_FIX.full_name
-LATITUDE, LONGITUDE, ALTITUDE = ORIGIN = (
-    "origin_latitude_deg",
-    "origin_longitude_deg",
-    "origin_altitude_m",
-)
 
 
 def stated_origin(topics: Mapping[str, Topic]) -> Floats | None:

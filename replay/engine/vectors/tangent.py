@@ -6,8 +6,8 @@ frame, an angle or a rotation vector, as are the covariances of estimates. Kurz,
 Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, sections 5.3 and 7.
 """
 
-from collections.abc import Iterator, Sequence
-from typing import Literal
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from recorders.models.orientation import compose, conjugate
 from recorders.models.planar import wrap_angle
 
 Floats = NDArray[np.float64]
+Number = TypeVar("Number")
 Kind = Literal["linear", "angle", "axis", "quaternion"]
 # How many components a thing of a kind has.
 WIDTHS: dict[str, int] = {"linear": 1, "angle": 1, "axis": 2, "quaternion": 4}
@@ -48,7 +49,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
     """Return names and kinds of the errors' components: `heading_w`, ... become `heading_x_rad`, ...
 
     A linear component or angle keeps its name; an axis has one "angle", a quaternion three components
-    of kind "rotation".
+    of kind "rotation". Of names without a stem, as `qw, qx, qy, qz`, these are `rotation_x_rad`, ...
 
     Args:
         components: names.
@@ -57,12 +58,40 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
     found: list[tuple[str, str]] = []
     for kind, columns in manifold_blocks(kinds):
         name = components[columns.start]
-        stem = name.rpartition("_")[0] or name
+        stem = name.rpartition("_")[0] or _common(components[columns])
+        if (f"{stem}_x_rad", "rotation") in found or (f"{stem}_rad", "angle") in found:
+            stem = name  # of several that have no stem
         if kind == "quaternion":
             found += [(f"{stem}_{axis}_rad", "rotation") for axis in "xyz"]
         else:
             found.append((f"{stem}_rad", "angle") if kind == "axis" else (name, kind))
     return found
+
+
+def _common(names: Sequence[str]) -> str:
+    """What the names of a vector's components begin with, of more than a letter; else `rotation`."""
+    stem = names[0]
+    while not all(name.startswith(stem) for name in names):
+        stem = stem[:-1]
+    return stem if len(stem) > 1 else "rotation"
+
+
+def named_now(
+    given: Mapping[str, Number], components: Sequence[str], kinds: Sequence[str]
+) -> dict[str, Number]:
+    """What is given by errors' components, whose names may be those of the release before.
+
+    >>> named_now({"qw_x_rad": 0.1}, ("qw", "qx", "qy", "qz"), ("quaternion",) * 4)
+    {'rotation_x_rad': 0.1}
+    """
+    names, before = [name for name, _ in tangent_components(components, kinds)], list[str]()
+    for kind, columns in manifold_blocks(kinds):
+        name = components[columns.start]
+        stem = name.rpartition("_")[0] or name
+        own = {"quaternion": [f"{stem}_{axis}_rad" for axis in "xyz"], "axis": [f"{stem}_rad"]}
+        before += own.get(kind, [name])
+    renamed = {old: new for old, new in zip(before, names, strict=True) if old not in names}
+    return {renamed.get(name, name): number for name, number in given.items()}
 
 
 def difference(estimate: Floats, truth: Floats, kinds: Sequence[str]) -> Floats:

@@ -5,7 +5,7 @@ JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), a case e
 `/estimates/NAME/CASE/fused`, and learns from other users than those that it judges.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -19,8 +19,9 @@ from recorders.extras import extra
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.models.scores import TOPIC, Comparisons, Matcher, comparisons_of, matchers_of
 from recorders.parameters import Parameters
+from replay.engine.api.functions import batch
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Booleans, Floats
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged, gather
 from replay.estimators.biometrics.mixture_hmm import Fit, fit, log_likelihood
 from replay.estimators.biometrics.pairs import (
@@ -217,35 +218,27 @@ def learn_mixture(
     return ratio
 
 
-def _bind_rule(name: str, topics: Mapping[str, Topic], parameters: RuleParameters) -> list[Bound]:
-    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
-        values = normalise(compared.scores[:, :, chosen], parameters.normalisation)
-        fused = RULES[parameters.rule](values, axis=2)
-        return fused_stream(compared, all_pairs(len(fused)), fused.ravel(), {})
-
-    return _bind(name, topics, parameters, fuse)
+def _by_rule(parameters: RuleParameters, compared: Comparisons, case: str, chosen: list[int]) -> Stream:
+    values = normalise(compared.scores[:, :, chosen], parameters.normalisation)
+    fused = RULES[parameters.rule](values, axis=2)
+    return fused_stream(compared, all_pairs(len(fused)), fused.ravel(), {})
 
 
-def _bind_classifier(
-    name: str, topics: Mapping[str, Topic], parameters: ClassifierParameters
-) -> list[Bound]:
+def _by_classifier(
+    parameters: ClassifierParameters, compared: Comparisons, case: str, chosen: list[int]
+) -> Stream:
     is_ratio = parameters.calibrated or parameters.classifier in LIKELIHOOD_RATIOS
-
-    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
-        return _learnt(compared, chosen, parameters, partial(learn_classifier, parameters), is_ratio)
-
-    return _bind(name, topics, parameters, fuse)
+    return _learnt(compared, chosen, parameters, partial(learn_classifier, parameters), is_ratio)
 
 
-def _bind_mixture(name: str, topics: Mapping[str, Topic], parameters: MixtureParameters) -> list[Bound]:
-    def fuse(compared: Comparisons, case: str, chosen: list[int]) -> Stream:
-        sequence = _sequence(compared.matchers, chosen, parameters)
-        both = parameters.components_of.get(case)
-        components = (both or parameters.genuine_components, both or parameters.impostor_components)
-        learner = partial(learn_mixture, parameters, components, sequence)
-        return _learnt(compared, chosen, parameters, learner, True)
-
-    return _bind(name, topics, parameters, fuse, parameters.components_of)
+def _by_mixture(
+    parameters: MixtureParameters, compared: Comparisons, case: str, chosen: list[int]
+) -> Stream:
+    sequence = _sequence(compared.matchers, chosen, parameters)
+    both = parameters.components_of.get(case)
+    components = (both or parameters.genuine_components, both or parameters.impostor_components)
+    learner = partial(learn_mixture, parameters, components, sequence)
+    return _learnt(compared, chosen, parameters, learner, True)
 
 
 def _sequence(
@@ -322,63 +315,52 @@ def fused_stream(
     )
 
 
-def _bind(
-    name: str,
-    topics: Mapping[str, Topic],
-    parameters: Subsets,
-    fuse: Callable[[Comparisons, str, list[int]], Stream],
-    named: Collection[str] = (),
-) -> list[Bound]:
-    """A batch estimator of all chosen subsets; none where the log has no scores to fuse.
-
-    `named` are subsets that other parameters speak of.
-    """
+def _find(name: str, topics: Mapping[str, Topic], parameters: Subsets) -> Iterator[Binding]:
+    """Find the scores, and which matchers are fused, by case; none where there is nothing to fuse."""
     if TOPIC not in topics or topics[TOPIC].schema_name != schemas.SCORE_VECTOR.full_name:
-        return []
+        return
     subsets = subsets_of(matchers_of(topics[TOPIC].metadata))
-    for case in (*parameters.subsets, *named):
+    for case in (*parameters.subsets, *getattr(parameters, "components_of", ())):
         if case not in subsets:
             raise BadInput(f"estimator {name}: no subset '{case}' of matchers; {choices(case, subsets)}")
     cases = parameters.subsets or [case for case, chosen in subsets.items() if len(chosen) > 1]
-    if not cases:
-        return []
-
-    def solve(streams: dict[str, Ragged]) -> list[Ragged]:
-        runs = [streams[TOPIC].of_run(run) for run in range(streams[TOPIC].runs)]
-        compared = [comparisons_of(run) for run in runs]
-        users = {len(each.scores) for each in compared}
-        if len(users) > 1:
-            raise BadInput(
-                f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay each on its "
-                "own"
-            )
-        return [
-            gather(
-                [
-                    replace(fuse(each, case, subsets[case]), topic=f"/estimates/{name}/{case}/fused")
-                    for each in compared
-                ]
-            )
-            for case in cases
-        ]
-
-    return [Batch(name, (TOPIC,), (), solve)]
+    if cases:
+        yield Binding({TOPIC: topics[TOPIC]}, setup={case: subsets[case] for case in cases})
 
 
-RULE = Estimator(
-    "normalise scores and combine them by a rule", NEEDS, RuleParameters, _bind_rule, "rule"
+def _solve(fuse: Callable[..., Stream], given: Given[Any]) -> list[Ragged]:
+    """Fuse all chosen subsets."""
+    compared = [comparisons_of(given[TOPIC].of_run(run)) for run in range(given.runs)]
+    users = {len(each.scores) for each in compared}
+    if len(users) > 1:
+        raise BadInput(
+            f"topic {TOPIC}: the logs have {min(users)} to {max(users)} users; replay each on its own"
+        )
+
+    def fused(case: str, chosen: list[int]) -> Ragged:
+        topic = f"/estimates/{given.name}/{case}/fused"
+        found = (fuse(given.parameters, each, case, chosen) for each in compared)
+        return gather([replace(each, topic=topic) for each in found])
+
+    return [fused(case, chosen) for case, chosen in given.setup.items()]
+
+
+_fusing = partial(batch, find=_find, requirements=NEEDS)
+RULE = _fusing(
+    "normalise scores and combine them by a rule",
+    parameters=RuleParameters,
+    variant="rule",
+    solve=partial(_solve, _by_rule),
 )
-CLASSIFIER = Estimator(
+CLASSIFIER = _fusing(
     "classify score vectors, cross-validated by user",
-    NEEDS,
-    ClassifierParameters,
-    _bind_classifier,
-    "classifier",
+    parameters=ClassifierParameters,
+    variant="classifier",
+    solve=partial(_solve, _by_classifier),
 )
-MIXTURE = Estimator(
+MIXTURE = _fusing(
     "likelihood ratio of HMMs with Gaussian mixtures, cross-validated by user",
-    NEEDS,
-    MixtureParameters,
-    _bind_mixture,
-    "topology",
+    parameters=MixtureParameters,
+    variant="topology",
+    solve=partial(_solve, _by_mixture),
 )

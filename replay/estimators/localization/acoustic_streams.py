@@ -1,7 +1,6 @@
 """Estimator `shooter:MODE`: where the shots of a log came from, shot by shot (Osborne et al. 2014)."""
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -9,8 +8,9 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.acoustic import Medium, Noise
 from recorders.parameters import Parameters
+from replay.engine.api.functions import batch
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Floats
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.channels import numbered
 from replay.engine.streams.measurements import PLANE, read_vectors
@@ -42,13 +42,14 @@ class ShooterParameters(Parameters):
 HEARD = ("muzzle_blast_azimuth_rad", "shockwave_azimuth_rad", "time_difference_s")
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> list[Bound]:
+def _find(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters) -> Iterator[Binding]:
+    """Find the sensors, and what they state of the world."""
     sensors = list(numbered(topics, "sensor", "detections", schemas.SHOT_DETECTION))
     streams = [f"/sensor{s}/detections" for s in sensors]
     static = [f"/sensor{s}/position" for s in sensors]
     if not sensors or not set(static) <= set(topics):
-        return []
-    worlds = {_world(topics[f"/sensor{s}/detections"]) for s in sensors}
+        return
+    worlds = {_world(topics[each]) for each in streams}
     if len(worlds) > 1:
         raise BadInput(
             f"estimator {name}: the sensors state different noise or air temperature; give all the same"
@@ -57,7 +58,8 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: ShooterParameters)
     setting = Setting(
         parameters.mode, noise, medium, parameters.estimate_sensors, parameters.cross_covariances
     )
-    return [Batch(name, tuple(streams), tuple(static), partial(_solve, name, sensors, setting))]
+    followed, fixed = ({each: topics[each] for each in names} for names in (streams, static))
+    yield Binding(followed, fixed, setup=(sensors, setting))
 
 
 def _world(topic: Topic) -> tuple[Noise, Medium]:
@@ -67,15 +69,15 @@ def _world(topic: Topic) -> tuple[Noise, Medium]:
     )
 
 
-def _solve(name: str, sensors: list[int], setting: Setting, streams: dict[str, Ragged]) -> list[Ragged]:
+def _solve(given: Given[ShooterParameters]) -> list[Ragged]:
+    sensors, setting = given.setup
     batches, heard = gather_detections(
-        [streams[f"/sensor{s}/detections"] for s in sensors],
-        [streams[f"/sensor{s}/position"] for s in sensors],
+        [given[f"/sensor{s}/detections"] for s in sensors],
+        [given[f"/sensor{s}/position"] for s in sensors],
     )
     components = parameter_names(setting, sensors)
-    return solution_streams(
-        f"/estimates/{name}/shooter", "/shooter/truth", components, batches, estimate(setting, heard)
-    )
+    topic, found = f"/estimates/{given.name}/shooter", estimate(setting, heard)
+    return solution_streams(topic, "/shooter/truth", components, batches, found)
 
 
 def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tuple[Batches, Detections]:
@@ -103,10 +105,11 @@ def _latest(positions: Ragged, batches: Batches) -> Floats:
     return fixes[latest]
 
 
-SHOOTER = Estimator(
+SHOOTER = batch(
     "where a shot came from; MODE: bearings-only, local-estimates or native-measurements",
-    "per sensor N /sensorN/detections and /sensorN/position",
-    ShooterParameters,
-    _bind,
+    parameters=ShooterParameters,
+    find=_find,
+    requirements="per sensor N /sensorN/detections and /sensorN/position",
+    solve=_solve,
     variant="mode",
 )

@@ -5,9 +5,9 @@ next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2
 biases, and scheme 3 `los-biases`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,9 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.models.optical import ANGLES
 from recorders.parameters import Parameters
+from replay.engine.api.functions import batch
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Floats
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.channels import numbered
 from replay.engine.streams.measurements import check_width
@@ -66,27 +67,19 @@ def gather_sightings(streams: list[Ragged]) -> Sightings:
     return Sightings(batches, targets.tolist(), measured)
 
 
-def _bind(
-    name: str, topics: Mapping[str, Topic], parameters: PositionsParameters | BiasesParameters
-) -> list[Bound]:
+def _find(
+    _: str, topics: Mapping[str, Topic], parameters: PositionsParameters | BiasesParameters
+) -> Iterator[Binding]:
+    """Find the sensors, the noise of their angles and the biases that are known."""
     sensors = list(numbered(topics, "sensor", "line_of_sight", schemas.LINE_OF_SIGHT))
     streams = [f"/sensor{s}/line_of_sight" for s in sensors]
     static = [f"/sensor{s}/{leaf}" for s in sensors for leaf in ("position", "attitude")]
     if not sensors or not set(static) <= set(topics):
-        return []
-    sigma = [
-        [
-            positive(topics[f"/sensor{s}/line_of_sight"], f"sigma_{angle}_rad")
-            for angle in ("azimuth", "elevation")
-        ]
-        for s in sensors
-    ]
-    known = known_biases(sensors, parameters)
-    return [
-        Batch(
-            name, tuple(streams), tuple(static), partial(_solve, name, sensors, np.array(sigma), known)
-        )
-    ]
+        return
+    angles = [f"sigma_{angle}_rad" for angle in ("azimuth", "elevation")]
+    sigma_rad = np.array([[positive(topics[each], angle) for angle in angles] for each in streams])
+    followed, fixed = ({each: topics[each] for each in names} for names in (streams, static))
+    yield Binding(followed, fixed, setup=(sensors, sigma_rad, known_biases(sensors, parameters)))
 
 
 def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
@@ -101,20 +94,18 @@ def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
     return np.radians(known).reshape(-1, 3)
 
 
-def _solve(
-    name: str, sensors: list[int], sigma_rad: Floats, known_rad: Floats, streams: dict[str, Ragged]
-) -> list[Ragged]:
-    position = [_constant(streams[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
-    turned = [_constant(streams[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
+def _solve(given: Given[Any]) -> list[Ragged]:
+    sensors, sigma_rad, known_rad = given.setup
+    position = [_constant(given[f"/sensor{s}/position"], "position_m", 3) for s in sensors]
+    turned = [_constant(given[f"/sensor{s}/attitude"], "quaternion", 4) for s in sensors]
     from scipy.spatial.transform import Rotation  # which takes long to import
 
     nominal = Rotation.from_quat(turned, scalar_first=True).inv().as_euler("ZYX")
     scene = Scene(np.array(position), nominal, sigma_rad, known_rad)
-    seen = gather_sightings([streams[f"/sensor{s}/line_of_sight"] for s in sensors])
+    seen = gather_sightings([given[f"/sensor{s}/line_of_sight"] for s in sensors])
     components = parameter_names(scene, seen.targets, sensors)
-    return solution_streams(
-        f"/estimates/{name}", "/truth", components, seen.batches, estimate(scene, seen.measured)
-    )
+    topic, found = f"/estimates/{given.name}", estimate(scene, seen.measured)
+    return solution_streams(topic, "/truth", components, seen.batches, found)
 
 
 def _constant(ragged: Ragged, field: str, width: int) -> Floats:
@@ -129,15 +120,11 @@ def _constant(ragged: Ragged, field: str, width: int) -> Floats:
     return values[0]
 
 
-LOS_POSITIONS = Estimator(
+_solving = partial(batch, find=_find, requirements=NEEDS, solve=_solve)
+LOS_POSITIONS = _solving(
     "target positions from lines of sight, biases taken as zero: schemes 1 and 2",
-    NEEDS,
-    PositionsParameters,
-    _bind,
+    parameters=PositionsParameters,
 )
-LOS_BIASES = Estimator(
-    "target positions and attitude biases from lines of sight: scheme 3",
-    NEEDS,
-    BiasesParameters,
-    _bind,
+LOS_BIASES = _solving(
+    "target positions and attitude biases from lines of sight: scheme 3", parameters=BiasesParameters
 )

@@ -8,7 +8,7 @@ could.
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from typing import Annotated, Literal, NamedTuple
 
@@ -20,9 +20,10 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.parameters import Parameters
 from replay.distributions import chi2
+from replay.engine.api.functions import recursive
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Booleans, Floats, Function
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import given_or_stated, numbered
 from replay.engine.streams.failures import Failure
@@ -32,16 +33,19 @@ from replay.estimators.models.landmarks import LANDMARKS, POSE
 from replay.estimators.networks.covariance_intersection import Criterion
 from replay.estimators.networks.encounters import (
     RobotEvents,
+    RobotInputs,
     RobotMemory,
     RobotResults,
     RobotSettings,
     RobotStates,
     SightingFusion,
     cooperate,
+    write_pose,
 )
 from replay.inference.kalman.steps import FAILURES
 from replay.inference.linear_algebra.small_matrices import update_memory
 from replay.inference.run.events import Points, points_of
+from replay.inference.run.loops import over_events
 
 Mode = Literal["alone", "naive", "ci", "joint"]
 
@@ -109,16 +113,20 @@ def memory(states: int) -> RobotMemory:
 
 @cache
 def _compiled() -> Function:
-    return compile_over_runs(cooperate, allocates=False)
+    return compile_over_runs(over_events(cooperate, write_pose), allocates=False)
 
 
-def begin(static: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> CooperativeState:
+Cooperating = Given[CooperativeParameters]
+
+
+def start(given: Cooperating) -> tuple[Cooperating, CooperativeState]:
     """All robots at their priors, and the maps.
 
     A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
     that is so for all, or the map is not planar.
     """
-    priors = [_prior(static[f"{prefix}/prior"]) for prefix in prefixes]
+    prefixes, _ = given.setup
+    priors = [_prior(given[f"{prefix}/prior"]) for prefix in prefixes]
     reasons = np.stack([each.reasons for each in priors], axis=1)
     if (reasons != "").all():
         raise BadInput(f"{reasons[0, 0]}; the filter cannot start")
@@ -133,7 +141,8 @@ def begin(static: Mapping[str, Ragged], prefixes: tuple[str, ...]) -> Cooperativ
         np.stack([each.time_ns for each in priors], axis=1),
         np.full(runs, ALL_WELL),
     )
-    return CooperativeState(robots, points_of(static["/landmarks"], LANDMARKS), reasons, reasons == "")
+    points = points_of(given["/landmarks"], LANDMARKS)
+    return given, CooperativeState(robots, points, reasons, reasons == "")
 
 
 def _prior(prior: Ragged) -> Priors:
@@ -143,24 +152,19 @@ def _prior(prior: Ragged) -> Priors:
         return no_priors(prior.runs, POSE, str(error))
 
 
-def run(
-    state: CooperativeState,
-    block: Block,
-    *,
-    name: str,
-    prefixes: tuple[str, ...],
-    mode: Mode,
-    criterion: Criterion,
-    settings: RobotSettings,
+def advance(
+    given: Cooperating, state: CooperativeState, block: Block
 ) -> tuple[CooperativeState, list[Ragged]]:
-    """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
+    """Filter a block; see `replay.engine.api.functions.recursive`."""
+    (prefixes, settings), mode = given.setup, given.parameters.mode
     robots = copy.deepcopy(state.robots)
     events = _events(block, state, prefixes, mode, settings)
-    count, topic = len(events.time_ns), f"/estimates/{name}"
+    count, topic = len(events.time_ns), f"/estimates/{given.name}"
     results = RobotResults(np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan))
-    fusion = SightingFusion(mode == "joint", mode == "ci", criterion == "trace")
+    fusion = SightingFusion(mode == "joint", mode == "ci", given.parameters.criterion == "trace")
     scratch = partial(memory, robots.mean.shape[1])
-    _compiled()(len(robots.mean), events, settings, fusion, robots, results, scratch=scratch)
+    inputs = RobotInputs(events, settings, fusion)
+    _compiled()(given.runs, inputs, robots, results, scratch=scratch)
     is_estimated = np.isfinite(results.mean[:, 0])
     made = [
         states_in(
@@ -236,11 +240,13 @@ def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
     return tuple(f"/robot{number}" for number in found[0] if all(number in each for each in found))
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters) -> list[Bound]:
+def _find(
+    name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters
+) -> Iterator[Binding]:
     """One filter for all robots; raises BadInput where an anchor is not among them."""
     prefixes = _robots(topics)
     if len(prefixes) < 2 or "/landmarks" not in topics:
-        return []
+        return
     numbers = [_number(prefix) for prefix in prefixes]
     for anchor in parameters.anchors:
         if anchor not in numbers:
@@ -262,28 +268,19 @@ def _bind(name: str, topics: Mapping[str, Topic], parameters: CooperativeParamet
         np.isin(numbers, parameters.anchors),
         np.array([np.inf, *chi2.ppf(parameters.gate_probability, [1, 2])]),
     )
-    return [
-        Recursive(
-            name,
-            tuple(f"{prefix}/{leaf}" for prefix in prefixes for leaf in ("odometry", "range_bearing")),
-            (*(f"{prefix}/prior" for prefix in prefixes), "/landmarks"),
-            partial(begin, prefixes=prefixes),
-            partial(
-                run,
-                name=name,
-                prefixes=prefixes,
-                mode=parameters.mode,
-                criterion=parameters.criterion,
-                settings=settings,
-            ),
-        )
-    ]
+    leaves = [(prefix, leaf) for prefix in prefixes for leaf in ("odometry", "range_bearing")]
+    streams = [f"{prefix}/{leaf}" for prefix, leaf in leaves]
+    static = [*(f"{prefix}/prior" for prefix in prefixes), "/landmarks"]
+    followed, fixed = ({each: topics[each] for each in names} for names in (streams, static))
+    yield Binding(followed, fixed, setup=(prefixes, settings))
 
 
-COOPERATIVE = Estimator(
+COOPERATIVE = recursive(
     "robots that share position estimates when they see each other: alone, naive, ci, joint",
-    "/landmarks and, for two robots or more, .../odometry, .../range_bearing and .../prior",
-    CooperativeParameters,
-    _bind,
+    parameters=CooperativeParameters,
+    find=_find,
+    requirements="/landmarks and, for two robots or more, .../odometry, .../range_bearing and .../prior",
+    start=start,
+    advance=advance,
     variant="mode",
 )

@@ -16,7 +16,15 @@ from numpy.typing import ArrayLike
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Function
 from replay.engine.compiling.compile import compile_over_runs
-from replay.estimators.networks.estimates import Estimate, blend, determinant, inverted, transform
+from replay.estimators.networks.estimates import (
+    Estimate,
+    Fused,
+    blend,
+    determinant,
+    inverted,
+    one_of,
+    transform,
+)
 from replay.estimators.networks.pairwise import fuse_in_turn
 
 Criterion = Literal["trace", "determinant"]
@@ -26,7 +34,7 @@ RULES = ("ci-trace", "ci-determinant", "niehsen", "franken", "naive", "inverse-c
 CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(len(RULES))
 
 
-class Fused(NamedTuple):
+class Fusions(NamedTuple):
     """Mean (..., n), covariance (..., n, n), the weights (..., K) and their certificate `gap` (...,).
 
     By the conditions of Karush, Kuhn and Tucker no weights better the criterion (the trace's logarithm,
@@ -182,12 +190,7 @@ def weigh_fully(count: int, weights: Floats) -> None:
 
 
 def weigh(
-    rule: int,
-    count: int,
-    covariances: Floats,
-    memory: FusionMemory,
-    weights: Floats,
-    tolerance: float,
+    rule: int, count: int, covariances: Floats, memory: FusionMemory, weights: Floats, tolerance: float
 ) -> float:
     """Fill the weights of a rule that adds up weighted informations; returns their certificate."""
     if rule in (CI_TRACE, CI_DETERMINANT):
@@ -203,17 +206,10 @@ def weigh(
 
 
 def fuse_together(
-    rule: int,
-    count: int,
-    parts: Estimate,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-    tolerance: float,
-    memory: FusionMemory,
+    rule: int, count: int, parts: Estimate, fused: Fused, tolerance: float, memory: FusionMemory
 ) -> float:
     """Add up weighted informations."""
-    information = memory.information
+    information, (mean, covariance, weights) = memory.information, fused
     for i in range(count):
         if not inverted(parts.covariance[i], information[i]):
             return np.inf
@@ -231,14 +227,7 @@ def rule_number(name: str) -> int:
 
 
 def fuse_by(
-    rule: int,
-    count: int,
-    parts: Estimate,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-    tolerance: float,
-    memory: FusionMemory,
+    rule: int, count: int, parts: Estimate, fused: Fused, tolerance: float, memory: FusionMemory
 ) -> float:
     """Fuse the first `count` estimates by the rule of a number; returns the certificate.
 
@@ -246,25 +235,17 @@ def fuse_by(
     single weight's error.
     """
     if rule in (INVERSE_CI, SPLIT_CI):
-        is_split = rule == SPLIT_CI
-        return fuse_in_turn(is_split, count, parts, weights, mean, covariance, tolerance)
-    return fuse_together(rule, count, parts, weights, mean, covariance, tolerance, memory)
+        return fuse_in_turn(rule == SPLIT_CI, count, parts, fused, tolerance)
+    return fuse_together(rule, count, parts, fused, tolerance, memory)
 
 
 def fuse_run(
-    run: int,
-    rule: int,
-    tolerance: float,
-    means: Floats,
-    covariances: Floats,
-    independents: Floats,
-    fused: Fused,
-    memory: FusionMemory,
+    run: int, rule: int, tolerance: float, given: Estimate, fusions: Fusions, memory: FusionMemory
 ) -> None:
     """Fuse the estimates of one run."""
-    parts = Estimate(means[run], covariances[run], independents[run])
-    mean, covariance, weights = fused.mean[run], fused.covariance[run], fused.weights[run]
-    fused.gap[run] = fuse_by(rule, means.shape[1], parts, weights, mean, covariance, tolerance, memory)
+    into = Fused(fusions.mean[run], fusions.covariance[run], fusions.weights[run])
+    count, parts = given.mean.shape[1], one_of(given, run)
+    fusions.gap[run] = fuse_by(rule, count, parts, into, tolerance, memory)
 
 
 @cache
@@ -278,7 +259,7 @@ def fuse(
     covariances: ArrayLike,
     independents: ArrayLike | None = None,
     tolerance: float = 1e-9,
-) -> Fused:
+) -> Fusions:
     """Fuse K estimates of one state, batch axes first.
 
     Args:
@@ -317,16 +298,18 @@ def fuse(
         raise BadInput("an independent part exceeds its covariance; give at most the covariance")
     batch, (count, size) = mean.shape[:-2], mean.shape[-2:]
     runs = int(np.prod(batch))
-    fused = Fused(
+    fused = Fusions(
         np.empty((runs, size)), np.empty((runs, size, size)), np.empty((runs, count)), np.empty(runs)
     )
     _fuse_runs()(
         runs,
         rule_number(name),
         tolerance,
-        mean.reshape(runs, count, size),
-        covariance.reshape(runs, count, size, size),
-        known.reshape(runs, count, size, size),
+        Estimate(
+            mean.reshape(runs, count, size),
+            covariance.reshape(runs, count, size, size),
+            known.reshape(runs, count, size, size),
+        ),
         fused,
         scratch=partial(fusion_memory, count, size),
     )
@@ -339,4 +322,4 @@ def fuse(
         raise BadInput(
             f"the weights did not converge: the certificate is {fused.gap.max():.1e}, not {tolerance}"
         )
-    return Fused(*(part.reshape(batch + part.shape[1:]) for part in fused))
+    return Fusions(*(part.reshape(batch + part.shape[1:]) for part in fused))

@@ -10,7 +10,7 @@ from replay.engine.streams.results import ALL_WELL
 from replay.estimators.models.landmarks import POSE, sight
 from replay.estimators.networks.estimates import blend
 from replay.estimators.networks.pairwise import Stake, sighting_weight
-from replay.inference.kalman.steps import NOT_FINITE, NOT_POSITIVE_DEFINITE
+from replay.inference.kalman.steps import NOT_FINITE, NOT_POSITIVE_DEFINITE, UNKNOWN
 from replay.inference.linear_algebra.gaussian import add_through, copy_gaussian, wrap
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.small_matrices import UpdateMemory, update
@@ -66,6 +66,14 @@ class RobotEvents(NamedTuple):
     place: Floats
     value: Floats
     is_due: Booleans
+
+
+class RobotInputs(NamedTuple):
+    """Holds what the robots go by."""
+
+    events: RobotEvents
+    settings: RobotSettings
+    fusion: SightingFusion
 
 
 class RobotResults(NamedTuple):
@@ -243,48 +251,56 @@ def meet(
 
 def cooperate(
     run: int,
-    events: RobotEvents,
-    settings: RobotSettings,
-    fusion: SightingFusion,
+    event: int,
+    inputs: RobotInputs,
     carried: RobotStates,
     results: RobotResults,
     work: RobotMemory,
-) -> None:
-    """Move the robots of one run through its events, until these end or an update fails."""
+) -> int:
+    """Move the robots of an event to its time, and use it unless it is from before the robot's own."""
+    events, settings, fusion = inputs
     mean, covariance = carried.mean[run], carried.covariance[run]
     difference = np.empty(2)
-    for event in range(events.offsets[run], events.offsets[run + 1]):
-        robots, now = events.robots[event], events.time_ns[event]
-        robot, seen = robots[0], robots[1]
-        if carried.failure[run] != ALL_WELL or now < carried.time_ns[run, robot]:
-            continue
-        for side in range(2):
-            if robots[side] >= 0:
-                density = settings.density[robots[side]]
-                advance(carried, run, robots[side], now, density, work)
-        if events.is_sighting[event]:
-            place = (events.place[event, 0], events.place[event, 1])
-            if seen >= 0:
-                place = (mean[3 * seen], mean[3 * seen + 1])
-            look(mean, robot, place, events.value[event], difference, work)
-            measured, variance = 0, settings.variance[robot]
-            for k in range(2):
-                measured += not np.isnan(difference[k])
-            gate = settings.gate[measured]
-            if measured > 0 and not meet(
-                mean, covariance, robots, difference, variance, gate, fusion, work
-            ):
-                carried.failure[run] = NOT_POSITIVE_DEFINITE
-                continue
-        else:
-            for k in range(2):
-                carried.velocity[run, robot, k] = events.value[event, k]
-        total = 0.0
-        for row in range(len(mean)):
-            total += mean[row]
-        if not np.isfinite(total):
-            carried.failure[run] = NOT_FINITE
-        elif events.is_due[event]:
-            first, end = 3 * robot, 3 * robot + 3
-            found = results.mean[event], results.covariance[event]
-            copy_gaussian(mean[first:end], covariance[first:end, first:end], found[0], found[1])
+    robots, now = events.robots[event], events.time_ns[event]
+    robot, seen = robots[0], robots[1]
+    if now < carried.time_ns[run, robot]:
+        return UNKNOWN
+    for side in range(2):
+        if robots[side] >= 0:
+            density = settings.density[robots[side]]
+            advance(carried, run, robots[side], now, density, work)
+    if events.is_sighting[event]:
+        place = (events.place[event, 0], events.place[event, 1])
+        if seen >= 0:
+            place = (mean[3 * seen], mean[3 * seen + 1])
+        look(mean, robot, place, events.value[event], difference, work)
+        measured, variance = 0, settings.variance[robot]
+        for k in range(2):
+            measured += not np.isnan(difference[k])
+        gate = settings.gate[measured]
+        if measured > 0 and not meet(mean, covariance, robots, difference, variance, gate, fusion, work):
+            return NOT_POSITIVE_DEFINITE
+    else:
+        for k in range(2):
+            carried.velocity[run, robot, k] = events.value[event, k]
+    total = 0.0
+    for row in range(len(mean)):
+        total += mean[row]
+    return ALL_WELL if np.isfinite(total) else NOT_FINITE
+
+
+def write_pose(
+    run: int,
+    event: int,
+    inputs: RobotInputs,
+    carried: RobotStates,
+    results: RobotResults,
+    work: RobotMemory,
+) -> int:
+    """Fill in the pose of the robot that an event is of, where it is wanted."""
+    if inputs.events.is_due[event]:
+        first = 3 * inputs.events.robots[event, 0]
+        mean, covariance = carried.mean[run], carried.covariance[run]
+        own = covariance[first : first + 3, first : first + 3]
+        copy_gaussian(mean[first : first + 3], own, results.mean[event], results.covariance[event])
+    return ALL_WELL

@@ -23,6 +23,14 @@ class Estimate(NamedTuple):
     independent: Floats
 
 
+class Fused(NamedTuple):
+    """Holds where a fusion fills in its mean (n,), covariance (n, n) and weights (K,)."""
+
+    mean: Floats
+    covariance: Floats
+    weights: Floats
+
+
 def inverted(matrix: Floats, inverse: Floats) -> bool:
     """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular."""
     size = len(matrix)

@@ -6,10 +6,10 @@ measurement again. The log says which message was sent when and where it arrived
 replay's output, so that one run is replayed with any rule. The state is (positions, velocities).
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -18,21 +18,22 @@ from recorders.errors import BadInput
 from recorders.log import Topic, schemas
 from recorders.parameters import Parameters
 from replay.distributions import chi2
+from replay.engine.api.functions import batch
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.channels import numbered
-from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL, failures_of, states_in
 from replay.engine.vectors.components import components_of
 from replay.estimators.networks.covariance_intersection import rule_number
 from replay.estimators.networks.nodes import (
     Activities,
     NodeFusion,
+    NodeInputs,
     NodeResults,
     Sensing,
-    follow,
+    following,
     node_memory,
 )
 
@@ -82,7 +83,7 @@ class NetworkParameters(Parameters):
 
 @cache
 def _compiled() -> Function:
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(following(), allocates=False)
 
 
 def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> NodeFusion:
@@ -112,22 +113,16 @@ def message_bytes(name: str, states: int) -> int:
     return 8 * doubles
 
 
-def solve(
-    whole: Mapping[str, Ragged],
-    *,
-    name: str,
-    sensors: Mapping[int, Topic],
-    components: Sequence[str],
-    parameters: NetworkParameters,
-) -> list[Ragged]:
-    """Replay the network, see the module; `sensors` are the topics by node.
+def solve(given: Given[NetworkParameters]) -> list[Ragged]:
+    """Replay the network, see the module.
 
     Raises BadInput where a link or the liar names an unknown node, or a message arrives before it was
     sent.
     """
-    prior_ns, prior_mean, prior_covariance = gaussians(whole["/prior"])
+    (sensors, components), parameters = given.setup, given.parameters
+    prior_ns, prior_mean, prior_covariance = given.prior("/prior")
     runs, size = prior_mean.shape
-    activities, sensing, arrived = _schedule(whole, sensors, components, prior_ns, parameters.rule)
+    activities, sensing, arrived = _schedule(given, sensors, components, prior_ns, parameters.rule)
     count = len(activities.node)
     blank = np.full((count, size), np.nan)
     square = np.full((count, size, size), np.nan)
@@ -144,21 +139,21 @@ def solve(
     most = 1 + int(np.diff(activities.received).max(initial=0))
     _compiled()(
         runs,
-        activities,
-        sensing,
-        prior_mean,
-        prior_covariance,
-        prior_ns,
-        _fusion(parameters, sensors, size),
-        results,
+        NodeInputs(
+            activities,
+            sensing,
+            _fusion(parameters, sensors, size),
+            prior_ns,
+            prior_mean,
+            prior_covariance,
+        ),
         failed_ns,
+        results,
         scratch=partial(node_memory, len(sensing.density), most, size),
     )
     well = np.full_like(failed_ns, ALL_WELL)
-    outputs = [
-        failures_of(f"/estimates/{name}", well, np.where(failed_ns < 0, well, 0), failed_ns, FAILURES)
-    ]
-    topic, kinds = f"/estimates/{name}", components_of(components)
+    topic, kinds = f"/estimates/{given.name}", components_of(components)
+    outputs = [failures_of(topic, well, np.where(failed_ns < 0, well, 0), failed_ns, FAILURES)]
     places = [f"node{number}" for number in sensors] if parameters.rule != CENTRALISED else ["centre"]
     done = np.isfinite(results.mean[:, 0])
     stamps = activities.time_ns, activities.offsets
@@ -171,7 +166,7 @@ def solve(
             rows, where = np.flatnonzero(chosen), f"{topic}/{place}/{leaf}"
             outputs.append(states_in(rows, where, *stamps, kinds, truth, mean, covariance))
     if parameters.gate_probability < 1.0:
-        links, rows = whole["/links"], np.sort(arrived[results.refused])
+        links, rows = given["/links"], np.sort(arrived[results.refused])
         refused = replace(links.stream.take(rows), topic=f"{topic}/refused")
         outputs.append(Ragged(refused, np.searchsorted(rows, links.offsets)))
     return outputs
@@ -294,14 +289,15 @@ def _sensing(
     return Sensing(np.concatenate(values), np.concatenate(index), variance, density)
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> list[Bound]:
+def _find(_: str, topics: Mapping[str, Topic], parameters: NetworkParameters) -> Iterator[Binding]:
     sensors = numbered(topics, "node", "sensor", schemas.VECTOR_MEASUREMENT)
     if not sensors or "/links" not in topics or "/prior" not in topics:
-        return []
+        return
     components = state_of(topics["/prior"])
-    read = ("/links", *(topic.name for topic in sensors.values()))
-    work: Any = partial(solve, name=name, sensors=sensors, components=components, parameters=parameters)
-    return [Batch(name, read, ("/prior",), work, {"/prior": components_of(components)})]
+    streams = {each: topics[each] for each in ("/links", *(topic.name for topic in sensors.values()))}
+    priors = {"/prior": components_of(components)}
+    static = {"/prior": topics["/prior"]}
+    yield Binding(streams, static, priors=priors, setup=(sensors, components))
 
 
 def state_of(prior: Topic) -> list[str]:
@@ -320,10 +316,11 @@ def state_of(prior: Topic) -> list[str]:
     return components
 
 
-NETWORK = Estimator(
+NETWORK = batch(
     "nodes that track one target and fuse the estimates they send each other, by any fusion rule",
-    "/prior, /links and, per node, /nodeN/sensor",
-    NetworkParameters,
-    _bind,
+    parameters=NetworkParameters,
+    find=_find,
+    requirements="/prior, /links and, per node, /nodeN/sensor",
+    solve=solve,
     variant="rule",
 )

@@ -5,10 +5,18 @@ from typing import NamedTuple
 import numpy as np
 
 from recorders.models.constant_velocity import noise_moments
-from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.arrays import Booleans, Floats, Function, Integers
 from replay.estimators.networks.covariance_intersection import FusionMemory, fuse_by, fusion_memory
-from replay.estimators.networks.estimates import Estimate, blend, determinant, inverted, one_of
+from replay.estimators.networks.estimates import (
+    Estimate,
+    Fused,
+    blend,
+    determinant,
+    inverted,
+    one_of,
+)
 from replay.inference.linear_algebra.gaussian import copy_gaussian, predict_constant_velocity
+from replay.inference.run.loops import over_stamps
 
 
 class Activities(NamedTuple):
@@ -58,6 +66,23 @@ class NodeFusion(NamedTuple):
     faulty_node: int
     fault_m: float
     fault_after_ns: int
+
+
+class NodeInputs(NamedTuple):
+    """Holds what the nodes go by, all runs; the prior's stamp, mean and covariance are of every run.
+
+    Attributes:
+        events: the activities.
+        sensing, fusion: what nodes measure, and how they fuse.
+        prior_ns, prior_mean, prior_covariance: (runs,), (runs, n), (runs, n, n).
+    """
+
+    events: Activities
+    sensing: Sensing
+    fusion: NodeFusion
+    prior_ns: Integers
+    prior_mean: Floats
+    prior_covariance: Floats
 
 
 class Nodes(NamedTuple):
@@ -160,14 +185,10 @@ def observe(
 
 
 def observe_all(
-    activity: int,
-    mean: Floats,
-    covariance: Floats,
-    independent: Floats,
-    activities: Activities,
-    sensing: Sensing,
+    activity: int, mean: Floats, covariance: Floats, independent: Floats, inputs: NodeInputs
 ) -> None:
     """Update with all that a node measures in an activity, see `observe`."""
+    activities, sensing = inputs.events, inputs.sensing
     for k in range(activities.measured[activity], activities.measured[activity + 1]):
         variance = sensing.variance[sensing.sensor[k]]
         observe(mean, covariance, independent, sensing.value[k], variance)
@@ -213,59 +234,60 @@ def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) ->
     return squared_distance(difference, most) <= gate
 
 
-def follow(
-    run: int,
-    activities: Activities,
-    sensing: Sensing,
-    prior_mean: Floats,
-    prior_covariance: Floats,
-    prior_ns: Integers,
-    fusion: NodeFusion,
-    results: NodeResults,
-    failed_ns: Integers,
-    work: NodeMemory,
-) -> None:
-    """Move the nodes of one run through their activities, until these end or a fusion fails.
+def following() -> Function:
+    """Make the loop over the activities of one run, until these end or a fusion fails.
 
-    At every time all nodes send first, and then take in what they hear.
+    Returns `follow(run, inputs, failed_ns, results, work)`, which fills in when the run failed.
     """
-    nodes, parts, weights, memory = work
-    nodes.time_ns[:], nodes.last_ns[:] = prior_ns[run], -1
-    for node in range(len(nodes.mean)):
-        copy_gaussian(prior_mean[run], prior_covariance[run], nodes.mean[node], nodes.covariance[node])
-    begin, last = activities.offsets[run], activities.offsets[run + 1]
-    while begin < last:
-        now = activities.time_ns[begin]
-        end = begin
-        while end < last and activities.time_ns[end] == now:
-            predict_and_send(end, prior_ns[run], activities, sensing, fusion, nodes, results)
-            end += 1
-        for activity in range(begin, end):
-            node = activities.node[activity]
-            mean, covariance = nodes.mean[node], nodes.covariance[node]
-            received = receive(activity, activities, sensing, fusion, nodes, parts, results)
-            if received > 1:
-                rule, tolerance = fusion.rule, fusion.tolerance
-                gap = fuse_by(rule, received, parts, weights, mean, covariance, tolerance, memory)
-                if not gap < np.inf:
-                    failed_ns[run] = now
-                    return
-            # the independent part is of no use any more
-            observe_all(activity, mean, covariance, parts.independent[0], activities, sensing)
-            copy_gaussian(mean, covariance, results.mean[activity], results.covariance[activity])
-        begin = end
+    go_through = over_stamps(act)
+
+    def follow(
+        run: int, inputs: NodeInputs, failed_ns: Integers, results: NodeResults, work: NodeMemory
+    ) -> None:
+        nodes = work.nodes
+        nodes.time_ns[:], nodes.last_ns[:] = inputs.prior_ns[run], -1
+        mean, covariance = inputs.prior_mean[run], inputs.prior_covariance[run]
+        for node in range(len(nodes.mean)):
+            copy_gaussian(mean, covariance, nodes.mean[node], nodes.covariance[node])
+        go_through(run, inputs, failed_ns, results, work)
+
+    return follow
+
+
+def act(
+    run: int,
+    begin: int,
+    end: int,
+    inputs: NodeInputs,
+    failed_ns: Integers,
+    results: NodeResults,
+    work: NodeMemory,
+) -> bool:
+    """Take all nodes through a time: they send first, and then take in what they hear."""
+    activities, fusion, (nodes, parts, weights, memory) = inputs.events, inputs.fusion, work
+    for activity in range(begin, end):
+        predict_and_send(activity, inputs.prior_ns[run], inputs, nodes, results)
+    for activity in range(begin, end):
+        node = activities.node[activity]
+        mean, covariance = nodes.mean[node], nodes.covariance[node]
+        received = receive(activity, inputs, nodes, parts, results)
+        if received > 1:
+            into = Fused(mean, covariance, weights)
+            gap = fuse_by(fusion.rule, received, parts, into, fusion.tolerance, memory)
+            if not gap < np.inf:
+                failed_ns[run] = activities.time_ns[begin]
+                return False
+        # the independent part is of no use any more
+        observe_all(activity, mean, covariance, parts.independent[0], inputs)
+        copy_gaussian(mean, covariance, results.mean[activity], results.covariance[activity])
+    return True
 
 
 def predict_and_send(
-    activity: int,
-    start_ns: int,
-    activities: Activities,
-    sensing: Sensing,
-    fusion: NodeFusion,
-    nodes: Nodes,
-    results: NodeResults,
+    activity: int, start_ns: int, inputs: NodeInputs, nodes: Nodes, results: NodeResults
 ) -> None:
     """Predict a node to now, update x* with its own measurements, and send that where it is due."""
+    activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now = activities.node[activity], activities.time_ns[activity]
     if now > nodes.time_ns[node]:
         span_s = (now - nodes.time_ns[node]) * 1e-9
@@ -274,10 +296,10 @@ def predict_and_send(
     mean, covariance = results.sent_mean[activity], results.sent_covariance[activity]
     copy_gaussian(nodes.mean[node], nodes.covariance[node], mean, covariance)
     independent = results.sent_independent[activity]
-    observe_all(activity, mean, covariance, independent, activities, sensing)
+    observe_all(activity, mean, covariance, independent, inputs)
     if not activities.may_send[activity]:
         return
-    if is_due(node, now, mean, covariance, sensing, fusion, nodes):
+    if is_due(node, now, mean, covariance, inputs, nodes):
         results.sent[activity], nodes.last_ns[node] = True, now
         copy_gaussian(mean, covariance, nodes.last_mean[node], nodes.last_covariance[node])
     if node == fusion.faulty_node and now - start_ns >= fusion.fault_after_ns:
@@ -285,15 +307,10 @@ def predict_and_send(
 
 
 def is_due(
-    node: int,
-    now: int,
-    mean: Floats,
-    covariance: Floats,
-    sensing: Sensing,
-    fusion: NodeFusion,
-    nodes: Nodes,
+    node: int, now: int, mean: Floats, covariance: Floats, inputs: NodeInputs, nodes: Nodes
 ) -> bool:
     """Tell whether x* may be sent again, and differs enough from what the last message says of now."""
+    sensing, fusion = inputs.sensing, inputs.fusion
     if nodes.last_ns[node] < 0:
         return True
     if now - nodes.last_ns[node] < fusion.interval_ns:
@@ -307,15 +324,10 @@ def is_due(
 
 
 def receive(
-    activity: int,
-    activities: Activities,
-    sensing: Sensing,
-    fusion: NodeFusion,
-    nodes: Nodes,
-    parts: Estimate,
-    results: NodeResults,
+    activity: int, inputs: NodeInputs, nodes: Nodes, parts: Estimate, results: NodeResults
 ) -> int:
     """Fill in what a node fuses, its own estimate first and all as of now; returns how many."""
+    activities, sensing, fusion = inputs.events, inputs.sensing, inputs.fusion
     node, now, size = activities.node[activity], activities.time_ns[activity], nodes.mean.shape[1]
     first, end = activities.received[activity], activities.received[activity + 1]
     count = 0

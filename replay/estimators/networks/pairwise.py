@@ -7,6 +7,7 @@ import numpy as np
 from replay.engine.arrays import Floats
 from replay.estimators.networks.estimates import (
     Estimate,
+    Fused,
     blend,
     determinant,
     golden,
@@ -132,17 +133,10 @@ def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -
     return weight if np.isfinite(value) else np.nan
 
 
-def fuse_in_turn(
-    is_split: bool,
-    count: int,
-    parts: Estimate,
-    weights: Floats,
-    mean: Floats,
-    covariance: Floats,
-    tolerance: float,
-) -> float:
+def fuse_in_turn(is_split: bool, count: int, parts: Estimate, into: Fused, tolerance: float) -> float:
     """Fuse one estimate after another, each at the weight of the least trace."""
-    size, steps = len(mean), steps_for(tolerance)
+    (mean, covariance, weights), steps = into, steps_for(tolerance)
+    size = len(mean)
     pair = Estimate(np.empty((2, size)), np.empty((2, size, size)), np.empty((2, size, size)))
     fused = Estimate(mean, covariance, np.empty((size, size)))
     weights[0] = 1.0

@@ -12,23 +12,24 @@ if only one of them is wrong; the union is the estimate until later frames have 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
 from recorders.extras import AtFirstUse
 from recorders.log import Stream, Topic, make_stream, schemas
+from replay.engine.api.functions import batch
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Floats, Integers
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.channels import given_or_stated
 from replay.engine.streams.failures import reason_stream
 from replay.estimators.sets.set_membership import (
     SetParameters,
+    bearings_in,
     fault_stream,
     known_of,
     polygons,
@@ -48,7 +49,6 @@ from replay.regions.frames import (
     Bearings,
     Bounds,
     Frame,
-    Known,
     frames_with_bearings,
 )
 from replay.regions.moving_sets import (
@@ -260,33 +260,24 @@ def _area(parts: Sequence[shapely.Geometry]) -> float:
     return float(shapely.union_all(parts).area)
 
 
-def solve(
-    whole: Mapping[str, Ragged],
-    *,
-    name: str,
-    topic: str,
-    odometry: str,
-    truth: str,
-    known: Known,
-    bounds: Bounds,
-    parameters: SetFilterParameters,
-) -> list[Ragged]:
-    """A set at every frame of every run; see `replay.engine.replaying.estimator.Batch`."""
+def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
+    """A set at every frame of every run; see `replay.engine.api.functions.batch`."""
+    known, bounds = given.setup
+    stated = map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad))
     metadata = {
-        **set_metadata(topic, truth, known),
-        "odometry": odometry,
-        **dict(
-            zip(STATED, map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad)), strict=True)
-        ),
+        **set_metadata(given.topics["seen"].name, known),
+        "odometry": given.topics["odometry"].name,
+        **dict(zip(STATED, stated, strict=True)),
     }
     solved = []
-    for run in range(whole[topic].runs):
-        seen, driven = whole[topic].of_run(run), whole[odometry].of_run(run)
+    for run in range(given.runs):
+        seen, driven = given["seen"].of_run(run), given["odometry"].of_run(run)
         velocity = np.stack([driven["forward_mps"], driven["turn_radps"]], axis=1)
-        found = list(frames_with_bearings(seen, whole["/landmarks"].of_run(run), known))
-        steps = follow(found, odometry_of(driven.publish_time_ns, velocity), bounds, parameters)
+        found = list(frames_with_bearings(seen, given["/landmarks"].of_run(run), known))
+        odometry = odometry_of(driven.publish_time_ns, velocity)
+        steps = follow(found, odometry, bounds, given.parameters)
         frame_at = {frame.time_ns: frame for frame, _ in found}
-        solved.append(_streams(f"/estimates/{name}", metadata, steps, frame_at))
+        solved.append(_streams(f"/estimates/{given.name}", metadata, steps, frame_at))
     return [gather(streams) for streams in zip(*solved, strict=True)]
 
 
@@ -321,38 +312,25 @@ def _streams(
     )
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: SetFilterParameters) -> list[Bound]:
-    bound: list[Bound] = []
-    if "/landmarks" not in topics:
-        return bound
-    for prefix in dict.fromkeys(topic.rpartition("/")[0] for topic in topics):
-        leaf = next((leaf for leaf in LEAVES if f"{prefix}/{leaf}" in topics), None)
-        if leaf is None or f"{prefix}/odometry" not in topics:
+def _find(_: str, topics: Mapping[str, Topic], parameters: SetFilterParameters) -> Iterator[Binding]:
+    for prefix, topic in bearings_in(topics, LEAVES):
+        if f"{prefix}/odometry" not in topics:
             continue
-        topic, odometry = topics[f"{prefix}/{leaf}"], topics[f"{prefix}/odometry"]
+        odometry, landmarks, bearing_rad = topics[f"{prefix}/odometry"], topics["/landmarks"], np.pi
         stated = [given_or_stated(parameters, [odometry], error) for error in ERRORS]
-        if leaf == "relative_bearing":
-            bearing_rad = np.pi
-        else:
+        if not topic.name.endswith("/relative_bearing"):
             bearing_rad = given_or_stated(parameters, [topic], "bearing_bound_rad")
-        work: Any = partial(
-            solve,
-            name=f"{name}{prefix}",
-            topic=topic.name,
-            odometry=odometry.name,
-            truth=f"{prefix}/truth",
-            known=known_of(topic, topics["/landmarks"], parameters),
-            bounds=Bounds.of([*stated, bearing_rad]),
-            parameters=parameters,
-        )
-        bound.append(Batch(f"{name}{prefix}", (topic.name, odometry.name), ("/landmarks",), work))
-    return bound
+        setup = known_of(topic, landmarks, parameters), Bounds.of([*stated, bearing_rad])
+        streams = {"seen": topic, "odometry": odometry}
+        yield Binding(streams, {"/landmarks": landmarks}, prefix, setup=setup)
 
 
-SET_FILTER = Estimator(
+SET_FILTER = batch(
     "guaranteed sets of positions over time, moved by odometry with bounded errors: exact, box, l4, l8",
-    "/landmarks and, per robot, .../odometry and one of .../range_bearing, bearing, relative_bearing",
-    SetFilterParameters,
-    _bind,
+    parameters=SetFilterParameters,
+    find=_find,
+    requirements="/landmarks and, per robot, .../odometry and one of .../range_bearing, bearing, "
+    "relative_bearing",
+    solve=solve,
     variant="shape",
 )

@@ -5,9 +5,8 @@ pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative be
 repeated on the fault's topic.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -15,8 +14,9 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from recorders.errors import BadInput
 from recorders.log import Stream, Topic, make_stream, schemas
 from recorders.parameters import Parameters
+from replay.engine.api.functions import batch
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Floats, Integers
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
 from replay.engine.streams.blocks import Ragged, gather
 from replay.regions.feasible_sets import (
     Arena,
@@ -75,39 +75,31 @@ def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floa
     return [np.array([[low_x, low_y], [high_x, low_y], [high_x, high_y], [low_x, high_y]])]
 
 
-def solve(
-    whole: Mapping[str, Ragged],
-    *,
-    name: str,
-    topic: str,
-    truth: str,
-    known: Known,
-    parameters: SetParameters,
-) -> list[Ragged]:
-    """A set for every frame of every run; see `replay.engine.replaying.estimator.Batch`."""
-    metadata = set_metadata(topic, truth, known)
-    landmarks, seen = whole["/landmarks"], whole[topic]
+def solve(given: Given[SetParameters]) -> list[Ragged]:
+    """A set for every frame of every run; see `replay.engine.api.functions.batch`."""
+    known: Known = given.setup
+    prefix, metadata = f"/estimates/{given.name}", set_metadata(given.topics["seen"].name, known)
     solved = []
-    for run in range(seen.runs):
-        found = frames(seen.of_run(run), landmarks.of_run(run), known)
-        borders = [(frame, polygons(frame.pairs, frame.arena, parameters)) for frame in found]
+    for run in range(given.runs):
+        found = frames(given["seen"].of_run(run), given["/landmarks"].of_run(run), known)
+        borders = [(frame, polygons(frame.pairs, frame.arena, given.parameters)) for frame in found]
         blamed = [
             (frame, int(pair))
             for frame, border in borders
             if not border
             for pair in to_blame(frame.pairs, frame.arena)[:1]
         ]
-        prefix, rings_of = f"/estimates/{name}", [(frame.time_ns, border) for frame, border in borders]
+        rings_of = [(frame.time_ns, border) for frame, border in borders]
         solved.append((*set_streams(prefix, metadata, rings_of), fault_stream(prefix, blamed)))
     return [gather(streams) for streams in zip(*solved, strict=True)]
 
 
-def set_metadata(topic: str, truth: str, known: Known) -> dict[str, str]:
+def set_metadata(topic: str, known: Known) -> dict[str, str]:
     """Describe sets in their channel: of which components, beside which truth, from which frames."""
     return {
         "components": "x_m,y_m",
         "kinds": "linear,linear",
-        "truth": truth,
+        "truth": f"{topic.rpartition('/')[0]}/truth",
         "measured": topic,
         **known.metadata(),
     }
@@ -156,25 +148,24 @@ def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
     )
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: SetParameters) -> list[Bound]:
-    bound: list[Bound] = []
-    if "/landmarks" not in topics:
-        return bound
+def bearings_in(topics: Mapping[str, Topic], leaves: Sequence[str]) -> Iterator[tuple[str, Topic]]:
+    """Find the prefixes of robots with bearings, in a log with landmarks, and the first topic of each.
+
+    Args:
+        topics: of the log.
+        leaves: the ends of the topics' names, the best first.
+    """
     for prefix in dict.fromkeys(topic.rpartition("/")[0] for topic in topics):
-        leaf = next((leaf for leaf in LEAVES if f"{prefix}/{leaf}" in topics), None)
-        if leaf is None:
-            continue
-        topic = topics[f"{prefix}/{leaf}"]
-        work: Any = partial(
-            solve,
-            name=f"{name}{prefix}",
-            topic=topic.name,
-            truth=f"{prefix}/truth",
-            known=known_of(topic, topics["/landmarks"], parameters),
-            parameters=parameters,
-        )
-        bound.append(Batch(f"{name}{prefix}", (topic.name,), ("/landmarks",), work))
-    return bound
+        leaf = next((leaf for leaf in leaves if f"{prefix}/{leaf}" in topics), None)
+        if leaf is not None and "/landmarks" in topics:
+            yield prefix, topics[f"{prefix}/{leaf}"]
+
+
+def _find(_: str, topics: Mapping[str, Topic], parameters: SetParameters) -> Iterator[Binding]:
+    for prefix, topic in bearings_in(topics, LEAVES):
+        landmarks = topics["/landmarks"]
+        known = known_of(topic, landmarks, parameters)
+        yield Binding({"seen": topic}, {"/landmarks": landmarks}, prefix, setup=known)
 
 
 def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known:
@@ -209,10 +200,11 @@ def _numbers(topic: Topic, name: str) -> tuple[float, ...]:
     return numbers
 
 
-SET_MEMBERSHIP = Estimator(
+SET_MEMBERSHIP = batch(
     "guaranteed sets of positions from bounded relative bearings: exact, box, l4, l8",
-    "/landmarks and one of .../relative_bearing, range_bearing, bearing",
-    SetParameters,
-    _bind,
+    parameters=SetParameters,
+    find=_find,
+    requirements="/landmarks and one of .../relative_bearing, range_bearing, bearing",
+    solve=solve,
     variant="shape",
 )

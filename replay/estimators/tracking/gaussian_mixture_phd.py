@@ -7,7 +7,7 @@ IEEE TAES 49(4), 2013: a detection that nothing explains begins a component, and
 is not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
@@ -19,26 +19,29 @@ from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
 from replay.distributions import chi2
+from replay.engine.api.functions import recursive
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import bindings, given_or_stated
 from replay.engine.streams.measurements import PLANE, read_vectors
-from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import ALL_WELL, failures_of, state_stream
 from replay.engine.vectors.components import Components
 from replay.estimators.tracking.phd_recursion import (
     STATES,
     Mixture,
+    PhdInputs,
     PhdMemory,
     PhdSettings,
     Scans,
     Sets,
-    follow,
+    extract,
+    process,
 )
 from replay.estimators.tracking.scans import by_scan
 from replay.inference.kalman.steps import FAILURES
 from replay.inference.linear_algebra.gaussian import no_innovation
+from replay.inference.run.loops import over_events
 
 Probability = Annotated[float, Field(gt=0, le=1)]
 
@@ -77,30 +80,31 @@ class PhdParameters(Parameters):
 
 @lru_cache(maxsize=1)
 def _compiled() -> Callable[..., None]:
-    return compile_over_runs(follow, allocates=False)
+    return compile_over_runs(over_events(process, extract), allocates=False)
 
 
-def start(static: Mapping[str, Ragged], *, most: int) -> Mixture | None:
-    """A component of weight 1 at each prior; None where there is none: then nothing is known yet.
+Filtering = Given[PhdParameters]
+
+
+def start(given: Filtering) -> tuple[Filtering, Mixture]:
+    """A component of weight 1 at each prior; without one nothing is known yet.
 
     Raises BadInput where there is no room for all.
     """
-    if not static:
-        return None
-    runs = next(iter(static.values())).runs
-    if len(static) > most:
+    most = given.parameters.most_components
+    if len(given) > most:
         raise BadInput(
-            f"{len(static)} priors are more than {most} components; give --set most_components=..."
+            f"{len(given)} priors are more than {most} components; give --set most_components=..."
         )
-    mixture = no_components(runs, most)
-    for component, prior in enumerate(static.values()):
-        time_ns, mean, covariance = gaussians(prior)
+    mixture = no_components(given.runs, most)
+    for component, prior in enumerate(given):
+        time_ns, mean, covariance = given.prior(prior)
         mixture.weight[:, component] = 1.0
         mixture.mean[:, component] = mean
         mixture.covariance[:, component] = covariance
         mixture.time_ns[:] = time_ns
-    mixture.used[:] = len(static)
-    return mixture
+    mixture.used[:] = len(given)
+    return given, mixture
 
 
 def no_components(runs: int, most: int) -> Mixture:
@@ -122,7 +126,8 @@ def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[
     runs, most = mixture.weight.shape
     sets = _no_sets(scans, mixture, settings)
     largest = int((scans.end - scans.first).max(initial=0))
-    _compiled()(runs, scans, mixture, settings, sets, scratch=partial(_work, most, largest))
+    inputs = PhdInputs(scans, settings)
+    _compiled()(runs, inputs, mixture, sets, scratch=partial(_work, most, largest))
     return mixture, sets
 
 
@@ -166,14 +171,11 @@ def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
     )
 
 
-def run(
-    state: Mixture | None, block: Block, *, name: str, settings: PhdSettings, most: int
-) -> tuple[Mixture, list[Ragged]]:
-    """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
+def advance(given: Filtering, before: Mixture, block: Block) -> tuple[Mixture, list[Ragged]]:
+    """Filter a block; see `replay.engine.api.functions.recursive`."""
     scans = scans_of(*block.streams.values())
-    before = no_components(len(scans.offsets) - 1, most) if state is None else state
-    after, sets = filter_scans(before, scans, settings)
-    return after, _outputs(f"/estimates/{name}", scans, sets, before, after)
+    after, sets = filter_scans(before, scans, given.setup)
+    return after, _outputs(f"/estimates/{given.name}", scans, sets, before, after)
 
 
 def scans_of(scan: Ragged, detection: Ragged) -> Scans:
@@ -229,29 +231,25 @@ def settings_of(parameters: PhdParameters, scan: Topic) -> PhdSettings:
     return PhdSettings._make([*numbers, float(chi2.ppf(parameters.gate_probability, 2))])
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> list[Bound]:
-    """One filter for every sensor with scans and detections; priors of things start all of them."""
+def _find(_: str, topics: Mapping[str, Topic], parameters: PhdParameters) -> Iterator[Binding]:
+    """Find every sensor with scans and detections; priors of things start the filters of all."""
     components: Components = dict.fromkeys(PLANE_MOTION, "linear")
     priors = {
-        found["prior"].name: components
+        found["prior"].name: found["prior"]
         for _, found in bindings(topics, {"prior": schemas.GAUSSIAN_ESTIMATE})
         if components.keys() <= set(found["prior"].metadata.get("components", "").split(","))
     }
-    bound: list[Bound] = []
     for sensor, found in bindings(topics, {"scan": schemas.SCAN, "detection": schemas.DETECTION}):
-        if parameters.sensor and sensor.strip("/") != parameters.sensor.strip("/"):
-            continue
-        own, most = f"{name}{sensor}", parameters.most_components
-        settings = settings_of(parameters, found["scan"])
-        advance = partial(run, name=own, settings=settings, most=most)
-        read = (found["scan"].name, found["detection"].name)
-        bound.append(Recursive(own, read, tuple(priors), partial(start, most=most), advance, priors))
-    return bound
+        if not parameters.sensor or sensor.strip("/") == parameters.sensor.strip("/"):
+            settings = settings_of(parameters, found["scan"])
+            yield Binding(found, priors, sensor, dict.fromkeys(priors, components), settings)
 
 
-GM_PHD = Estimator(
+GM_PHD = recursive(
     "number and positions of targets from unordered scans: Gaussian mixture PHD filter",
-    "per sensor .../scan and .../detection",
-    PhdParameters,
-    _bind,
+    parameters=PhdParameters,
+    find=_find,
+    requirements="per sensor .../scan and .../detection",
+    start=start,
+    advance=advance,
 )

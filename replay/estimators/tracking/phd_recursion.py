@@ -7,7 +7,7 @@ import numpy as np
 from recorders.models.vehicles import noise_moments
 from replay.engine.arrays import Booleans, Floats, Integers, varying
 from replay.engine.streams.results import ALL_WELL
-from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE
+from replay.inference.kalman.steps import NOT_POSITIVE_DEFINITE, UNKNOWN
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     cholesky,
@@ -65,6 +65,13 @@ class Scans(NamedTuple):
     first: Integers
     end: Integers
     place: Floats
+
+
+class PhdInputs(NamedTuple):
+    """Holds what the recursion goes by."""
+
+    events: Scans
+    settings: PhdSettings
 
 
 class Sets(NamedTuple):
@@ -292,8 +299,32 @@ def keep(run: int, groups: int, mixture: Mixture, work: PhdMemory) -> None:
     mixture.used[run] = kept
 
 
-def extract(run: int, scan: int, mixture: Mixture, sets: Sets) -> None:
-    """Tell a scan's set: a component stands for as many things as its weight rounds to."""
+def process(
+    run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
+) -> int:
+    """Take the components of a run through a scan; one from before the mixture's time says nothing."""
+    scans, settings = inputs
+    if mixture.time_ns[run] >= 0:
+        duration_s = (scans.time_ns[scan] - mixture.time_ns[run]) * 1e-9
+        if duration_s < 0.0:
+            return UNKNOWN
+        noise = noise_moments(settings.acceleration_sigma_mps2, duration_s)
+        for component in range(mixture.used[run]):
+            mean, covariance = mixture.mean[run, component], mixture.covariance[run, component]
+            predict_constant_velocity(mean, covariance, duration_s, (2, 1), noise)
+    mixture.time_ns[run] = scans.time_ns[scan]
+    count = update(run, scan, scans, mixture, settings, work)
+    groups = merge(count, settings, work) if count >= 0 else -1
+    if groups < 0:
+        return NOT_POSITIVE_DEFINITE
+    keep(run, groups, mixture, work)
+    return ALL_WELL
+
+
+def extract(
+    run: int, scan: int, inputs: PhdInputs, mixture: Mixture, sets: Sets, work: PhdMemory
+) -> int:
+    """Fill in a scan's set: a component stands for as many things as its weight rounds to."""
     row = sets.room[scan]
     for component in range(mixture.used[run]):
         weight = mixture.weight[run, component]
@@ -308,28 +339,4 @@ def extract(run: int, scan: int, mixture: Mixture, sets: Sets) -> None:
             row += 1
     sets.elements[scan] = row - sets.room[scan]
     sets.is_reported[scan] = True
-
-
-def follow(
-    run: int, scans: Scans, mixture: Mixture, settings: PhdSettings, sets: Sets, work: PhdMemory
-) -> None:
-    """Take one run through its scans, until they end or it fails."""
-    for scan in range(scans.offsets[run], scans.offsets[run + 1]):
-        if mixture.failure[run] != ALL_WELL:
-            break
-        if mixture.time_ns[run] >= 0:
-            duration_s = (scans.time_ns[scan] - mixture.time_ns[run]) * 1e-9
-            if duration_s < 0.0:
-                continue
-            noise = noise_moments(settings.acceleration_sigma_mps2, duration_s)
-            for component in range(mixture.used[run]):
-                mean, covariance = mixture.mean[run, component], mixture.covariance[run, component]
-                predict_constant_velocity(mean, covariance, duration_s, (2, 1), noise)
-        mixture.time_ns[run] = scans.time_ns[scan]
-        count = update(run, scan, scans, mixture, settings, work)
-        groups = merge(count, settings, work) if count >= 0 else -1
-        if groups < 0:
-            mixture.failure[run] = NOT_POSITIVE_DEFINITE
-            break
-        keep(run, groups, mixture, work)
-        extract(run, scan, mixture, sets)
+    return ALL_WELL

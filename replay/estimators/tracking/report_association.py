@@ -80,6 +80,13 @@ class Reports(NamedTuple):
     speed_mps: Floats
 
 
+class ReportInputs(NamedTuple):
+    """Holds what the tracker goes by."""
+
+    events: Reports
+    settings: ReportSettings
+
+
 class ReportResults(NamedTuple):
     """Holds the output of every report: its track's number, mean (n, 4) and spread (n, 3)."""
 
@@ -321,31 +328,28 @@ def forget(run: int, now_ns: int, tracks: Tracks, settings: ReportSettings) -> N
 
 def track(
     run: int,
-    reports: Reports,
+    first: int,
+    end: int,
+    inputs: ReportInputs,
     tracks: Tracks,
-    settings: ReportSettings,
     results: ReportResults,
     memory: ReportMemory,
-) -> None:
-    """Take one run's reports in, stamp by stamp, the surest pair of report and track first."""
-    weights, probability = memory.weights, memory.probability
-    first, end = reports.offsets[run], reports.offsets[run + 1]
-    while first < end:
-        count = 1
-        while not reports.is_last[first + count - 1]:
-            count += 1
-        forget(run, reports.time_ns[first], tracks, settings)
-        used = tracks.used[run]
-        for row in range(count):
-            weights.missed[row] = 1.0
-            for place in range(used):
-                ratio = ratio_of(run, place, first + row, reports, tracks, settings)
-                weights.detected[row, place] = ratio
-        nearest(weights, count, used, probability, memory.association)
-        for row in range(count):
-            chosen = NO_TRACK
-            for place in range(used):
-                if probability[row, 1 + place] > 0.0:
-                    chosen = place
-            take_in(run, first + row, chosen, reports, tracks, settings, results)
-        first += count
+) -> bool:
+    """Take in one run's reports of one stamp, the surest pair of report and track first."""
+    (reports, settings), weights, probability = inputs, memory.weights, memory.probability
+    count = end - first
+    forget(run, reports.time_ns[first], tracks, settings)
+    used = tracks.used[run]
+    for row in range(count):
+        weights.missed[row] = 1.0
+        for place in range(used):
+            ratio = ratio_of(run, place, first + row, reports, tracks, settings)
+            weights.detected[row, place] = ratio
+    nearest(weights, count, used, probability, memory.association)
+    for row in range(count):
+        chosen = NO_TRACK
+        for place in range(used):
+            if probability[row, 1 + place] > 0.0:
+                chosen = place
+        take_in(run, first + row, chosen, reports, tracks, settings, results)
+    return True

@@ -13,7 +13,7 @@ pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with Application
 Navigation, 11.6.2). Both axes have the same noise: three numbers are a track's covariance.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache, partial
 from typing import Annotated, Any
 
@@ -25,13 +25,15 @@ from recorders.errors import BadInput
 from recorders.log import Topic, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.parameters import Parameters
+from replay.engine.api.functions import recursive
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Floats
 from replay.engine.compiling.compile import compile_over_runs
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.measurements import PLANE, read_vectors
 from replay.estimators.tracking.report_association import (
     LEVELS,
+    ReportInputs,
     ReportMemory,
     ReportResults,
     Reports,
@@ -40,6 +42,7 @@ from replay.estimators.tracking.report_association import (
     track,
 )
 from replay.inference.association.clusters import Weights, memory_for
+from replay.inference.run.loops import over_stamps
 
 FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=LEVELS)]
 
@@ -78,35 +81,30 @@ class ReportTrackerParameters(Parameters):
 
 @lru_cache(maxsize=1)
 def _compiled() -> Callable[..., None]:
-    return compile_over_runs(track, allocates=False)
+    return compile_over_runs(over_stamps(track), allocates=False)
 
 
-def start(_: Mapping[str, Ragged]) -> None:
-    """Start with nothing: before the first report not even the number of runs is known."""
+Reporting = Given[ReportTrackerParameters]
 
 
-def run(
-    state: Tracks | None, block: Block, *, name: str, topic: str, settings: ReportSettings
-) -> tuple[Tracks, list[Ragged]]:
-    """Track a block; see `replay.engine.replaying.estimator.Recursive`."""
+def start(given: Reporting) -> tuple[Reporting, Tracks]:
+    """Start without tracks."""
+    return given, _no_tracks(given.runs)
+
+
+def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, list[Ragged]]:
+    """Track a block; see `replay.engine.api.functions.recursive`."""
+    settings, topic = given.setup, given.topics["reports"].name
     reports = _reports(block, topic, settings)
-    most = int(np.diff(reports.offsets).max(initial=0))
-    runs = len(reports.offsets) - 1
-    tracks = _with_room(state or _no_tracks(runs), most)
+    tracks = _with_room(before, int(np.diff(reports.offsets).max(initial=0)))
     rows = len(reports.time_ns)
     results = ReportResults(np.empty(rows, np.int64), np.empty((rows, 4)), np.empty((rows, 3)))
     ends = np.flatnonzero(reports.is_last)
     together = int(np.diff(ends, prepend=-1).max(initial=1))
-    _compiled()(
-        runs,
-        reports,
-        tracks,
-        settings,
-        results,
-        scratch=partial(_memory, together, tracks.number.shape[1]),
-    )
+    memory = partial(_memory, together, tracks.number.shape[1])
+    _compiled()(given.runs, ReportInputs(reports, settings), tracks, results, scratch=memory)
     stream = make_stream(
-        f"/estimates/{name}/track",
+        f"/estimates/{given.name}/track",
         schemas.TRACK_ESTIMATE,
         reports.time_ns,
         metadata={**state_metadata(PLANE_MOTION), "reports": topic},
@@ -208,20 +206,18 @@ def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
     )
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: ReportTrackerParameters) -> list[Bound]:
+def _find(_: str, topics: Mapping[str, Topic], parameters: ReportTrackerParameters) -> Iterator[Binding]:
     settings = settings_of(parameters)
-    bound: list[Bound] = []
     for topic in topics.values():
         if topic.schema_name == schemas.COURSE_FIX.full_name:
-            own = f"{name}{topic.name.rpartition('/')[0]}"
-            advance = partial(run, name=own, topic=topic.name, settings=settings)
-            bound.append(Recursive(own, (topic.name,), (), start, advance))
-    return bound
+            yield Binding({"reports": topic}, {}, topic.name.rpartition("/")[0], setup=settings)
 
 
-REPORT_TRACKER = Estimator(
+REPORT_TRACKER = recursive(
     "tracks of vessels from reports of position, course and speed that do not say whose they are",
-    ".../reports (fuselog.CourseFix)",
-    ReportTrackerParameters,
-    _bind,
+    parameters=ReportTrackerParameters,
+    find=_find,
+    requirements=".../reports (fuselog.CourseFix)",
+    start=start,
+    advance=advance,
 )

@@ -9,8 +9,7 @@ named `KIND-PARTICLES` or `KIND-PARTICLES-topology`, as in `vehicle-particles:ax
 
 import copy
 import re
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +19,10 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic
 from recorders.models.vehicles import turn
 from recorders.parameters import Parameters
+from replay.engine.api.functions import recursive
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Floats
 from replay.engine.compiling.compile import compiled
-from replay.engine.replaying.estimator import Bound, Estimator
 from replay.engine.streams.blocks import Block, Ragged
 from replay.estimators.vehicles.association import (
     all_maps,
@@ -32,7 +32,7 @@ from replay.estimators.vehicles.association import (
 from replay.estimators.vehicles.streams import (
     Frames,
     VehiclesState,
-    bind_vehicles,
+    find_vehicles,
     frames_of,
     no_results,
     outputs_of,
@@ -108,27 +108,28 @@ def parse_method(method: str, seed: int) -> Method:
     return Method(found[1], int(found[2]), found[3] is not None, seed)
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: ParticlesParameters) -> list[Bound]:
+def _find(name: str, topics: Mapping[str, Topic], parameters: ParticlesParameters) -> Iterator[Binding]:
     method = parse_method(parameters.method, parameters.seed)
-    begin, advance = partial(_start, method), partial(_run, method)
     sensor = "topology" if method.uses_topology else ""
-    return bind_vehicles(name, topics, "set", sensor, begin, advance)
+    for each in find_vehicles(name, topics, "set", sensor):
+        yield each._replace(setup=(each.setup, method))
 
 
-def _start(method: Method, setup: Setup, static: Mapping[str, Ragged]) -> Cloud:
-    carried = start(setup, static)
-    runs = len(carried.mean)
-    covariance = carried.covariance if method.kind == "associations" else np.empty((runs, 0, 0))
+def _start(given: Given[ParticlesParameters]) -> tuple[tuple[Setup, Method], Cloud]:
+    setup, method = given.setup
+    carried = start(setup, given)
+    covariance = carried.covariance if method.kind == "associations" else np.empty((given.runs, 0, 0))
     joint = Joint(
         np.repeat(carried.mean, method.particles, axis=0),
         np.repeat(covariance, method.particles, axis=0),
     )
-    return Cloud(carried, joint, np.zeros((runs, method.particles)), [None] * runs)
+    weights, generators = np.zeros((given.runs, method.particles)), [None] * given.runs
+    return (setup, method), Cloud(carried, joint, weights, [*generators])
 
 
-def _run(method: Method, setup: Setup, before: Cloud, block: Block) -> tuple[Cloud, list[Ragged]]:
-    """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
-    cloud = copy.deepcopy(before)
+def _run(settings: tuple[Setup, Method], before: Cloud, block: Block) -> tuple[Cloud, list[Ragged]]:
+    """Filter a block; see `replay.engine.api.functions.recursive`."""
+    (setup, method), cloud = settings, copy.deepcopy(before)
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
     results = no_results(setup, runs, count)
@@ -263,10 +264,12 @@ def _estimate(method: Method, cloud: Cloud, run: int) -> tuple[Floats, Floats]:
     return middle, (weight[:, None] * apart).T @ apart
 
 
-VEHICLE_PARTICLES = Estimator(
+VEHICLE_PARTICLES = recursive(
     "particle filters of unordered fixes; the method follows the name, as in vehicle-particles:set-1000",
-    "/vehicleN/prior, /network and, with topology, /infrastructure",
-    ParticlesParameters,
-    _bind,
+    parameters=ParticlesParameters,
+    find=_find,
+    requirements="/vehicleN/prior, /network and, with topology, /infrastructure",
+    start=_start,
+    advance=_run,
     variant="method",
 )

@@ -6,7 +6,7 @@ frame after frame is filtered in all runs at once.
 """
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,13 +17,13 @@ from recorders.errors import BadInput, choices
 from recorders.log import Topic, schemas
 from recorders.models.states import PLANE_MOTION
 from recorders.parameters import Parameters
+from replay.engine.api.functions import recursive
+from replay.engine.api.inputs import Binding, Given
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import numbered, stated
 from replay.engine.streams.failures import Failure, reason_stream
 from replay.engine.streams.measurements import PLANE, read_fixes, read_vectors
-from replay.engine.streams.priors import gaussians
 from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream
 from replay.engine.vectors.components import Components, components_of
 from replay.estimators.vehicles.association import MISSED, Scanning
@@ -121,25 +121,19 @@ def no_results(setup: Setup, runs: int, frames: int) -> VehiclesResults:
     )
 
 
-def _bind(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters) -> list[Bound]:
+def _find(name: str, topics: Mapping[str, Topic], parameters: VehiclesParameters) -> Iterator[Binding]:
     fixes, sensor = split_method(parameters.method)
     if fixes not in FIXES:
         raise BadInput(f"estimator {name}: no method '{fixes}'; {choices(fixes, FIXES)}")
+    found = find_vehicles(name, topics, fixes, sensor)
     scan, sigma_m = parameters.registration_scan, parameters.sigma_fix_m
-    return bind_vehicles(name, topics, fixes, sensor, start, run, scan, sigma_m)
+    for each in found:
+        setup = each.setup._replace(registration_scan=scan, sigma_fix_m=sigma_m)
+        yield each._replace(setup=setup)
 
 
-def bind_vehicles(
-    name: str,
-    topics: Mapping[str, Topic],
-    fixes: str,
-    sensor: str,
-    begin: Callable[[Setup, Mapping[str, Ragged]], Any],
-    advance: Callable[[Setup, Any, Block], tuple[Any, list[Ragged]]],
-    registration_scan: int = 1,
-    sigma_fix_m: float | None = None,
-) -> list[Bound]:
-    """A method over the topics it follows; nothing where one is missing."""
+def find_vehicles(name: str, topics: Mapping[str, Topic], fixes: str, sensor: str) -> Iterator[Binding]:
+    """Find the topics that a method follows; nothing where one is missing."""
     numbers = vehicle_numbers(topics)
     used = ["/network/scan", "/network/detection"]
     if fixes == "known":
@@ -147,22 +141,20 @@ def bind_vehicles(
     if sensor:
         used += ["/infrastructure/scan", "/infrastructure/detection"]
     if not numbers or not set(used) <= set(topics):
-        return []
+        return
     setup = Setup(
         name,
         tuple(numbers),
         fixes,
         sensor,
-        registration_scan,
         motion_of(topics, numbers),
         scanning_of(topics, "/network/scan"),
         scanning_of(topics, "/infrastructure/scan"),
-        sigma_fix_m,
     )
     state: Components = dict.fromkeys(PLANE_MOTION, "linear")
-    priors = {f"/vehicle{number}/prior": state for number in numbers}
-    start, run = partial(begin, setup), partial(advance, setup)
-    return [Recursive(name, tuple(used), tuple(priors), start, run, priors)]
+    priors = [f"/vehicle{number}/prior" for number in numbers]
+    followed, fixed = ({each: topics[each] for each in names} for names in (used, priors))
+    yield Binding(followed, fixed, priors=dict.fromkeys(priors, state), setup=setup)
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
@@ -183,19 +175,23 @@ def scanning_of(topics: Mapping[str, Topic], topic: str) -> Scanning:
     return Scanning(*(stated([topics[topic]], name) for name in Scanning._fields))
 
 
-def start(setup: Setup, static: Mapping[str, Ragged]) -> VehiclesState:
+def _start(given: Given[Any]) -> tuple[Setup, VehiclesState]:
+    return given.setup, start(given.setup, given)
+
+
+def start(setup: Setup, given: Given[Any]) -> VehiclesState:
     """Every run's priors."""
-    runs = next(iter(static.values())).runs
+    runs = given.runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
-    for vehicle, prior in enumerate(static.values()):
+    for vehicle, prior in enumerate(given):
         own = slice(STATES * vehicle, STATES * (vehicle + 1))
-        time_ns, mean[:, own], covariance[:, own, own] = gaussians(prior)
+        time_ns, mean[:, own], covariance[:, own, own] = given.prior(prior)
     registered, failed = np.zeros((2, runs), bool)
     return VehiclesState(mean, covariance, time_ns, np.zeros(runs, np.int64), registered, failed)
 
 
 def run(setup: Setup, carried: VehiclesState, block: Block) -> tuple[VehiclesState, list[Ragged]]:
-    """Filter a block; see `replay.engine.replaying.estimator.Recursive`."""
+    """Filter a block; see `replay.engine.api.functions.recursive`."""
     frames = frames_of(setup, block)
     runs, count = frames.time_ns.shape
     before = carried.failed
@@ -381,10 +377,12 @@ def outputs_of(
         yield Ragged(stream, np.searchsorted(at_run, np.arange(runs + 1)))
 
 
-VEHICLES = Estimator(
+VEHICLES = recursive(
     "cooperative vehicles; the method follows the name, as in vehicles:hungarian-topology",
-    "/vehicleN/prior and, by method, /vehicleN/fix, /network and /infrastructure",
-    VehiclesParameters,
-    _bind,
+    parameters=VehiclesParameters,
+    find=_find,
+    requirements="/vehicleN/prior and, by method, /vehicleN/fix, /network and /infrastructure",
+    start=_start,
+    advance=run,
     variant="method",
 )

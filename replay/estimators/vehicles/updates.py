@@ -65,11 +65,11 @@ class Setup(NamedTuple):
     numbers: tuple[int, ...]
     fixes: str
     sensor: str
-    registration_scan: int
     motion: Motion
     network: Scanning
     infrastructure: Scanning
-    sigma_fix_m: float | None
+    registration_scan: int = 1
+    sigma_fix_m: float | None = None
 
     @property
     def has_pose(self) -> bool:

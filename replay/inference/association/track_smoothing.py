@@ -16,6 +16,8 @@ from replay.inference.run.recursion import Estimates
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
+    Piece,
+    Smoothed,
     back_memory,
     backward_pass_over_runs,
     no_later,
@@ -41,8 +43,9 @@ def smooth_tracks(
         np.empty(mean.shape),
         np.empty(covariance.shape),
     )
-    arguments = (nodes, offsets, offsets[1:], FOREVER_NS, no_later(runs, n, n), offsets[:-1], smoothed)
-    backward_pass_over_runs(stage.model.kinds)(runs, *arguments, scratch=partial(back_memory, n, n))
+    later, filled = no_later(runs, n, n), Smoothed(offsets[1:], offsets[:-1], FOREVER_NS, smoothed)
+    go_back, memory = backward_pass_over_runs(stage.model.kinds), partial(back_memory, n, n)
+    go_back(runs, Piece(nodes, offsets), later, filled, scratch=memory)
     back = np.argsort(order)
     return smoothed.mean[back], smoothed.covariance[back]
 

@@ -43,6 +43,7 @@ from replay.inference.association.tracker import (
     moving,
 )
 from replay.inference.association.tracks import NEVER, Tracks
+from replay.inference.kalman.steps import Interval
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.settings import reading_settings
 
@@ -101,8 +102,9 @@ def advancing(tracker: Tracker) -> Function:
         duration_s = (time_ns - tracks.time_ns[run]) * 1e-9
         if tracks.time_ns[run] != NEVER and duration_s > 0.0:
             belief = belief_of(run, tracks)
+            interval = Interval(memory.shift, duration_s, p, 0)
             for place in range(tracks.used[run]):
-                predict(place, belief, memory.shift, duration_s, p, 0, memory.motion)
+                predict(place, belief, interval, memory.motion)
                 wait(run, place, duration_s, tracks, p)
         tracks.time_ns[run] = time_ns
 

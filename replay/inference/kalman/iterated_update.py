@@ -10,9 +10,11 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Measurement,
     Workspace,
 )
 from replay.inference.kalman.update import (
+    is_unmeasured,
     linear_innovation,
     reading,
     sensor_derivative,
@@ -70,17 +72,12 @@ def iterated_update(stage: Stage, number: int) -> Function:
     def update(
         mean: Floats,
         covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         work: Workspace,
         record: InnovationRecord,
     ) -> int:
-        present = 0
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
+        data, parameters, gate, _ = measurement
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         innovation, step, factor = work.innovations[number], work.step, 1.0
         find_slope(mean, covariance, work.slope)

@@ -20,11 +20,7 @@ from replay.inference.kalman.forms import extended, sampled
 from replay.inference.kalman.iterated_update import iterated_update
 from replay.inference.kalman.predict import linear_motion, motion_noise
 from replay.inference.kalman.square_root import FACTORED
-from replay.inference.kalman.steps import (
-    Steps,
-    Workspace,
-    gaussian_filter,
-)
+from replay.inference.kalman.steps import Interval, Measurement, Steps, Workspace, gaussian_filter
 from replay.inference.kalman.update import (
     kalman_update,
     linear_sensor,
@@ -71,7 +67,9 @@ class UnscentedParameters(MethodParameters):
     """Options of methods that may use the unscented transform.
 
     Attributes:
-        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter.
+        kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf
+            has 0.5 unless its name says another, as in lrkf:ukf:kappa=0, so that all points weigh
+            alike; with the same kappa both give the same.
     """
 
     kappa: float = 0.0
@@ -114,6 +112,7 @@ class Method:
             BadInput where they name none.
         filtering: what goes through a log, where that is no `replay.inference.run.filtering.Filter`.
         takes_all_modes: whether it takes all modes of a model, not one of its motions.
+        is_random: whether it draws random numbers, beside those of its samples.
     """
 
     summary: str
@@ -125,6 +124,7 @@ class Method:
     made_for: Callable[[Any], "Method"] | None = None
     filtering: Callable[..., Any] | None = None
     takes_all_modes: bool = False
+    is_random: bool = False
 
 
 def _iterated(stage: Stage) -> Steps:
@@ -163,15 +163,8 @@ def _exact_motion(stage: Stage) -> Function:
     assert moments is not None
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
 
-    def predict(
-        mean: Floats,
-        covariance: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, _ = interval
         state = read_state(mean)
         moments(mean, covariance, read_control(control), duration_s, parameters)
         add_noise(state, covariance, duration_s, parameters, work)
@@ -187,14 +180,8 @@ def _exact_sensor(stage: Stage, number: int) -> Function:
     assert moments is not None
     m, angular = len(sensor.measured), tuple(kind == "angle" for kind in sensor.measured.values())
 
-    def innovate(
-        mean: Floats,
-        covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def innovate(mean: Floats, covariance: Floats, measurement: Measurement, work: Workspace) -> bool:
+        data, parameters, _, _ = measurement
         difference, spread, cross = work.innovations[number]
         predicted = work.predicted
         moments(mean, covariance, read_reference(data), parameters, predicted, spread, cross)

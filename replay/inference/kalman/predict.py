@@ -3,7 +3,7 @@
 from typing import Any
 
 from replay.engine.arrays import Floats, Function
-from replay.inference.kalman.steps import Workspace
+from replay.inference.kalman.steps import Interval, Workspace
 from replay.inference.linear_algebra.gaussian import add_through
 from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
 from replay.inference.linear_algebra.sparse import adding_through, pattern_of, propagating_covariance
@@ -15,8 +15,8 @@ from replay.inference.model.stage import Stage
 def linear_motion(stage: Stage) -> Function:
     """Make the prediction by the Jacobian at the mean, which is exact where the motion is linear.
 
-    Returns `predict(mean, covariance, control, duration_s, parameters, sample_index, work)`: in place,
-    the mean (n,) becomes f(x, u) and the covariance (t, t) F P F' + Q.
+    Returns `predict(mean, covariance, interval, work)`: in place, the mean (n,) becomes f(x, u) and the
+    covariance (t, t) F P F' + Q.
     """
     model, motion = stage.model, stage.motion
     n, read_control = model.size, tuple_of(model.controls)
@@ -26,15 +26,8 @@ def linear_motion(stage: Stage) -> Function:
     move_covariance = propagating_covariance(pattern_of(known, model.tangent))
     add_noise = motion_noise(model, motion)
 
-    def predict(
-        mean: Floats,
-        covariance: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, _ = interval
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
         fill(mean, work.state)

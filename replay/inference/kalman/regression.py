@@ -13,7 +13,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, varying
 from replay.inference.kalman.predict import motion_derivative, motion_noise, nothing
-from replay.inference.kalman.steps import Workspace
+from replay.inference.kalman.steps import Interval, Measurement, Workspace
 from replay.inference.kalman.update import reading, sensor_noise
 from replay.inference.linear_algebra.gaussian import cholesky, wrap
 from replay.inference.linear_algebra.manifold import (
@@ -217,20 +217,13 @@ def sampled_motion(stage: Stage, number: int) -> Function:
     read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
     fill = filling(model.size)
 
-    def predict(
-        mean: Floats,
-        covariance: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, event = interval
         memory, state, driven = work.samples[number], read_state(mean), read_control(control)
         arguments = (driven, duration_s, parameters)
         variances = variances_of(state, duration_s, parameters)
         cross = work.product.T
-        if not regress(mean, covariance, arguments, variances, covariance, cross, sample_index, memory):
+        if not regress(mean, covariance, arguments, variances, covariance, cross, event, memory):
             return False
         linearise(state, driven, duration_s, parameters, work)
         add_noise(state, covariance, duration_s, parameters, work)
@@ -273,18 +266,12 @@ def sampled_sensor(stage: Stage, number: int, samples: int) -> Function:
     variances_of = entering or no_variances
     add_noise = nothing if sensor.noises else sensor_noise(sensor)
 
-    def innovate(
-        mean: Floats,
-        covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def innovate(mean: Floats, covariance: Floats, measurement: Measurement, work: Workspace) -> bool:
+        data, parameters, _, event = measurement
         memory = work.samples[samples]
         difference, spread, cross = work.innovations[number]
         arguments, variances = (read_reference(data), parameters), variances_of(parameters)
-        if not regress(mean, covariance, arguments, variances, spread, cross, sample_index, memory):
+        if not regress(mean, covariance, arguments, variances, spread, cross, event, memory):
             return False
         for i in range(m):
             difference[i] = wrap(data[i] - memory.centre[i], angular[i])

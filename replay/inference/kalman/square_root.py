@@ -27,9 +27,12 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Interval,
+    Measurement,
     Workspace,
 )
 from replay.inference.kalman.update import (
+    is_unmeasured,
     reading,
     sensor_derivative,
     sensor_noise,
@@ -101,20 +104,13 @@ def _predicting(stage: Stage, spread: Function, add_noise: Function, samples: in
     t, read_control = stage.model.tangent, tuple_of(stage.model.controls)
     read_state, fill = tuple_of(stage.model.size), filling(stage.model.size)
 
-    def predict(
-        mean: Floats,
-        factor: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(mean: Floats, factor: Floats, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, event = interval
         count = len(work.samples[samples].offsets) if samples >= 0 else t
         rows, weights = np.zeros((2 * t, count + t)), np.zeros(count + t)
         noise, found = np.zeros((t, t)), np.zeros((2 * t, 2 * t))
         state, given = read_state(mean), (read_control(control), duration_s, parameters)
-        spread(state, factor, given, sample_index, work, (rows, weights))
+        spread(state, factor, given, event, work, (rows, weights))
         fill(mean, work.state)
         add_noise(state, noise, duration_s, parameters, work)
         if not _factorise(rows, weights, noise, found):
@@ -186,26 +182,18 @@ def _updating(
     correct = correcting(model.kinds, model.correct, form=FACTORS)
 
     def update(
-        mean: Floats,
-        factor: Floats,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
-        work: Workspace,
-        record: InnovationRecord,
+        mean: Floats, factor: Floats, measurement: Measurement, work: Workspace, record: InnovationRecord
     ) -> int:
+        data, parameters, gate, event = measurement
         count = len(work.samples[samples].offsets) if samples >= 0 else t
         rows, weights = np.zeros((m + t, count + m)), np.zeros(count + m)
         noise, found = np.zeros((m, m)), np.zeros((m + t, m + t))
-        innovation, size, present = work.innovations[number], 0, 0
+        innovation, size = work.innovations[number], 0
         difference, own_spread, _ = innovation
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         state, given = read_state(mean), (read_reference(data), parameters)
-        spread(state, factor, given, sample_index, work, (rows, weights))
+        spread(state, factor, given, event, work, (rows, weights))
         add_noise(noise, data, parameters, work)
         for i in range(m):
             difference[i] = wrap(data[i] - work.predicted[i], angular[i])

@@ -42,15 +42,46 @@ class Gaussian(NamedTuple):
     covariance: Floats
 
 
+class Interval(NamedTuple):
+    """Holds what a prediction goes by, beside the belief.
+
+    Attributes:
+        control: (controls,), what drives the state; NaN in a gap.
+        duration_s: how long it goes.
+        parameters: the motion's.
+        event: the number of the event that it leads to, which numbers sets of randomised samples too.
+    """
+
+    control: Floats
+    duration_s: float
+    parameters: Any
+    event: int
+
+
+class Measurement(NamedTuple):
+    """Holds what an update goes by, beside the belief.
+
+    Attributes:
+        data: the numbers of the message, see `update.reading`.
+        parameters: the sensor's.
+        gate: (m + 1,), bounds of the NIS by the number of components.
+        event: the number of the event, see `Interval`.
+    """
+
+    data: Floats
+    parameters: Any
+    gate: Floats
+    event: int
+
+
 class Steps(NamedTuple):
     """Holds the steps of a recursive filter of one model, as the recursion calls them.
 
     Attributes:
         memory: (sets) -> what one core works in; `sets` are the samples, one for each of `sampled`.
-        predict: (run, belief, control, duration_s, parameters, sample_index, memory) -> whether all is
-            well; moves the belief in place. `sample_index` numbers the sets of randomised samples.
-        updates: for every sensor, (run, belief, data, parameters, gate, sample_index, memory, record) ->
-            a failure, ALL_WELL or NOTHING_MEASURED; see `kalman_update`.
+        predict: (run, belief, interval, memory) -> whether all is well; moves the belief in place.
+        updates: for every sensor, (run, belief, measurement, memory, record) -> a failure, ALL_WELL or
+            NOTHING_MEASURED; see `kalman_update`.
         estimate: (run, belief, estimates, row, memory) fills a row of the results: its mean, its
             covariance, and what the method keeps beside them.
         sampled: the dimensions in which it takes samples, the motion's first.
@@ -158,10 +189,10 @@ def gaussian_filter(
 
     Args:
         stage: the model as a method takes it.
-        predict: `predict(mean, covariance, control, duration_s, parameters, sample_index, work)` moves
-            one run's mean (n,) and covariance (t, t) in place; returns whether all is well.
-        updates: for every sensor, `update(mean, covariance, data, parameters, gate, sample_index, work,
-            record)`; see `kalman_update`.
+        predict: `predict(mean, covariance, interval, work)` moves one run's mean (n,) and covariance
+            (t, t) in place; returns whether all is well.
+        updates: for every sensor, `update(mean, covariance, measurement, work, record)`; see
+            `kalman_update`.
         memory: (sets) -> the workspace; `workspace(stage)` unless given.
         sampled: see `Steps.sampled`.
         form: what stands for the covariance.
@@ -173,17 +204,9 @@ def gaussian_filter(
     if has_gaps:
         predict = _predicting_gap((gap_motion or keeping)(stage), predict)
 
-    def predict_run(
-        run: int,
-        belief: Gaussian,
-        control: Any,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Any,
-    ) -> bool:
+    def predict_run(run: int, belief: Gaussian, interval: Interval, work: Any) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return predict(mean, covariance, control, duration_s, parameters, sample_index, work)
+        return predict(mean, covariance, interval, work)
 
     def estimate(run: int, belief: Gaussian, estimates: Any, row: int, work: Any) -> None:
         mean, covariance = estimates.mean[row], estimates.covariance[row]
@@ -204,18 +227,10 @@ def gaussian_filter(
 def _predicting_gap(predict_gap: Function, predict_driven: Function) -> Function:
     """Make the prediction of one kind where the control is NaN, else of the other."""
 
-    def predict(
-        mean: Floats,
-        covariance: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
-        if np.isnan(control[0]):
-            return predict_gap(mean, covariance, control, duration_s, parameters, sample_index, work)
-        return predict_driven(mean, covariance, control, duration_s, parameters, sample_index, work)
+    def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
+        if np.isnan(interval.control[0]):
+            return predict_gap(mean, covariance, interval, work)
+        return predict_driven(mean, covariance, interval, work)
 
     return predict
 
@@ -226,19 +241,11 @@ def keeping(stage: Stage) -> Function:
     assert gap_noise is not None
     read_state, add, t = tuple_of(model.size), adding_noise(model.tangent), model.tangent
 
-    def keep(
-        mean: Floats,
-        covariance: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def keep(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
         for row in range(t):
             for column in range(t):
                 work.product[row, column] = covariance[row, column]
-        add(covariance, gap_noise(read_state(mean), duration_s, parameters))
+        add(covariance, gap_noise(read_state(mean), interval.duration_s, interval.parameters))
         return True
 
     return keep
@@ -246,16 +253,9 @@ def keeping(stage: Stage) -> Function:
 
 def _of_run(update: Function) -> Function:
     def update_run(
-        run: int,
-        belief: Gaussian,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
-        work: Any,
-        record: InnovationRecord,
+        run: int, belief: Gaussian, measurement: Measurement, work: Any, record: InnovationRecord
     ) -> int:
         mean, covariance = belief.mean[run], belief.covariance[run]
-        return update(mean, covariance, data, parameters, gate, sample_index, work, record)
+        return update(mean, covariance, measurement, work, record)
 
     return update_run

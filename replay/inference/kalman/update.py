@@ -11,6 +11,7 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Measurement,
     Workspace,
 )
 from replay.inference.linear_algebra.gaussian import (
@@ -104,8 +105,8 @@ def sensor_derivative(model: Model, sensor: Sensor) -> Function:
 def linear_sensor(stage: Stage, number: int) -> Function:
     """Make the innovation by the derivative at the mean.
 
-    Returns `innovate(mean, covariance, data, parameters, sample_index, work)`, which fills that of the
-    sensor in `work.innovations`.
+    Returns `innovate(mean, covariance, measurement, work)`, which fills that of the sensor in
+    `work.innovations`.
 
     Args:
         stage: the model with the sensors at hand.
@@ -118,14 +119,8 @@ def linear_sensor(stage: Stage, number: int) -> Function:
     pattern = pattern_of(known_entries(linearise, "rows"), len(sensor.measured))
     compare = linear_innovation(sensor, number, pattern)
 
-    def innovate(
-        mean: Floats,
-        covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        sample_index: int,
-        work: Workspace,
-    ) -> bool:
+    def innovate(mean: Floats, covariance: Floats, measurement: Measurement, work: Workspace) -> bool:
+        data, parameters, _, _ = measurement
         linearise(read_state(mean), read_reference(data), parameters, work)
         compare(covariance, data, parameters, work)
         return True
@@ -218,6 +213,14 @@ def writing_innovation(stage: Stage, number: int) -> Function:
     return write_innovation
 
 
+def is_unmeasured(data: Floats, components: int) -> bool:
+    """Tell whether a message has none of these components, which stand first in its data."""
+    measured = 0
+    for i in range(components):
+        measured += not np.isnan(data[i])
+    return measured == 0
+
+
 def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     """Make the Kalman update by a sensor: x (+) K v and P - K S K', with K = C S^-1.
 
@@ -231,12 +234,11 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     Args:
         stage: the model with the sensors at hand.
         number: the sensor's, among these.
-        innovate: `innovate(mean, covariance, data, parameters, sample_index, work)` fills the innovation
-            v (m,), S (m, m), C (t, m) of the sensor; returns whether the covariance was one.
+        innovate: `innovate(mean, covariance, measurement, work)` fills the innovation v (m,), S (m, m),
+            C (t, m) of the sensor; returns whether the covariance was one.
 
-    Returns `update(mean, covariance, data, parameters, gate, sample_index, work, record)`, in place, for
-    a mean (n,), a covariance (t, t) and bounds of the NIS `gate` (m + 1,) by the number of components.
-    It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
+    Returns `update(mean, covariance, measurement, work, record)`, in place, for a mean (n,) and a
+    covariance (t, t). It returns ALL_WELL, NOTHING_MEASURED or NOT_POSITIVE_DEFINITE.
     """
     model, m, write_innovation = (
         stage.model,
@@ -249,20 +251,15 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
     def update(
         mean: Floats,
         covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         work: Workspace,
         record: InnovationRecord,
     ) -> int:
-        present = 0
-        for i in range(m):
-            present += not np.isnan(data[i])
-        if present == 0:
+        data, parameters, gate, _ = measurement
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         innovation = work.innovations[number]
-        if not innovate(mean, covariance, data, parameters, sample_index, work):
+        if not innovate(mean, covariance, measurement, work):
             return NOT_POSITIVE_DEFINITE
         write_innovation(innovation, record)
         size = drop_missing(innovation)

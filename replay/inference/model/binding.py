@@ -4,19 +4,24 @@ One binding for all models: the topics of a model are looked for under every pre
 as `/robot1/odometry` beside `/robot1/prior`; what is absent of its sensors is left out.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from itertools import takewhile
 from typing import NamedTuple
 
+from recorders.errors import BadInput
 from recorders.log import Schema, Topic, schemas
+from recorders.log.planes import FRAME, plane_in_words, stated_in
 from replay.engine.arrays import Floats
 from replay.engine.streams.channels import resolved
-from replay.engine.streams.geodetic import GEODETIC
+from replay.engine.streams.geodetic import GEODETIC, stated_origin
 from replay.engine.streams.results import named
 from replay.inference.model.model import (
     Control,
     Model,
     Sensor,
 )
+
+START = "start"  # the frame of what begins at zero, wherever that is
 
 
 class Found(NamedTuple):
@@ -31,6 +36,7 @@ class Found(NamedTuple):
         has_prior: whether the log does; else see `replay.inference.run.initialization`.
         fallbacks: topics that take the place of some components of the control.
         origin: latitude, longitude (deg) and altitude (m) of the plane's origin (3,), where stated.
+        frame: the frame of its own that its positions are in; empty where they are in the log's plane.
     """
 
     prefix: str
@@ -41,6 +47,7 @@ class Found(NamedTuple):
     has_prior: bool = True
     fallbacks: tuple[tuple[Control, Topic], ...] = ()
     origin: Floats | None = None
+    frame: str = ""
 
     @property
     def geodetic(self) -> tuple[Topic, ...]:
@@ -89,12 +96,19 @@ def topics_of(
 ) -> list[Found]:
     """Find everything in a log that is of this model; `names` are topics by the model's names for them.
 
+    A thing's topics are in one namespace. Where that cannot be meant, since each of its sensors has one
+    of its own, they are those of one thing; see `_one_thing`.
+
     Args:
         model: the model.
         topics: of the log, by name.
         names: see above.
     """
     names = names or {}
+    one = _one_thing(model, topics, names)
+    if one is not None:
+        found_one = _found(model, one)
+        return [] if found_one is None else [found_one]
     begins = [model.prior]
     if model.start is not None:
         begins += [model.control.topic] if model.control else [each.topic for each in model.all_sensors]
@@ -104,6 +118,94 @@ def topics_of(
     )
     found = (_found(model, UnderPrefix(topics, prefix, names)) for prefix in prefixes)
     return [each for each in found if each is not None]
+
+
+def _one_thing(
+    model: Model, topics: Mapping[str, Topic], names: Mapping[str, str]
+) -> UnderPrefix | None:
+    """Return the one thing of a model whose topics are in several namespaces; None where they are not.
+
+    With one control there is one thing, in its namespace. With none there is one where no sensor, prior
+    or truth is there twice. What its namespace lacks, and one other has, is its own; what several others
+    have is not taken. Nor is a pose, which may be a goal, or in a frame of its own.
+    """
+    there = {name: topic for name, topic in topics.items() if not name.startswith("/estimates/")}
+    sensors = {
+        sensor.topic: [
+            name
+            for name in _named(there, sensor.topic, sensor.schema)
+            if there[name].metadata.get("system", model.system) == model.system
+        ]
+        for sensor in model.all_sensors
+        if sensor.schema is not schemas.POSE
+    }
+    priors = [
+        name
+        for name in _named(there, model.prior, schemas.GAUSSIAN_ESTIMATE)
+        if model.state.keys() <= set(there[name].metadata.get("components", "").split(","))
+    ]
+    others = {model.prior: priors, model.truth: _named(there, model.truth, schemas.TRUTH_STATE)}
+    given = {name for name in (*sensors, *others) if name in names or name.startswith("/") or not name}
+    found = {name: each for name, each in (sensors | others).items() if name not in given}
+    if model.control is not None:
+        name = names.get(model.control.topic, model.control.topic)
+        controls = _named(there, name, model.control.schema)
+        homes = [each.removesuffix(f"/{name.removeprefix('/')}") for each in controls]
+    else:
+        spaces = {
+            each.removesuffix(f"/{name}") for name in sensors if name in found for each in found[name]
+        }
+        are_several = any(len(each) > 1 for each in found.values()) or len(spaces) < 2
+        own = [each.removesuffix(f"/{model.prior}") for each in priors] or [_common(spaces)]
+        homes = [] if are_several else own
+    if len(homes) != 1:
+        return None
+    [home] = homes
+    elsewhere = {
+        name: each[0] for name, each in found.items() if len(each) == 1 and f"{home}/{name}" not in there
+    }
+    return UnderPrefix(topics, home, {**names, **elsewhere}) if elsewhere else None
+
+
+def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
+    """The topics of any namespace that end with this name, and serve as messages of the schema."""
+    end = f"/{name.removeprefix('/')}"
+    return [
+        each
+        for each, topic in topics.items()
+        if each.endswith(end) and topic.schema_name in serving(schema)
+    ]
+
+
+def _common(spaces: Collection[str]) -> str:
+    """The namespace that all of these are in."""
+    parts = zip(*(space.split("/") for space in spaces), strict=False)
+    alike = takewhile(lambda each: len(set(each)) == 1, parts)
+    return "/".join(each[0] for each in alike)
+
+
+def offers_of(model: Model, found: Found, topics: Mapping[str, Topic]) -> dict[str, str]:
+    """Say of topics that are not taken how they would be, where the model has none of that kind.
+
+    A kind is a sensor, or what takes the place of a part of the control; its message tells it where only
+    one has such, and else the topic's name.
+    """
+    kinds = {sensor.topic: sensor.schema for sensor in model.all_sensors}
+    if model.control is not None:
+        kinds |= {drive.topic: drive.schema for drive in model.control.fallbacks}
+    here = {each.topic for each, _ in found.sensors} | {each.topic for each, _ in found.fallbacks}
+    taken = {topic.name for _, topic in found.sensors} | {topic.name for _, topic in found.fallbacks}
+    if found.control is not None:
+        taken.add(found.control.name)
+    said = {}
+    for name, topic in topics.items():
+        fitting = [each for each, schema in kinds.items() if topic.schema_name in serving(schema)]
+        alike = [each for each in fitting if name.endswith(f"/{each}")]
+        is_told = len(fitting) == 1 and topic.schema_name != schemas.POSE.full_name
+        for role in alike[:1] or (fitting if is_told else []):
+            if name not in taken and role not in here and not name.startswith("/estimates/"):
+                said[name] = f"--set topics.{role}={name}"
+    return said
 
 
 def _found(model: Model, here: UnderPrefix) -> Found | None:
@@ -157,3 +259,38 @@ def _suffices(
 def measures_state(model: Model, sensor: Sensor) -> bool:
     """Tell whether a sensor measures components of the state by their names, with their covariance."""
     return bool(sensor.covariance) and sensor.measured.items() <= model.state.items()
+
+
+def in_its_plane(label: str, model: Model, found: Found, topics: Mapping[str, Topic]) -> Found:
+    """Find the plane that positions are in: the log's, or a frame of its own; see `Filter.start`.
+
+    Raises BadInput where a sensor says where the thing is in a frame of its own, and another one on
+    earth; and where fixes are used and channels state different origins.
+    """
+    placing = [(sensor, topic) for sensor, topic in found.sensors if "x_m" in sensor.measured]
+    if "x_m" not in model.state:
+        placing = []
+    own = [
+        (sensor, topic)
+        for sensor, topic in placing
+        if topic not in found.geodetic
+        and stated_in(topic.name, topic.metadata) is None
+        and (topic.metadata.get(FRAME) or found.geodetic)
+    ]
+    origin = stated_origin(topics) if found.geodetic else None
+    if origin is not None:
+        own = [(sensor, topic) for sensor, topic in own if topic.metadata.get(FRAME)]
+    if own and len(own) < len(placing):
+        (sensor, topic), other = own[0], next(each for each in placing if each not in own)
+        raise BadInput(
+            f"estimator {label}: {other[1].name} says where on earth, {topic.name} in "
+            f"{plane_in_words(topic.metadata)}, and no channel states where on earth that is; state it "
+            f"with --set {topic.name}.plane=LATITUDE,LONGITUDE,HEIGHT, or leave one of them out with "
+            f"--set topics.{other[0].topic}= or --set topics.{sensor.topic}="
+        )
+    if own:
+        return found._replace(frame=own[0][1].metadata[FRAME])
+    starts_anywhere = not found.has_prior and not model.finds_start and model.start is not None
+    if starts_anywhere and not placing and model.control is not None:
+        return found._replace(frame=START)
+    return found._replace(origin=origin)

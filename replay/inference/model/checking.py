@@ -70,8 +70,8 @@ def check_model(
     parameters: Mapping[str, Any] | None = None,
     states: ArrayLike | None = None,
     seed: int = 0,
-) -> None:
-    """Check all functions of a model against what it declares.
+) -> "Checked":
+    """Check all functions of a model against what it declares; returns what was checked, in sentences.
 
     Args:
         model: the model.
@@ -130,6 +130,37 @@ def check_model(
         for sensor in model.sensors:
             if not sensor.covariance:
                 _check_noise(sensor.noise, (numbers,), sensor.noises or len(sensor.measured))
+    return _checked(model, calls, parts, len(tried))
+
+
+class Checked(tuple[str, ...]):
+    """Sentences on what was checked; a notebook shows them line by line."""
+
+    def __repr__(self) -> str:
+        return "\n".join(self)
+
+
+def _checked(
+    model: Model, calls: Sequence[_Call], parts: Sequence[Motion | Sensor], states: int
+) -> Checked:
+    """Say what was checked of every function, and what was not, since nothing is declared of it."""
+    said = [f"{model.summary}: {len(calls)} functions at {states} states"]
+    for call, part in zip(calls, parts, strict=True):
+        by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
+        found = [f"derivatives by {by}", "angles, jumps and lengths"]
+        found += ["linear"] if part.linear else []
+        written = part.jacobians if isinstance(part, Motion) else part.jacobian
+        found += ["derivatives by hand"] if written is not None else []
+        states_noise = isinstance(part, Motion) or not part.covariance
+        if part.noise is None:
+            found.append("no noise is declared")
+        else:
+            found.append("variances" if states_noise else "no variances, which messages state")
+        said.append(f"{call.what}: {'; '.join(found)}")
+    for name, has in (("moments", any(part.moments for part in parts)), ("start", model.start)):
+        if has:
+            said.append(f"{name}: not checked")
+    return Checked(said)
 
 
 def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:

@@ -309,6 +309,9 @@ class Model:
     >>> from dataclasses import replace
     >>> from replay.inference.model.checking import check_model
     >>> check_model(model)
+    on a line: 2 functions at 20 states
+    move (...): derivatives by state; angles, jumps and lengths; linear; variances
+    measure (...): derivatives by state; angles, jumps and lengths; variances
     >>> check_model(replace(model, sensors=(replace(ranges, linear=True),)))
     Traceback (most recent call last):
     AssertionError: measure (...) is declared linear, but the derivative of range_m by x_m changes ...

@@ -1,6 +1,6 @@
 """Collects the numbers that a model's functions read: from parameters, or from a log's channels."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Topic
+from recorders.log.planes import ORIGIN
 from replay.engine.arrays import Floats, Function
 from replay.engine.streams.channels import stated
 from replay.inference.model.binding import Found
@@ -76,6 +77,7 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     everything = _stating(found)
     assumed = assumed_of(label, stage, found, parameters)
     given |= {name: number for name, number in assumed.items() if given[name] is None}
+    given |= _of_origin(stage, found, parameters)
     needed = _needed(f"estimator {label}", stage, tuple(given.items()))
     own = [[], *([topic] for _, topic in found.sensors)]
     settings = np.array(
@@ -110,6 +112,59 @@ def settings_of(label: str, stage: Stage, found: Found, parameters: ModelParamet
     return settings
 
 
+def origin_parameters(found: Found, parameters: ModelParameters) -> tuple[str, ...]:
+    """List the numbers of the plane's origin that are neither given nor stated for the model itself.
+
+    They are those of the plane that fixes are taken into: gravity is that of the place.
+    """
+    stating = _stating(found)
+    return tuple(
+        name
+        for name in ORIGIN
+        if found.geodetic
+        and name in type(parameters).model_fields
+        and getattr(parameters, name) is None
+        and not any(name in each.metadata for each in stating)
+    )
+
+
+def _of_origin(stage: Stage, found: Found, parameters: ModelParameters) -> dict[str, float]:
+    """Take numbers from the plane's origin; until a first fix is known, what is usual stands for its."""
+    start = stage.model.start
+    usual = start.parameters if start is not None else {}
+    return {
+        name: usual.get(name, 0.0) if found.origin is None else float(found.origin[ORIGIN.index(name)])
+        for name in origin_parameters(found, parameters)
+    }
+
+
+def placed_settings(
+    settings: Floats,
+    names: Sequence[str],
+    found: Found,
+    parameters: ModelParameters,
+    origins: Floats | None,
+    runs: int,
+) -> Floats:
+    """Repeat settings (1 + sensors, fields) for each run, with the numbers of its plane's origin.
+
+    Args:
+        settings: see `settings_of`.
+        names: of its columns.
+        found: the topics.
+        parameters: as given by the user.
+        origins: (runs, 3) of every run's plane, first fixes if none is stated; None without fixes.
+        runs: how many there are.
+    """
+    placed = np.repeat(settings[None], runs, axis=0)
+    if origins is None or found.origin is not None:
+        return placed
+    known = np.isfinite(origins[:, 0])
+    for name in origin_parameters(found, parameters):
+        placed[known, :, names.index(name)] = origins[known, ORIGIN.index(name), None]
+    return placed
+
+
 def _stating(found: Found) -> list[Topic]:
     """List the topics whose channels state numbers, in the order in which they are asked."""
     control = [] if found.control is None else [found.control]
@@ -136,7 +191,10 @@ def assumed_of(label: str, stage: Stage, found: Found, parameters: ModelParamete
     return {
         name: number
         for name, number in start.parameters.items()
-        if name in read and given[name] is None and not any(name in each.metadata for each in stating)
+        if name in read
+        and given[name] is None
+        and not any(name in each.metadata for each in stating)
+        and name not in origin_parameters(found, parameters)
     }
 
 

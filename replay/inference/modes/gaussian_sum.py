@@ -29,7 +29,7 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
+from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
 from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.gaussian import cholesky, copy_gaussian
 from replay.inference.linear_algebra.manifold import boxplus
@@ -115,19 +115,11 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
     predict_member = inner.predict
 
     def predict(
-        run: int,
-        belief: GaussianSumBelief,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memory: GaussianSumMemory,
+        run: int, belief: GaussianSumBelief, interval: Interval, memory: GaussianSumMemory
     ) -> bool:
         gaussians, well = Gaussian(belief.mean[run], belief.covariance[run]), True
         for each in range(belief.left[run]):
-            predicted = predict_member(
-                each, gaussians, control, duration_s, parameters, sample_index, memory.filters[0]
-            )
+            predicted = predict_member(each, gaussians, interval, memory.filters[0])
             well = predicted and well
         return well
 
@@ -180,17 +172,14 @@ def gaussian_sum_steps(stage: Stage, inner: Steps, members: int) -> Steps:
         def update_run(
             run: int,
             belief: GaussianSumBelief,
-            data: Floats,
-            parameters: Any,
-            gate: Floats,
-            sample_index: int,
+            measurement: Measurement,
             memory: GaussianSumMemory,
             record: InnovationRecord,
         ) -> int:
             count = belief.left[run]
             weights = belief.probability[run, :count], belief.log_probability[run, :count]
             gaussians = Gaussian(belief.mean[run, :count], belief.covariance[run, :count])
-            outcome = update(gaussians, weights, data, parameters, gate, sample_index, memory, record)
+            outcome = update(gaussians, weights, measurement, memory, record)
             if outcome == ALL_WELL and count > 1:
                 keep_possible(run, belief)
                 merge_agreeing(run, belief, memory)

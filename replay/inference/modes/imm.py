@@ -32,7 +32,7 @@ from replay.inference.kalman.methods import (
     named_filter,
     no_steps,
 )
-from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
+from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
 from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.tuples import filling
 from replay.inference.model.model import Model
@@ -97,26 +97,16 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     rates_of, fill_rates = switching.rates, filling(modes * (modes - 1))
     to_covariance = form.to_covariance
 
-    def predict(
-        run: int,
-        belief: ModeBelief,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memory: InteractingMemory,
-    ) -> bool:
+    def predict(run: int, belief: ModeBelief, interval: Interval, memory: InteractingMemory) -> bool:
         mean, covariance = belief.mean[run], belief.covariance[run]
         probability, log_probability = belief.probability[run], belief.log_probability[run]
-        fill_rates(memory.rates, rates_of(parameters))
-        fill_transition(memory.rates, duration_s, memory.transition)
+        fill_rates(memory.rates, rates_of(interval.parameters))
+        fill_transition(memory.rates, interval.duration_s, memory.transition)
         to_common_tangent(mean, covariance, probability, memory)
         fill_weights(probability, log_probability, memory)
         for mode in range(modes):
             mix(memory.weights[mode], memory, mean[mode], covariance[mode])
-        return predict_modes(
-            Gaussian(mean, covariance), control, duration_s, parameters, sample_index, memory.filters
-        )
+        return predict_modes(Gaussian(mean, covariance), interval, memory.filters)
 
     def estimate(
         run: int, belief: ModeBelief, mixtures: Mixtures, row: int, memory: InteractingMemory
@@ -154,16 +144,13 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
         def update_run(
             run: int,
             belief: ModeBelief,
-            data: Floats,
-            parameters: Any,
-            gate: Floats,
-            sample_index: int,
+            measurement: Measurement,
             memory: InteractingMemory,
             record: InnovationRecord,
         ) -> int:
             weights = belief.probability[run], belief.log_probability[run]
             gaussians = Gaussian(belief.mean[run], belief.covariance[run])
-            return update(gaussians, weights, data, parameters, gate, sample_index, memory, record)
+            return update(gaussians, weights, measurement, memory, record)
 
         return update_run
 

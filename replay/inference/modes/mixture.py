@@ -10,7 +10,7 @@ from recorders.log import make_stream, schemas
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.results import ALL_WELL, named
-from replay.inference.kalman.steps import Gaussian, InnovationRecord, Steps
+from replay.inference.kalman.steps import Gaussian, InnovationRecord, Interval, Measurement, Steps
 from replay.inference.kalman.update import innovation_components, writing_innovation
 from replay.inference.linear_algebra.gaussian import drop_missing, whiten, wrap
 from replay.inference.linear_algebra.tuples import range_of
@@ -47,21 +47,11 @@ def predicting(filters: Sequence[Steps]) -> Function:
     """Make `predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
     predictions = tuple(each.predict for each in filters)
 
-    def predict(
-        belief: Any,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memories: Any,
-    ) -> bool:
+    def predict(belief: Any, interval: Interval, memories: Any) -> bool:
         well = True
         for mode in range_of(len(predictions)):
             predict_mode, memory = predictions[mode], memories[mode]
-            well = (
-                predict_mode(mode, belief, control, duration_s, parameters, sample_index, memory)
-                and well
-            )
+            well = predict_mode(mode, belief, interval, memory) and well
         return well
 
     return predict
@@ -70,7 +60,7 @@ def predicting(filters: Sequence[Steps]) -> Function:
 def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function:
     """Make the update of several Gaussians by sensor `number`, and of the probabilities of their modes.
 
-    `update(gaussians, (probability, log_probability), data, ...)`, in place; see `Steps.updates`. A
+    `update(gaussians, (probability, log_probability), ...)`, in place; see `Steps.updates`. A
     measurement that is in the gate of one mode is let in by all: likelihoods of different measurements
     do not compare. The innovation that is recorded is that of the mixture, whose covariance has the
     spread of the modes' innovations; the log-likelihood is log sum_j mu_j N(v_j; 0, S_j).
@@ -114,26 +104,23 @@ def mixture_update(stage: Stage, number: int, update_mode: Function) -> Function
     def update(
         gaussians: Gaussian,
         weights: tuple[Floats, Floats],
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         memory: Any,
         record: InnovationRecord,
     ) -> int:
+        data, parameters, _, event = measurement
         probability, log_probability = weights
         numbers, taken = memory.records.numbers, 0
         for mode in range(len(probability)):
             numbers[mode, 2] = 0.0
-        for bounds in (gate, memory.open_gate):
+        opened = Measurement(data, parameters, memory.open_gate, event)
+        for each in (measurement, opened):
             for mode in range(len(probability)):
                 if numbers[mode, 2] == 0.0:
                     own = InnovationRecord(
                         memory.records.difference[mode], memory.records.covariance[mode], numbers[mode]
                     )
-                    outcome = update_mode(
-                        mode, gaussians, data, parameters, bounds, sample_index, memory.filters[0], own
-                    )
+                    outcome = update_mode(mode, gaussians, each, memory.filters[0], own)
                     if outcome != ALL_WELL:
                         return outcome
                     taken += int(numbers[mode, 2])

@@ -303,4 +303,5 @@ BOOTSTRAP = Method(
     variant="particles",
     made_for=_made_for,
     filtering=ParticleFilter,
+    is_random=True,
 )

@@ -15,10 +15,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.philox import Words, fill_normals, philox, unit
 from replay.inference.kalman.predict import nothing
 from replay.inference.kalman.regression import settling
-from replay.inference.kalman.steps import (
-    Gaussian,
-    Workspace,
-)
+from replay.inference.kalman.steps import Gaussian, Interval, Workspace
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
     semidefinite_cholesky,
@@ -125,15 +122,8 @@ def moving(stage: Stage, by_control: int) -> Function:
     spread = _additive_noise(stage, by_control) if is_additive else _no_noise
     scatter = add if is_additive else nothing
 
-    def predict(
-        run: int,
-        cloud: Cloud,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memory: ParticleMemory,
-    ) -> bool:
+    def predict(run: int, cloud: Cloud, interval: Interval, memory: ParticleMemory) -> bool:
+        control, duration_s, parameters, _ = interval
         states, offsets, key = cloud.states[run], cloud.offsets[run], cloud.key[run]
         cloud.counter[run] = resample(states, cloud.weight[run], key, cloud.counter[run], memory)
         cloud.counter[run] = fill_normals(memory.numbers, memory.words, key, cloud.counter[run])

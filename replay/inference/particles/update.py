@@ -11,8 +11,15 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Measurement,
 )
-from replay.inference.kalman.update import reading, sensor_noise, write_numbers, writing_innovation
+from replay.inference.kalman.update import (
+    is_unmeasured,
+    reading,
+    sensor_noise,
+    write_numbers,
+    writing_innovation,
+)
 from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     cholesky,
@@ -46,17 +53,12 @@ def weighing(stage: Stage, number: int) -> Function:
     def update(
         run: int,
         cloud: Cloud,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         memory: ParticleMemory,
         record: InnovationRecord,
     ) -> int:
-        present = 0
-        for j in range(m):
-            present += not np.isnan(data[j])
-        if present == 0:
+        data, parameters, gate, _ = measurement
+        if is_unmeasured(data, m):
             return NOTHING_MEASURED
         weight, own = cloud.weight[run], memory.sensors[number]
         compare(cloud.states[run], data, parameters, memory)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.log import Topic, schemas
+from recorders.log.planes import FRAME
 from recorders.log.streams import computed_stream
 from replay.distributions import chi2
 from replay.engine.arrays import Floats, Function, Integers
@@ -23,7 +24,7 @@ from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.covariances import Form
 from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
+from replay.inference.model.settings import placed_settings, reading_settings
 from replay.inference.model.stage import Stage, title_of
 from replay.inference.run.events import Context, data_columns, events_of, points_of
 from replay.inference.run.out_of_sequence import issued
@@ -32,6 +33,8 @@ from replay.inference.run.recursion import (
     FilterEvents,
     Innovations,
     RecursionState,
+    RunInputs,
+    RunResults,
     filled,
     no_results,
     recursion,
@@ -167,6 +170,11 @@ class Filter:
             return np.tile(self.found.origin, (runs, 1))
         return next((origins_of(static[topic.name]) for topic in self.found.geodetic), None)
 
+    def settings_of_runs(self, context: Context, runs: int) -> Floats:
+        """Repeat the settings for each run (runs, 1 + sensors, fields), see `placed_settings`."""
+        names, of = number_fields(self.stage.model.parameters), (self.found, self.parameters)
+        return placed_settings(self.settings, names, *of, context.origins, runs)
+
     def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
         events, without_covariance = events_of(
@@ -270,24 +278,22 @@ class Filter:
         recorded = ragged_rows(events.source >= 0, events.offsets)
         innovation_size = len(self.measured)
         estimates, innovations = self.no_results(due, recorded, innovation_size)
-        if self.has_partial_innovations:
+        if any(len(sensor.measured) < innovation_size for sensor in sensors):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
-        settings = np.repeat(self.settings[None], runs, axis=0)
-        generators = state.generators
+        settings, generators = self.settings_of_runs(state.context, runs), state.generators
         if self.is_random:
             generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
         for part, scratch in self.parts(generators, events):
-            columns = events, settings, self.gates, carried, estimates, innovations
-            if part is not None:
-                columns = (
-                    events._replace(offsets=events.offsets[part.start : part.stop + 1]),
-                    settings[part],
-                    self.gates,
-                    of_runs(carried, part),
-                    estimates._replace(end=estimates.end[part]),
-                    innovations._replace(end=innovations.end[part]),
-                )
-            loop(runs if part is None else part.stop - part.start, *columns, scratch=scratch)
+            inputs = RunInputs(events, settings, self.gates)
+            results = RunResults(estimates, innovations)
+            if part is None:
+                loop(runs, inputs, carried, results, scratch=scratch)
+                continue
+            own = events._replace(offsets=events.offsets[part.start : part.stop + 1])
+            inputs = RunInputs(own, settings[part], self.gates)
+            ends = estimates.end[part], innovations.end[part]
+            results = RunResults(estimates._replace(end=ends[0]), innovations._replace(end=ends[1]))
+            loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=scratch)
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
@@ -358,7 +364,8 @@ class Filter:
     @cached_property
     def state_metadata(self) -> Mapping[str, str]:
         """Return what the channel of the states says."""
-        return {**named(self.stage.model.state), "truth": self.truth}
+        frame = {FRAME: self.found.frame} if self.found.frame else {}
+        return {**named(self.stage.model.state), "truth": self.truth, **frame}
 
     @cached_property
     def innovation_metadata(self) -> Mapping[str, str]:
@@ -369,12 +376,6 @@ class Filter:
     def measured(self) -> Mapping[str, str]:
         """Return the components of all innovations."""
         return innovation_components(self.stage.sensors)
-
-    @cached_property
-    def has_partial_innovations(self) -> bool:
-        """Tell whether a sensor measures only some of these components."""
-        size = len(self.measured)
-        return any(len(sensor.measured) < size for sensor in self.stage.sensors)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
         """Make the stream of innovations, which needs a sensor; see `states`."""

@@ -8,7 +8,7 @@ import numpy as np
 from recorders.log import Clock, Stream
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.blocks import Ragged
-from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
 from replay.inference.model.stage import Stage
 from replay.inference.model.start import Start
 
@@ -44,8 +44,8 @@ def run_count(first: Mapping[str, Ragged]) -> int:
 
 def unknown(state: Mapping[str, Any], start: Start | None) -> tuple[Floats, Floats]:
     """Make the mean (n,) and sigmas (t,) of a state that nobody knows; NaN where none is given."""
-    sigmas = start.sigmas if start else {}
     kinds = list(state.values())
+    sigmas = named_now(start.sigmas, list(state), kinds) if start else {}
     mean = np.zeros(len(kinds))
     for kind, columns in manifold_blocks(kinds):
         if kind in ("axis", "quaternion"):

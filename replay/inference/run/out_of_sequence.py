@@ -9,12 +9,12 @@ told when no message can change it any more.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.log import make_stream, schemas
-from replay.engine.arrays import Floats, Function, Integers
+from replay.engine.arrays import Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.blocks import Block, Ragged, copied, ragged_rows
 from replay.engine.streams.results import ALL_WELL, failures_of
@@ -35,19 +35,42 @@ from replay.inference.run.history import (
     no_history,
     structure_of,
 )
+from replay.inference.run.loops import over_events
 from replay.inference.run.recursion import (
     CONTROL,
     FilterEvents,
     Innovations,
     RecursionState,
-    fault_of,
+    RunInputs,
+    RunResults,
     filled,
     processing,
+    writing_estimates,
 )
 from replay.inference.run.skipped import passed_over
 from replay.sampling.sets import sets_by_runs
 
 # The loop
+
+
+class LateState(NamedTuple):
+    """Holds what the recursion moves, of all runs.
+
+    Attributes:
+        carried: after all messages so far.
+        failure: that of what is carried.
+        history: what is kept.
+        window_ns: how far messages may be late.
+        repeated: (n,), how many updates each event had repeated.
+        row: (runs,), the kept message that each run is at.
+    """
+
+    carried: RecursionState
+    failure: Integers
+    history: History
+    window_ns: int
+    repeated: Integers
+    row: Integers
 
 
 @lru_cache(maxsize=64)
@@ -64,6 +87,7 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
 
     `structure` is that of `KeptMessages`.
     """
+    write = writing_estimates(estimate)
     copy, restore = copying_rows(structure), copying_rows(dict(structure)["after"])
     passes_controls = model.control is not None and not model.control.estimates
 
@@ -88,18 +112,9 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
         history.counts[run] += 1
         return row
 
-    def process_again(
-        run: int,
-        row: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
-        carried: RecursionState,
-        kept: KeptMessages,
-        at: Integers,
-        memory: Any,
-    ) -> int:
+    def process_again(run: int, row: int, inputs: RunInputs, state: LateState, memory: Any) -> int:
         """Predict to a kept message and update by it; returns what failed, or ALL_WELL."""
+        events, carried, kept, at = inputs.events, state.carried, state.history.kept, state.row
         stored = FilterEvents(
             events.offsets,
             kept.time_ns,
@@ -117,7 +132,8 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
             for j in range(kept.difference.shape[1]):
                 kept.covariance[row, i, j] = np.nan
         at[run] = row
-        failure = process(run, row, stored, settings, gates, carried, records, memory)
+        again = RunInputs(stored, inputs.settings, inputs.gates)
+        failure = process(run, row, again, carried, RunResults((), records), memory)
         kept.has_innovation[row] = at[run] > row
         restore(carried, run, kept.after, row)
         return failure
@@ -147,52 +163,49 @@ def reprocessing(model: Model, process: Function, estimate: Function, structure:
             row += 1
         return row
 
-    def follow(
-        run: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
-        window_ns: int,
-        carried: RecursionState,
-        history: History,
-        estimates: Any,
-        innovations: Innovations,
-        repeated: Integers,
-        at: Integers,
-        memory: Any,
-    ) -> None:
-        """Move what is carried and kept, and fill the results, until the events end or the run fails."""
-        kept, capacity = history.kept, len(history.kept.time_ns) // len(history.first)
-        for event in range(events.offsets[run], events.offsets[run + 1]):
-            if carried.failure[run] != ALL_WELL:
+    def reprocess(
+        run: int, event: int, inputs: RunInputs, state: LateState, results: RunResults, memory: Any
+    ) -> int:
+        """Put an event where it belongs, and use it and all behind it again."""
+        history, kept = state.history, state.history.kept
+        begin = insert(run, event, inputs.events, history, capacity_of(history))
+        last = last_row(run, history)
+        state.repeated[event] = last - begin
+        restore(kept.after, begin - 1, state.carried, run)
+        failure = ALL_WELL
+        for row in range(begin, last + 1):
+            failure = process_again(run, row, inputs, state, memory)
+            if failure != ALL_WELL:
                 break
-            begin = insert(run, event, events, history, capacity)
-            last = run * capacity + history.first[run] + history.counts[run] - 1
-            repeated[event] = last - begin
-            restore(kept.after, begin - 1, carried, run)
-            failure = ALL_WELL
-            for row in range(begin, last + 1):
-                failure = process_again(
-                    run, row, events, settings[run], gates, carried, kept, at, memory
-                )
-                if failure != ALL_WELL:
-                    break
-            if failure == ALL_WELL and events.wants_estimate[event]:
-                row, result = newest_estimated(last, kept), estimates.end[run]
-                estimate(row, kept.after.belief, estimates, result, memory)
-                failure = fault_of(estimates.mean[result], estimates.covariance[result])
-                if failure == ALL_WELL:
-                    estimates.time_ns[result] = kept.time_ns[row]
-                    estimates.end[run] = result + 1
-            first = run * capacity + history.first[run]
-            while first < last and kept.time_ns[first + 1] < kept.time_ns[last] - window_ns:
-                write_innovation(run, first, kept, innovations)
-                first += 1
-            history.counts[run] = last - first + 1
-            history.first[run] = first - run * capacity
-            carried.failure[run] = failure
+        first = run * capacity_of(history) + history.first[run]
+        while first < last and kept.time_ns[first + 1] < kept.time_ns[last] - state.window_ns:
+            write_innovation(run, first, kept, results.innovations)
+            first += 1
+        history.counts[run] = last - first + 1
+        history.first[run] = first - run * capacity_of(history)
+        return failure
 
-    return follow
+    def record(
+        run: int, event: int, inputs: RunInputs, state: LateState, results: RunResults, memory: Any
+    ) -> int:
+        """Fill in the newest estimate where one is wanted."""
+        if not inputs.events.wants_estimate[event]:
+            return ALL_WELL
+        kept = state.history.kept
+        row = newest_estimated(last_row(run, state.history), kept)
+        return write(run, row, kept.time_ns[row], kept.after.belief, results.estimates, memory)
+
+    return over_events(reprocess, record)
+
+
+def capacity_of(history: History) -> int:
+    """Return how many messages there is room for in each run."""
+    return len(history.kept.time_ns) // len(history.first)
+
+
+def last_row(run: int, history: History) -> int:
+    """Find the newest kept message of a run."""
+    return run * capacity_of(history) + history.first[run] + history.counts[run] - 1
 
 
 # As an estimator
@@ -233,16 +246,11 @@ class OutOfSequenceFilter:
         sets = tuple(next(sets_by_runs(each, (), events.offsets))[1] for each in inner.samplers)
         loop(
             runs,
-            events,
-            np.repeat(inner.settings[None], runs, axis=0),
-            inner.gates,
-            self.window_ns,
-            carried,
-            history,
-            estimates,
-            innovations,
-            repeated,
-            np.zeros(runs, np.int64),
+            RunInputs(events, inner.settings_of_runs(state.context, runs), inner.gates),
+            LateState(
+                carried, carried.failure, history, self.window_ns, repeated, np.zeros(runs, np.int64)
+            ),
+            RunResults(estimates, innovations),
             scratch=partial(steps.memory, sets),
         )
         states, *others = inner.output_streams(*filled(estimates, due))

@@ -23,11 +23,14 @@ from replay.inference.kalman.steps import (
     NOTHING_MEASURED,
     UNKNOWN,
     InnovationRecord,
+    Interval,
+    Measurement,
     Steps,
 )
 from replay.inference.linear_algebra.tuples import range_of
 from replay.inference.model.model import Model
 from replay.inference.model.stage import Stage
+from replay.inference.run.loops import over_events
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -99,6 +102,27 @@ class Innovations(NamedTuple):
     numbers: Floats
 
 
+class RunInputs(NamedTuple):
+    """Holds what a recursion goes by, in all runs.
+
+    Attributes:
+        events: in the order in which they are processed.
+        settings: (runs, 1 + sensors, fields), see `settings_of`.
+        gates: (sensors + 1, m + 1), bounds of the NIS by sensor; the last row is an open gate's.
+    """
+
+    events: FilterEvents
+    settings: Floats
+    gates: Floats
+
+
+class RunResults(NamedTuple):
+    """Holds what a recursion fills in: the method's own estimates, and innovations."""
+
+    estimates: Any
+    innovations: Innovations
+
+
 ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
 
 
@@ -165,7 +189,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         steps: the method's steps for it.
         settings_of: `settings_of(settings, row)` makes a row's parameters.
 
-    Returns `process(run, event, events, settings, gates, carried, innovations, memory)`.
+    Returns `process(run, event, inputs, carried, results, memory)`.
     """
     predict = steps.predict
     update = choosing(steps.updates)
@@ -182,37 +206,30 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 carried.control[run, k] = data[first + k]
 
     def advance(
-        run: int,
-        event: int,
-        duration_s: float,
-        events: FilterEvents,
-        settings: Floats,
-        carried: RecursionState,
-        memory: Any,
+        run: int, event: int, duration_s: float, inputs: RunInputs, carried: RecursionState, memory: Any
     ) -> bool:
         """Predict to an event."""
-        control = carried.control[run]
-        first = events.data.shape[1] - controls
+        control, data = carried.control[run], inputs.events.data[event]
+        first = len(data) - controls
         if interpolated and not np.isnan(control[0]):  # the mean of both ends drives the step
             for k in range(controls):
-                control[k] = 0.5 * (control[k] + events.data[event, first + k])
-        parameters = settings_of(settings, 0)
-        return predict(run, carried.belief, control, duration_s, parameters, event, memory)
+                control[k] = 0.5 * (control[k] + data[first + k])
+        interval = Interval(control, duration_s, settings_of(inputs.settings[run], 0), event)
+        return predict(run, carried.belief, interval, memory)
 
     def process(
         run: int,
         event: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
+        inputs: RunInputs,
         carried: RecursionState,
-        innovations: Innovations,
+        results: RunResults,
         memory: Any,
     ) -> int:
         """Predict to one event and update by it; returns what failed, ALL_WELL where nothing did.
 
         UNKNOWN in a gap of the control after which it goes on.
         """
+        events, gates, innovations = inputs.events, inputs.gates, results.innovations
         source, data = events.source[event], events.data[event]
         duration_s = (events.time_ns[event] - carried.time_ns[run]) * 1e-9
         if duration_s > 0.0:
@@ -222,7 +239,7 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 carried.control[run, :] = np.nan
                 return UNKNOWN
             carried.time_ns[run] = events.time_ns[event]
-            if not advance(run, event, duration_s, events, settings, carried, memory):
+            if not advance(run, event, duration_s, inputs, carried, memory):
                 return NOT_POSITIVE_DEFINITE
         if duration_s >= 0.0 if interpolated else source == CONTROL:
             drive(run, data, carried)
@@ -231,10 +248,11 @@ def processing(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             record = InnovationRecord(
                 innovations.difference[row], innovations.covariance[row], innovations.numbers[row]
             )
-            parameters = settings_of(settings, source + 1)
+            parameters = settings_of(inputs.settings[run], source + 1)
             waited_s = (events.time_ns[event] - carried.accepted_ns[run, source]) * 1e-9
             gate = gates[-1] if waited_s > parameters.gate_reopens_s else gates[source]
-            outcome = update(source, run, carried.belief, data, parameters, gate, event, memory, record)
+            measurement = Measurement(data, parameters, gate, event)
+            outcome = update(source, run, carried.belief, measurement, memory, record)
             if outcome >= 0:
                 return outcome
             if outcome == ALL_WELL:
@@ -258,42 +276,47 @@ def recursion(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         steps: the method's steps for it.
         settings_of: see above.
 
-    Returns `follow(run, events, settings, gates, carried, estimates, innovations, memory)`, with
-    settings (runs, 1 + sensors, fields) and gates (sensors + 1, m + 1); it changes what is carried in
-    place.
+    Returns `follow(run, inputs, carried, results, memory)`; it changes what is carried in place.
     """
-    process, estimate = processing(stage, steps, settings_of), steps.estimate
+    write = writing_estimates(steps.estimate)
 
-    def follow(
+    def record(
         run: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
+        event: int,
+        inputs: RunInputs,
         carried: RecursionState,
-        estimates: Estimates,
-        innovations: Innovations,
+        results: RunResults,
         memory: Any,
-    ) -> None:
-        """Move what is carried, and fill the results, until the events end or the run fails."""
-        start_ns = carried.time_ns[run]
-        for event in range(events.offsets[run], events.offsets[run + 1]):
-            if carried.failure[run] != ALL_WELL:
-                break
-            failure = process(run, event, events, settings[run], gates, carried, innovations, memory)
-            if (
-                failure == ALL_WELL
-                and events.wants_estimate[event]
-                and events.time_ns[event] >= start_ns
-            ):
-                row = estimates.end[run]
-                estimate(run, carried.belief, estimates, row, memory)
-                failure = fault_of(estimates.mean[row], estimates.covariance[row])
-                if failure == ALL_WELL:
-                    estimates.time_ns[row] = events.time_ns[event]
-                    estimates.end[run] = row + 1
-            carried.failure[run] = ALL_WELL if failure == UNKNOWN else failure
+    ) -> int:
+        """Fill in the estimate where one is wanted, from the state's own time on."""
+        time_ns = inputs.events.time_ns[event]
+        if inputs.events.wants_estimate[event] and time_ns >= carried.time_ns[run]:
+            return write(run, run, time_ns, carried.belief, results.estimates, memory)
+        return ALL_WELL
 
-    return follow
+    return over_events(processing(stage, steps, settings_of), record)
+
+
+def writing_estimates(estimate: Function) -> Function:
+    """Make `write(run, row, time_ns, belief, estimates, memory)`: it fills in a run's next estimate.
+
+    That is of a row of the belief; an estimate that is none counts as not written. Returns what is wrong
+    with it, see `fault_of`.
+
+    Args:
+        estimate: the method's, see `Steps.estimate`.
+    """
+
+    def write(run: int, row: int, time_ns: int, belief: Any, estimates: Any, memory: Any) -> int:
+        result = estimates.end[run]
+        estimate(row, belief, estimates, result, memory)
+        failure = fault_of(estimates.mean[result], estimates.covariance[result])
+        if failure == ALL_WELL:
+            estimates.time_ns[result] = time_ns
+            estimates.end[run] = result + 1
+        return failure
+
+    return write
 
 
 def fault_of(mean: Floats, covariance: Floats) -> int:

@@ -13,7 +13,7 @@ Bell, SIAM J. Optim. 4(3), 1994.
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Interval,
+    Measurement,
     Steps,
     Workspace,
     gaussian_filter,
@@ -102,19 +104,11 @@ def affine_steps(stage: Stage) -> Steps:
     chained = smoothing_steps(stage, steps)
     advance, hold = chained.predict, damped
 
-    def predict(
-        run: int,
-        belief: Chain,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        event: int,
-        memory: ForwardMemory,
-    ) -> bool:
-        if not advance(run, belief, control, duration_s, parameters, event, memory):
+    def predict(run: int, belief: Chain, interval: Interval, memory: ForwardMemory) -> bool:
+        if not advance(run, belief, interval, memory):
             return False
         trajectory = memory.filter.samples[0]
-        hold(belief.mean[run], belief.covariance[run], trajectory, trajectory.node[event])
+        hold(belief.mean[run], belief.covariance[run], trajectory, trajectory.node[interval.event])
         return True
 
     return chained._replace(predict=predict)
@@ -142,15 +136,8 @@ def affine_motion(stage: Stage) -> Function:
     flat, carry = is_flat(model.kinds), carrying(model.kinds)
     turn = by_right_jacobian(model.kinds)
 
-    def predict(
-        mean: Floats,
-        covariance: Floats,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        event: int,
-        work: Workspace,
-    ) -> bool:
+    def predict(mean: Floats, covariance: Floats, interval: Interval, work: Workspace) -> bool:
+        control, duration_s, parameters, event = interval
         trajectory, step = work.samples[0], work.step
         node, noise, offset = trajectory.node[event], trajectory.noise, trajectory.offset[0]
         state = read_state(trajectory.mean[node - 1])
@@ -287,13 +274,11 @@ def affine_sensor(stage: Stage, number: int) -> Function:
     def update(
         mean: Floats,
         covariance: Floats,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        event: int,
+        measurement: Measurement,
         work: Workspace,
         record: InnovationRecord,
     ) -> int:
+        data, parameters, _, event = measurement
         trajectory, innovation = work.samples[0], work.innovations[number]
         node, reference, column = trajectory.node[event], read_reference(data), trajectory.column
         if noise_enters:

@@ -20,7 +20,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
-from replay.inference.kalman.steps import InnovationRecord, Steps
+from replay.inference.kalman.steps import InnovationRecord, Interval, Measurement, Steps
 from replay.inference.linear_algebra.gaussian import (
     copy_gaussian,
     multiply,
@@ -71,6 +71,13 @@ class Nodes(NamedTuple):
     rest: Floats
 
 
+class Piece(NamedTuple):
+    """Holds nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
+
+    nodes: Nodes
+    offsets: Integers
+
+
 class ForwardMemory(NamedTuple):
     """Holds what the steps of one core work in: the filter's own memory, and four matrices (t, t)."""
 
@@ -92,21 +99,13 @@ def smoothing_steps(stage: Stage, steps: Steps) -> Steps:
     retrace, to_covariance = steps.form.retrace, steps.form.to_covariance
     find_slope = sloping(model.kinds, model.correct, steps.form)
 
-    def predict(
-        run: int,
-        belief: Chain,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        sample_index: int,
-        memory: ForwardMemory,
-    ) -> bool:
+    def predict(run: int, belief: Chain, interval: Interval, memory: ForwardMemory) -> bool:
         rest, turned, product = memory.rest, memory.turned, memory.product
         mean, covariance = belief.mean[run], belief.covariance[run]
         for row in range(t):
             for column in range(t):
                 rest[row, column] = covariance[row, column]
-        if not predict_filter(run, belief, control, duration_s, parameters, sample_index, memory.filter):
+        if not predict_filter(run, belief, interval, memory.filter):
             return False
         if not retrace(rest, covariance, memory.filter, turned, memory.factor):
             return False
@@ -144,14 +143,11 @@ def _with_memory(update: Function) -> Function:
     def update_filter(
         run: int,
         belief: Chain,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        sample_index: int,
+        measurement: Measurement,
         memory: ForwardMemory,
         record: InnovationRecord,
     ) -> int:
-        return update(run, belief, data, parameters, gate, sample_index, memory.filter, record)
+        return update(run, belief, measurement, memory.filter, record)
 
     return update_filter
 
@@ -192,6 +188,18 @@ class Later(NamedTuple):
 
     is_there: Integers
     nodes: Nodes
+
+
+class Smoothed(NamedTuple):
+    """Holds what smoothing fills in: the nodes of run r before row stop[r], from row start[r] on.
+
+    Each comes back from the last node within the lag.
+    """
+
+    stop: Integers
+    start: Integers
+    lag_ns: int
+    estimates: Estimates
 
 
 class BackMemory(NamedTuple):
@@ -246,21 +254,10 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
             work.mean[row] = mean[row]
         move(work.mean, work.covariance, work)
 
-    def smooth(
-        run: int,
-        nodes: Nodes,
-        offsets: Integers,
-        stop: Integers,
-        lag_ns: int,
-        later: Later,
-        start: Integers,
-        smoothed: Estimates,
-        work: BackMemory,
-    ) -> None:
-        """Smooth the nodes of a piece that lie before row stop[run], into the rows from start[run] on.
-
-        Each comes back from the last node within the lag; `later` then holds the first of them.
-        """
+    def smooth(run: int, piece: Piece, later: Later, smoothed: Smoothed, work: BackMemory) -> None:
+        """Smooth the nodes of a piece; `later` then holds the first of them."""
+        nodes, offsets = piece
+        stop, start, lag_ns, estimates = smoothed
         begin, through, reached = offsets[run], offsets[run + 1] - 1, -1
         at = through
         for row in range(stop[run] - 1, begin - 1, -1):
@@ -277,8 +274,8 @@ def backward_pass(kinds: Kinds, correct: Correction | None = None) -> Function:
                 go_back(nodes.mean[at - 1], nodes.covariance[at - 1], nodes, at, work)
                 at -= 1
             place = start[run] + row - begin
-            smoothed.time_ns[place] = nodes.time_ns[row]
-            copy_gaussian(work.mean, work.covariance, smoothed.mean[place], smoothed.covariance[place])
+            estimates.time_ns[place] = nodes.time_ns[row]
+            copy_gaussian(work.mean, work.covariance, estimates.mean[place], estimates.covariance[place])
         if stop[run] > begin:
             later.is_there[run] = True
             first = later.nodes

@@ -11,6 +11,8 @@ from replay.inference.kalman.steps import (
     NOT_POSITIVE_DEFINITE,
     NOTHING_MEASURED,
     InnovationRecord,
+    Interval,
+    Measurement,
     Steps,
     Workspace,
     workspace,
@@ -74,15 +76,8 @@ def bound_steps(stage: Stage) -> Steps:
     linearise = motion_derivative(model, motion, by_state=True)
     add_noise = motion_noise(model, motion)
 
-    def predict(
-        run: int,
-        trajectory: TrueTrajectory,
-        control: Floats,
-        duration_s: float,
-        parameters: Any,
-        event: int,
-        memory: BoundMemory,
-    ) -> bool:
+    def predict(run: int, trajectory: TrueTrajectory, interval: Interval, memory: BoundMemory) -> bool:
+        control, duration_s, parameters, event = interval
         mean, work = trajectory.mean[run], memory.work
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
@@ -123,22 +118,19 @@ def bound_update(stage: Stage, number: int) -> Function:
     def update(
         run: int,
         trajectory: TrueTrajectory,
-        data: Floats,
-        parameters: Any,
-        gate: Floats,
-        event: int,
+        measurement: Measurement,
         memory: BoundMemory,
         record: InnovationRecord,
     ) -> int:
         mean, covariance, work = trajectory.mean[run], trajectory.covariance[run], memory.work
         if np.isnan(mean[0]):
             return NO_TRUTH
-        innovate(mean, covariance, data, parameters, event, work)
+        innovate(mean, covariance, measurement, work)
         innovation, noise = work.innovations[number], memory.noise[number]
         for i in range(m):
             for j in range(m):
                 noise[i, j] = 0.0
-        add_noise(noise, data, parameters, work)
+        add_noise(noise, measurement.data, measurement.parameters, work)
         size = 0
         for i in range(m):
             if not np.isnan(innovation.difference[i]):

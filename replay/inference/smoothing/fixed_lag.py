@@ -12,8 +12,7 @@ from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.inference.linear_algebra.gaussian import copy_gaussian, propagate_covariance
 from replay.inference.linear_algebra.manifold import boxminus, boxplus
-from replay.inference.run.recursion import Estimates
-from replay.inference.smoothing.backward_pass import BackMemory, Nodes, compose
+from replay.inference.smoothing.backward_pass import BackMemory, Nodes, Piece, Smoothed, compose
 
 
 class Window(NamedTuple):
@@ -73,18 +72,10 @@ def sliding(kinds: tuple[str, ...]) -> Function:
             for column in range(len(step)):
                 work.covariance[row, column] += rest[row, column]
 
-    def slide(
-        run: int,
-        nodes: Nodes,
-        offsets: Integers,
-        stop: Integers,
-        lag_ns: int,
-        window: Window,
-        start: Integers,
-        smoothed: Estimates,
-        work: BackMemory,
-    ) -> None:
-        """Smooth the nodes before row stop[run] into the rows from start[run] on."""
+    def slide(run: int, piece: Piece, window: Window, smoothed: Smoothed, work: BackMemory) -> None:
+        """Smooth the nodes of a piece, and move the window."""
+        nodes, offsets = piece
+        stop, start, lag_ns, estimates = smoothed
         begin, last = offsets[run], offsets[run + 1] - 1
         turned, through = begin + window.turned[run], begin + window.through[run]
         for row in range(begin, stop[run]):
@@ -105,9 +96,9 @@ def sliding(kinds: tuple[str, ...]) -> Function:
             if turned > row:
                 go_back(nodes.gain[row + 1], nodes.predicted[row + 1], nodes.rest[row + 1], work)
             place = start[run] + row - begin
-            smoothed.time_ns[place] = nodes.time_ns[row]
-            mean = smoothed.mean[place]
-            copy_gaussian(nodes.mean[row], work.covariance, mean, smoothed.covariance[place])
+            estimates.time_ns[place] = nodes.time_ns[row]
+            mean = estimates.mean[place]
+            copy_gaussian(nodes.mean[row], work.covariance, mean, estimates.covariance[place])
             add(mean, work.mean)
         window.turned[run], window.through[run] = turned - stop[run], through - stop[run]
 

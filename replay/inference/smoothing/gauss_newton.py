@@ -26,18 +26,18 @@ from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
 from replay.inference.run.recursion import (
-    Estimates,
-    FilterEvents,
     Innovations,
     RecursionState,
+    RunInputs,
+    RunResults,
     recursion,
 )
 from replay.inference.smoothing.affine import Trajectory, affine_steps, damped, reaching
 from replay.inference.smoothing.backward_pass import (
-    FOREVER_NS,
     ForwardMemory,
     Later,
-    Nodes,
+    Piece,
+    Smoothed,
     backward_pass,
 )
 
@@ -58,6 +58,23 @@ class Plan(NamedTuple):
     initial: Floats
     damping: float
     passes: int
+
+
+class SearchState(NamedTuple):
+    """Holds what a search changes, of all runs.
+
+    Attributes:
+        carried, piece, innovations: of the pass forward.
+        later, smoothed: of the way back.
+        kept: (nodes, n), the best trajectory.
+    """
+
+    carried: RecursionState
+    piece: Piece
+    innovations: Innovations
+    later: Later
+    smoothed: Smoothed
+    kept: Floats
 
 
 class Ended(NamedTuple):
@@ -88,18 +105,10 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
     flat, hold = is_flat(kinds), damped
 
     def go_forward(
-        run: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
-        plan: Plan,
-        carried: RecursionState,
-        nodes: Nodes,
-        offsets: Integers,
-        innovations: Innovations,
-        memory: ForwardMemory,
+        run: int, inputs: RunInputs, plan: Plan, state: SearchState, memory: ForwardMemory
     ) -> bool:
         """Filter about the trajectory, and sum its cost; whether all went well."""
+        carried, (nodes, offsets) = state.carried, state.piece
         trajectory, belief, begin = memory.filter.samples[0], carried.belief, offsets[run]
         mean, covariance = belief.mean[run], belief.covariance[run]
         for row in range(t):
@@ -120,7 +129,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
             carried.control[run, row] = plan.initial[row]
         carried.time_ns[run], carried.failure[run] = plan.start_ns[run], ALL_WELL
         nodes.end[run] = begin
-        follow(run, events, settings, gates, carried, nodes, innovations, memory)
+        follow(run, inputs, carried, RunResults(nodes, state.innovations), memory)
         whole = carried.failure[run] == ALL_WELL and nodes.end[run] == offsets[run + 1]
         return whole and np.isfinite(trajectory.cost[0] + trajectory.held[0])
 
@@ -148,23 +157,11 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         return largest, squares, settled
 
     def search_run(
-        run: int,
-        events: FilterEvents,
-        settings: Floats,
-        gates: Floats,
-        plan: Plan,
-        carried: RecursionState,
-        nodes: Nodes,
-        offsets: Integers,
-        innovations: Innovations,
-        later: Later,
-        kept: Floats,
-        smoothed: Estimates,
-        ended: Ended,
-        scratch: Any,
+        run: int, inputs: RunInputs, plan: Plan, state: SearchState, ended: Ended, scratch: Any
     ) -> None:
-        """Move `kept` (nodes, n) to the best trajectory of run `run`; the covariances go with it."""
+        """Move what is kept to the best trajectory of a run; the covariances go with it."""
         memory, back = scratch
+        offsets, later, kept, smoothed = state.piece.offsets, state.later, state.kept, state.smoothed
         trajectory, begin, end = memory.filter.samples[0], offsets[run], offsets[run + 1]
         ended.passes[run] = ended.converged[run] = 0
         best, damping, again, last = np.inf, plan.damping, False, False
@@ -172,9 +169,7 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
         taken, promised = 0.0, 0.0
         while begin < end:
             trajectory.damping[0] = damping
-            well = go_forward(
-                run, events, settings, gates, plan, carried, nodes, offsets, innovations, memory
-            )
+            well = go_forward(run, inputs, plan, state, memory)
             held, passes = trajectory.held[0], ended.passes[run]
             slack, poor = COST_ROUNDING * max(1.0, best), False
             if not again:
@@ -190,10 +185,10 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
                 taken, last = damping, damping > MOST_DAMPING
             else:
                 later.is_there[run] = False
-                go_back(run, nodes, offsets, offsets[1:], FOREVER_NS, later, offsets, smoothed, back)
+                go_back(run, state.piece, later, smoothed, back)
                 if last:
                     return
-                largest, squares, settled = move(trajectory, kept, smoothed.mean, begin, end)
+                largest, squares, settled = move(trajectory, kept, smoothed.estimates.mean, begin, end)
                 output_streams = ended.output_streams[run, passes]
                 output_streams[0], output_streams[1], output_streams[2] = best, damping, largest
                 ended.passes[run] += 1

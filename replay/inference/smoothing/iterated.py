@@ -22,19 +22,21 @@ from replay.inference.kalman.steps import Gaussian, Steps
 from replay.inference.model.stage import Stage
 from replay.inference.run.events import data_columns
 from replay.inference.run.filtering import FilterState
-from replay.inference.run.recursion import NOTHING, Estimates, FilterEvents, no_results
+from replay.inference.run.recursion import NOTHING, Estimates, FilterEvents, RunInputs, no_results
 from replay.inference.run.timing import join_events, last_of_stamps, output_times, select_events
 from replay.inference.smoothing import smoothers
 from replay.inference.smoothing.affine import LOSSES, Trajectory, no_factors
 from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Nodes,
+    Piece,
+    Smoothed,
     back_memory,
     no_later,
     smoothing_steps,
 )
-from replay.inference.smoothing.gauss_newton import Ended, Plan, searching
-from replay.inference.smoothing.smoothers import Piece, Smoother, SmootherParameters
+from replay.inference.smoothing.gauss_newton import Ended, Plan, SearchState, searching
+from replay.inference.smoothing.smoothers import Smoother, SmootherParameters
 
 
 class IteratedParameters(SmootherParameters):
@@ -213,12 +215,11 @@ class IteratedSmoother(Smoother):
             )
             return steps.memory((own,)), back_memory(t, t)
 
-        settings = np.repeat(self.settings[None], runs, axis=0)
+        settings = self.settings_of_runs(state.context, runs)
         gates = np.full_like(self.gates, np.inf)
-        loop(
-            runs, events, settings, gates, plan, carried, vectors, offsets, innovations, later,
-            kept.mean, smoothed, ended, scratch=scratch,
-        )  # fmt: skip
+        back = Smoothed(offsets[1:], offsets, FOREVER_NS, smoothed)
+        found = SearchState(carried, Piece(vectors, offsets), innovations, later, back, kept.mean)
+        loop(runs, RunInputs(events, settings, gates), plan, found, ended, scratch=scratch)
         return ended
 
     def _told(self, ended: Ended, way: Way) -> list[Ragged]:

@@ -38,6 +38,8 @@ from replay.inference.smoothing.backward_pass import (
     FOREVER_NS,
     Chain,
     Nodes,
+    Piece,
+    Smoothed,
     back_memory,
     backward_pass_over_runs,
     no_later,
@@ -85,13 +87,6 @@ def parse_forward(text: str) -> Forward:
 
 
 # As an estimator
-
-
-class Piece(NamedTuple):
-    """Holds nodes of all runs: run r owns offsets[r]:offsets[r + 1]."""
-
-    nodes: Nodes
-    offsets: Integers
 
 
 class Stored:
@@ -195,8 +190,8 @@ class Smoother(Filter):
         offsets = np.append(0, np.cumsum(stop - piece.offsets[:-1]))
         smoothed = _no_estimates(offsets, model.size, model.tangent)
         memory = partial(back_memory, model.size, model.tangent)
-        arguments = (piece.nodes, piece.offsets, stop, self.lag_ns, window, offsets, smoothed)
-        sliding_over_runs(model.kinds)(len(stop), *arguments, scratch=memory)
+        filled = Smoothed(stop, offsets, self.lag_ns, smoothed)
+        sliding_over_runs(model.kinds)(len(stop), piece, window, filled, scratch=memory)
         return smoothed, offsets
 
     def _no_window(self, runs: int) -> Window:
@@ -224,8 +219,9 @@ class Smoother(Filter):
             start -= of_piece
             end = piece.offsets[:-1] + of_piece
             memory = partial(back_memory, n, t)
-            arguments = (piece.nodes, piece.offsets, end, self.lag_ns, later, start, smoothed)
-            backward_pass_over_runs(model.kinds, model.correct)(runs, *arguments, scratch=memory)
+            filled = Smoothed(end, start, self.lag_ns, smoothed)
+            go_back = backward_pass_over_runs(model.kinds, model.correct)
+            go_back(runs, piece, later, filled, scratch=memory)
         return smoothed, offsets
 
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from replay.distributions import chi2
 
 Array = NDArray[np.float64]
+CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is within its interval
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:

@@ -7,7 +7,7 @@ Scaramuzza, "A tutorial on quantitative trajectory evaluation for visual(-inerti
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,31 +15,23 @@ from scipy.spatial.transform import Rotation
 
 from recorders.errors import BadInput
 from recorders.log import Clock, Stream
-from recorders.models.orientation import compose
-from recorders.models.planar import wrap_angle
 from recorders.trajectories import Trajectory
+from replay.engine.streams.planes import HEADING, VECTORS, Movement, moved_states
 from replay.engine.streams.sources import LogSource
 from replay.engine.vectors.components import stated_components
-from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+from replay.judging.errors.planes import ALIGNED
 
 Floats = NDArray[np.float64]
 Align = Literal["none", "yaw", "se2", "se3", "sim3"]
 
-# Components of one vector in the log's frame, which turn together; the first is the position.
-VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "m"), ("v", "mps"))]
-HEADING = "heading_rad"
 # Of the two largest extents of a path, squared: rounding alone makes straight lines as wide as this.
 LEAST_WIDTH = 1e-10
 # The cosine of an angle that is none but for rounding: 1e-6 rad.
 LEAST_COSINE = 1 - 1e-12
 
 
-class Alignment(NamedTuple):
+class Alignment(Movement):
     """The transform p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
-
-    rotation: Floats = np.eye(3)
-    translation_m: Floats = np.zeros(3)
-    scale: float = 1.0
 
 
 def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
@@ -107,40 +99,20 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
     Raises BadInput where a planar state would be turned out of its plane.
     """
     components = stated_components(estimates.metadata, {}, f"topic {estimates.topic}")
-    names, kinds = list(components), list(components.values())
-    tangent = [name for name, _ in tangent_components(names, kinds)]
-    mean = estimates["mean"].copy()
-    jacobian = np.eye(len(tangent))
-    is_flat = False
-    for vector in VECTORS:
-        there = [axis for axis, name in enumerate(vector) if name in components]
-        if not there:
-            continue
-        turn = alignment.scale * alignment.rotation[np.ix_(there, there)]
-        is_flat |= len(there) < 3
-        columns = [names.index(vector[axis]) for axis in there]
-        rows = [tangent.index(vector[axis]) for axis in there]
-        shift = alignment.translation_m[there] if vector == VECTORS[0] else 0.0
-        mean[:, columns] = mean[:, columns] @ turn.T + shift
-        jacobian[np.ix_(rows, rows)] = turn
-    if components.get(HEADING) == "angle":
-        is_flat = True
-        yaw_rad = np.arctan2(alignment.rotation[1, 0], alignment.rotation[0, 0])
-        column = names.index(HEADING)
-        mean[:, column] = wrap_angle(mean[:, column] + yaw_rad)
+    is_flat = components.get(HEADING) == "angle" or any(
+        0 < len(components.keys() & set(vector)) < len(vector) for vector in VECTORS
+    )
     if is_flat and alignment.rotation[2, 2] < LEAST_COSINE:
         raise BadInput(
             f"topic {estimates.topic}: is planar, and the alignment would turn it out of its plane; "
             "give --align se2"
         )
-    quaternion = Rotation.from_matrix(alignment.rotation).as_quat(scalar_first=True)
-    for kind, columns_of in manifold_blocks(kinds):
-        if kind == "quaternion":
-            mean[:, columns_of] = compose(quaternion, mean[:, columns_of])
-    size = len(tangent)
+    mean, jacobian = moved_states(components, estimates["mean"], alignment)
+    size = len(jacobian)
     covariance = jacobian @ estimates["covariance"].reshape(-1, size, size) @ jacobian.T
     changed = {"mean": mean, "covariance": covariance.reshape(len(mean), size * size)}
-    return replace(estimates, columns={**estimates.columns, **changed})
+    metadata = {**estimates.metadata, ALIGNED: "truth"}
+    return replace(estimates, columns={**estimates.columns, **changed}, metadata=metadata)
 
 
 @dataclass(frozen=True, repr=False)

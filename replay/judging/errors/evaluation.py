@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.log import Stream
+from recorders.log.planes import Origin
+from recorders.models.orientation import heading
 from replay.distributions import chi2
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.planes import into_plane_of
 from replay.engine.streams.sources import Source
 from replay.engine.vectors.components import (
     Components,
@@ -33,10 +36,11 @@ from replay.engine.vectors.tangent import (
     tangent_components,
     truth_at,
 )
+from replay.judging.errors.planes import ALIGNED, FirstFixes, planes_of, unlike
 from replay.judging.errors.truths import Truths
 
 Floats = NDArray[np.float64]
-POSITION = ("x_m", "y_m", "z_m")
+POSITION, HEADING = ("x_m", "y_m", "z_m"), "heading_rad"
 BOUND = "bound"  # in the metadata of what is no estimate, but what no estimator gets below
 
 
@@ -68,6 +72,7 @@ class Errors:
             known here.
         is_bound: whether these are no estimates, but what is known at the truth itself: the covariances
             are then what the squares of errors are at least.
+        heading_rad: (n,) the true heading; None where truth and estimate have none.
     """
 
     estimator: str
@@ -84,6 +89,7 @@ class Errors:
     without_truth: int
     components_without_truth: tuple[str, ...] = ()
     is_bound: bool = False
+    heading_rad: Floats | None = None
 
     @property
     def squared(self) -> Floats:
@@ -117,7 +123,9 @@ PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
     """Some rows of errors."""
-    return replace(errors, **{name: getattr(errors, name)[rows] for name in PER_ROW})
+    columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
+    heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
+    return replace(errors, **columns, heading_rad=heading_rad)
 
 
 class Innovations(NamedTuple):
@@ -185,11 +193,13 @@ def errors_of(
     *,
     steps: NDArray[np.int64] | None = None,
     first_run: int = 0,
+    first_fixes: FirstFixes | None = None,
 ) -> Errors | None:
     """Errors of a Gaussian estimate stream of an ensemble, in the components that all truths have.
 
-    An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, or the
-    truths have nothing in common with the estimates (see `components_without_truth`).
+    An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, the
+    truths have nothing in common with the estimates (see `components_without_truth`), or their planes
+    have not (see `unlike`); a truth in another plane is taken into that of the estimates.
 
     Args:
         estimates: the stream, or a block of it.
@@ -197,6 +207,7 @@ def errors_of(
         gap_limit_s: the truth is not interpolated over longer gaps.
         steps: (runs,) how many estimates of each run came before.
         first_run: the number of the first run.
+        first_fixes: the planes of estimates whose channels state none.
 
     Raises BadInput where the stream does not say what its components are, or a truth states that one
     is of another kind.
@@ -207,12 +218,16 @@ def errors_of(
     truth_topic = stream.metadata.get("truth", "")
     lacking = components_without_truth(estimates, sources)
     judged = {name: kind for name, kind in components.items() if name not in lacking}
+    first_fixes = first_fixes or {}
     if not judged or not all(truth_topic in source.topics for source in sources):
         return None
+    if unlike(stream, sources, first_fixes):
+        return None
+    planes = planes_of(stream, len(sources), first_fixes)
     names, kinds = list(judged), list(judged.values())
     truth = np.concatenate(
         [
-            reference(truth, truth_topic, judged, estimates.of_run(run), gap_limit_s)
+            reference(truth, truth_topic, judged, estimates.of_run(run), gap_limit_s, planes[run])
             for run, truth in enumerate(truths)
         ]
     )
@@ -246,7 +261,19 @@ def errors_of(
         int((~known).sum()),
         lacking,
         is_bound,
+        _heading_of(truth[known], judged),
     )
+
+
+def _heading_of(state: Floats, components: Components) -> Floats | None:
+    """The heading (n,) in a state (n, components); None where it has none."""
+    names, kinds = list(components), list(components.values())
+    if components.get(HEADING) == "angle":
+        return state[:, names.index(HEADING)]
+    if "quaternion" in kinds:
+        first = kinds.index("quaternion")
+        return heading(state[:, first : first + WIDTHS["quaternion"]])
+    return None
 
 
 def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
@@ -271,6 +298,19 @@ def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tu
     )
 
 
+def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: FirstFixes) -> str:
+    """Say what of a Gaussian estimate stream is not judged, and why; empty where all is."""
+    what = " ".join(filter(None, split_topic(estimates.stream.topic)))
+    if why := unlike(estimates.stream, sources, first):
+        return f"{what}: not judged: {why}"
+    names = components_without_truth(estimates, sources)
+    if not names:
+        return ""
+    verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
+    truth = estimates.stream.metadata["truth"]
+    return f"{what}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
+
+
 def _components(stream: Stream) -> dict[str, Any]:
     """Names and kinds of an estimate's components; raises BadInput where it does not state them."""
     names = stream.components
@@ -284,9 +324,16 @@ def _components(stream: Stream) -> dict[str, Any]:
 
 
 def reference(
-    truths: Truths, topic: str, components: Components, estimates: Stream, gap_limit_s: float
+    truths: Truths,
+    topic: str,
+    components: Components,
+    estimates: Stream,
+    gap_limit_s: float,
+    plane: Origin | None = None,
 ) -> Floats:
     """The truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
+
+    Where it states the origin of another plane than that of the estimates, it is taken into theirs.
 
     Raises BadInput where the truth lacks a component.
     """
@@ -294,6 +341,8 @@ def reference(
     truth = truths.around(topic, times, gap_limit_s, estimates.topic)
     if len(truth) == 0:
         return np.full((len(estimates), len(components)), np.nan)
+    if plane is not None and ALIGNED not in estimates.metadata:
+        truth = into_plane_of(truth, plane)
     columns = match_components(truth.metadata, components, f"{truths.source.name}: topic {topic}")
     known = replace(truth, columns={"state": truth["state"][:, columns]})
     return truth_at(known, times, list(components.values()), gap_limit_s)

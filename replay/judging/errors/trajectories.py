@@ -5,6 +5,7 @@ IROS 2012; conventions and names are those of evo (https://github.com/MichaelGru
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
@@ -24,6 +25,8 @@ Association = Literal["nearest", "interpolated"]
 POSE_KINDS = ("linear",) * 3 + ("quaternion",) * 4
 # Grids for the time offset are no longer than this.
 MOST_STEPS = 1 << 20
+# Offsets that are tried in all, and from how many of the best the search goes on.
+GRID, STARTS = 65, 4
 # From the correlation's best place to the best offset it is a few steps.
 MOST_MOVES = 50
 
@@ -98,7 +101,7 @@ class Compared(NamedTuple):
 
 
 def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> Compared:
-    """Associate, align, and take the errors.
+    """Associate, align, and take the errors; a time offset that is sought is added where it helps.
 
     Raises BadInput where no poses belong together, they do not tell the alignment, or the way is shorter
     than the delta.
@@ -109,6 +112,12 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
     offset_s = comparison.time_offset_s
     if offset_s == "estimate":
         offset_s = estimated_offset_s(estimate, truth, comparison.align)
+        shifted = compare(estimate, truth, replace(comparison, time_offset_s=offset_s))
+        with suppress(BadInput):  # as where the stamps are far apart without
+            as_it_is = compare(estimate, truth, replace(comparison, time_offset_s=0.0))
+            if np.mean(as_it_is.absolute_m**2) <= np.mean(shifted.absolute_m**2):
+                return as_it_is
+        return shifted
     if offset_s:
         _stamps(truth)  # without which the offset would go unnoticed
         estimate = replace(estimate, time_ns=_stamps(estimate) + round(offset_s * 1e9))
@@ -280,8 +289,9 @@ def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
 def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) -> float:
     """Estimate what to add to the estimate's stamps, in s, so that it is nearest to the truth.
 
-    From where the speeds of both correlate most, which no alignment changes, the search goes down to the
-    offset with the least RMSE of aligned positions.
+    What is least is the RMSE of aligned positions. The search goes down from where that is least among
+    the offsets at which the speeds of both correlate most, which no alignment changes, a grid of all
+    that leave half of the poses a truth, and none at all.
 
     Raises BadInput where one has no stamps, or its speed never changes.
     """
@@ -303,12 +313,16 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
                 "give the offset in s"
             )
         speeds.append(speed - speed.mean())
-    offset_s = float(times[1][0] - times[0][0] + _best_lag(*speeds) * step_s)
+    begin_s = times[1][0] - times[0][0]
+    shorter = 0.5 * min(spans)
+    grid = np.linspace(begin_s - spans[0] + shorter, begin_s + spans[1] - shorter, GRID)
+    candidates = [0.0, *(begin_s + _best_lags(*speeds) * step_s), *grid]
 
     def covered(offset_s: float) -> NDArray[np.bool_]:
         return (times[1][0] <= times[0] + offset_s) & (times[0] + offset_s <= times[1][-1])
 
-    least = covered(offset_s).sum() / 2  # of few poses the RMSE is small anywhere
+    # of few poses the RMSE is small anywhere
+    least = max(int(covered(offset_s).sum()) for offset_s in candidates) / 2
 
     def rmse_m(offset_s: float) -> float:
         inside = covered(offset_s)
@@ -316,21 +330,28 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
             return np.inf
         there = estimate.position_m[inside]
         true = _positions_at(truth, times[1], times[0][inside] + offset_s)
-        found = alignment_of(there, true, align, estimate.name)
+        try:
+            found = alignment_of(there, true, align, estimate.name)
+        except BadInput:  # of this part of the way, which may be straight
+            return np.inf
         error = found.scale * there @ found.rotation.T + found.translation_m - true
         return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
-    for _ in range(MOST_MOVES):
-        around = offset_s - 2 * step_s, offset_s + 2 * step_s
-        before_s = offset_s
-        offset_s = float(minimize_scalar(rmse_m, bounds=around, options={"xatol": 1e-6}).x)
-        if abs(offset_s - before_s) < step_s:
-            break
-    return offset_s
+    def least_near(offset_s: float) -> float:
+        for _ in range(MOST_MOVES):
+            around = offset_s - 2 * step_s, offset_s + 2 * step_s
+            before_s = offset_s
+            offset_s = float(minimize_scalar(rmse_m, bounds=around, options={"xatol": 1e-6}).x)
+            if abs(offset_s - before_s) < step_s:
+                break
+        return offset_s
+
+    starts = sorted(candidates, key=rmse_m)[:STARTS]
+    return min([0.0, *map(least_near, starts)], key=rmse_m)
 
 
-def _best_lag(estimate: Floats, truth: Floats) -> int:
-    """How many places later the first signal correlates most with the other.
+def _best_lags(estimate: Floats, truth: Floats) -> Integers:
+    """How many places later the first signal correlates most with the other: the highest peaks.
 
     Pearson's correlation of what overlaps, which is half of the shorter one at least.
     """
@@ -345,7 +366,10 @@ def _best_lag(estimate: Floats, truth: Floats) -> int:
     product = np.maximum(variances[0], least[0]) * np.maximum(variances[1], least[1])
     correlation = (count * correlate(truth, estimate) - sums[0] * sums[1]) / np.sqrt(product)
     correlation[2 * count < min(len(estimate), len(truth))] = -np.inf
-    return int(correlation_lags(len(truth), len(estimate))[np.argmax(correlation)])
+    beside = np.pad(correlation, 1, constant_values=-np.inf)
+    peaks = np.flatnonzero((correlation >= beside[:-2]) & (correlation >= beside[2:]))
+    highest = peaks[np.argsort(-correlation[peaks], kind="stable")[:STARTS]]
+    return correlation_lags(len(truth), len(estimate))[highest]
 
 
 def _positions_at(trajectory: Trajectory, time_s: Floats, at_s: Floats) -> Floats:

@@ -6,19 +6,21 @@ from scipy.spatial.transform import Rotation
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.trajectories import Trajectory
+from replay.engine.streams.planes import HEADING
 from replay.engine.vectors.components import stated_components
 from replay.engine.vectors.tangent import manifold_blocks, tangent_components
-from replay.judging.errors.alignment import HEADING
 from replay.judging.errors.evaluation import POSITION
 from replay.judging.errors.trajectories import POSE_KINDS
 
 
 def trajectory_of(stream: Stream) -> Trajectory | None:
-    """The poses that a truth or an estimate stream states; None where it states no position.
+    """The poses that a truth, an estimate or a Pose stream states; None where it states no position.
 
     What the position lacks is zero, as the height of a robot in the plane; a heading is a rotation about
     the vertical. Poses that are not finite are left out.
     """
+    if stream.schema.full_name == schemas.POSE.full_name:
+        return _of_poses(stream)
     components = stated_components(stream.metadata, {}, f"topic {stream.topic}")
     names, kinds = list(components), list(components.values())
     if POSITION[0] not in names or len(set(names).intersection(POSITION)) < 2:
@@ -37,6 +39,17 @@ def trajectory_of(stream: Stream) -> Trajectory | None:
     elif components.get(HEADING) == "angle":
         rotation = Rotation.from_euler("z", state[:, [names.index(HEADING)]]).as_matrix()
     return Trajectory(stream.topic, position_m, rotation, stamps)
+
+
+def _of_poses(stream: Stream) -> Trajectory:
+    """Positions with unit quaternions; what is not finite is left out."""
+    position_m, quaternion = (
+        stream[name].reshape(len(stream), width)
+        for name, width in (("position_m", 3), ("quaternion", 4))
+    )
+    known = np.isfinite(np.hstack([position_m, quaternion])).all(axis=1)
+    rotation = Rotation.from_quat(quaternion[known], scalar_first=True).as_matrix()
+    return Trajectory(stream.topic, position_m[known], rotation, stream.publish_time_ns[known])
 
 
 def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:

@@ -137,12 +137,14 @@ def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Flo
     return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
 
 
-def _nis(innovations: Innovations) -> Sums:
+def innovation_sums(innovations: Innovations) -> Sums:
+    """Count messages, and those that a gate let in, with their numbers, and sum NIS."""
     return {
         "messages": len(innovations.squared),
         "squared": float(innovations.squared.sum()),
         "degrees": int(innovations.degrees.sum()),
         "accepted": int(innovations.accepted.sum()),
+        "accepted_degrees": int(innovations.degrees[innovations.accepted].sum()),
     }
 
 
@@ -264,7 +266,7 @@ CONSISTENCY = Metric(
     "NEES against its chi-square bounds", Errors, _no_nees, _add_nees, _merge_nees, consistency
 )
 INNOVATION = metric_of_sums(
-    "NIS, and the share of measurements that a gate kept out", Innovations, _nis, innovation
+    "NIS, and the share of measurements that a gate kept out", Innovations, innovation_sums, innovation
 )
 LIKELIHOOD = metric_of_sums(
     "log-likelihood of the measurements, per run", Innovations, _log_likelihoods, likelihood

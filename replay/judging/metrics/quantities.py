@@ -1,9 +1,10 @@
 """Keeps the sums of an estimate stream's errors by step and by time, which merge."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from replay.judging.errors.constant import ConstantSums
 from replay.judging.errors.evaluation import Errors, Floats
 from replay.judging.metrics.sums import BinnedSums
 
@@ -13,17 +14,20 @@ class Quantities:
     """Sums of one estimate stream: what tables and figures are made of.
 
     The columns of both sums are elapsed time, squared error of the position, of the rotation and of
-    each component, trace of the main quantity's covariance and of its square, and NEES.
+    each component, trace of the main quantity's covariance and of its square, and NEES. `constant` tells
+    an error that stays.
     """
 
     errors: Errors  # the last block: for names and kinds
     by_step: BinnedSums
     by_time: BinnedSums
+    constant: ConstantSums = field(default_factory=ConstantSums)
 
     def merge(self, other: "Quantities") -> None:
         """Take in the sums of other runs."""
         self.by_step.merge(other.by_step)
         self.by_time.merge(other.by_time)
+        self.constant.merge(other.constant)
 
 
 def columns_of(errors: Errors) -> Floats:

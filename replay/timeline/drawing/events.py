@@ -8,6 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recorders.log import Stream, schemas
+from replay.engine.replaying.usage import CONTROLS
 from replay.engine.streams.failures import sentences_of
 from replay.timeline.drawing.canvas import Canvas, Scene, Times, entity_path, escaped, gap_limit_ns, thin
 
@@ -73,10 +74,16 @@ def draw_events(
     happened = [unread, *also, *_of_estimators(scene, case), *_of_sensors(scene, case)]
     happened = [each for each in happened if each.texts]
     for who, level, time_ns, texts in happened:
-        lines = [f"{who}: {text}" for text in texts]
+        lines = stamped(canvas, time_ns, [f"{who}: {text}" for text in texts])
         columns = rr.TextLog.columns(text=lines, level=[level] * len(lines))
         canvas.send(f"{root}/{who}", time_ns, columns)
     return [events_view(root)] if happened else []
+
+
+def stamped(canvas: Canvas, time_ns: Times, texts: Sequence[str]) -> list[str]:
+    """Texts with their times in the run: the viewer's own column of stamps is narrow, and cuts them."""
+    elapsed_s = ((time_ns - canvas.epoch_ns) * 1e-9).tolist()
+    return [f"{at_s:.3f} s, {text}" for at_s, text in zip(elapsed_s, texts, strict=True)]
 
 
 def events_view(root: str) -> rrb.TextLogView:
@@ -94,12 +101,8 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
             yield Happened(estimator, "INFO", times[:1], [text])
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         gated = stream.take(stream["accepted"] == 0)
-        squares = gated["normalised_innovation_squared"].tolist()
-        texts = [
-            f"gated target {target}: NIS {square:.1f}"
-            for target, square in zip(gated["target_id"].tolist(), squares, strict=True)
-        ]
-        yield Happened(estimator, "WARN", gated.publish_time_ns, texts)
+        if len(gated):
+            yield Happened(estimator, "WARN", gated.publish_time_ns, _gated(scene, case, gated))
     for estimator, stream in scene.outputs_of(case, schemas.STARTED):
         yield Happened(estimator, "INFO", stream.publish_time_ns, sentences_of(stream))
     for estimator, stream in scene.outputs_of(case, schemas.DIAGNOSED):
@@ -129,6 +132,38 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
         yield Happened(estimator, "ERROR", stream.publish_time_ns, texts)
 
 
+def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
+    """What was kept out, by the sensors that have a message of its stamp, and of its target."""
+    sensed = {
+        _within(topic, case): scene.read(topic)
+        for topic in scene.topics_near(case)
+        if scene.source.topics[topic].schema_name not in NOT_SENSED | CONTROLS
+    }
+    there = {
+        sensor: set(zip(stream.publish_time_ns.tolist(), _targets(stream), strict=True))
+        for sensor, stream in sensed.items()
+    }
+    texts = []
+    squares = gated["normalised_innovation_squared"].tolist()
+    of = zip(gated.publish_time_ns.tolist(), _targets(gated), squares, strict=True)
+    for time_ns, target, square in of:
+        sensors = [sensor for sensor, messages in there.items() if (time_ns, target) in messages]
+        what = " or ".join(sensors) or "a measurement"
+        texts.append(f"gated {what}{f' of target {target}' if target else ''}: NIS {square:.1f}")
+    return texts
+
+
+def _targets(stream: Stream) -> list[int]:
+    """What messages are about, 0 for nothing."""
+    none = np.zeros(len(stream), np.int64)
+    return stream.columns.get("target_id", none).tolist()
+
+
+def _within(topic: str, case: str) -> str:
+    """A topic as it is called within its case."""
+    return topic.removeprefix(f"/{case}").removeprefix("/")
+
+
 def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
     """Spans in which a sensor was dead, stated by the log or seen as a gap; how good solutions are."""
     for topic in scene.topics_near(case):
@@ -140,7 +175,7 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
             outages = np.stack([stated.publish_time_ns, stated["end_time_ns"]], axis=1)
         gaps = _gaps(scene.read(topic))
         explained = (gaps[:, None, 0] < outages[:, 1]) & (outages[:, 0] < gaps[:, None, 1])
-        sensor = topic.removeprefix(f"/{case}").removeprefix("/")
+        sensor = _within(topic, case)
         yield from _changes(sensor, scene.read(topic))
         yield _spans(sensor, "dead for", outages)
         yield _spans(sensor, "silent for", gaps[~explained.any(axis=1)])

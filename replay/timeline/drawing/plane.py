@@ -5,7 +5,7 @@ hangs on one transform that turns it up. What moves sits at its time and vanishe
 current; a path is a segment per row, of which the view shows the last minute.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +42,8 @@ CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
 # What is left free beside the places, as a share of their side, or of so much of the longer one.
 MARGIN, LEAST_SIDE = 0.07, 0.3
+# A legend has room for so many entries, one below another.
+LEGEND_ROWS = 14
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -54,8 +56,9 @@ class Stroke(NamedTuple):
 
     def fields(self, widen: float = 1.0) -> dict[str, Any]:
         """The fields of Rerun's archetypes."""
-        radii = rr.Radius.ui_points(self.radius_px * widen)
-        return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - self.radius_px}
+        radius_px = self.radius_px * widen
+        radii = rr.Radius.ui_points(radius_px)
+        return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - radius_px}
 
 
 def turn_up(canvas: Canvas, root: str = ROOT) -> None:
@@ -268,10 +271,8 @@ def plane_view(
     Of the `paths` it shows what lies up to `trail_s` before the cursor.
     """
     extent = extent_of(places)
-    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
+    low, high = bounds_of(places)
     step_m = nice(extent / 10.0)
-    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent)
-    low, high = low - margin, high + margin
     _draw_grid(canvas, f"{root}/grid", low - extent, high + extent, step_m)
     trail = trail_of(canvas, trail_s)
     return rrb.Spatial2DView(
@@ -282,6 +283,25 @@ def plane_view(
         # the bounds are outside the transform that turns y up
         visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
     )
+
+
+def bounds_of(places: Floats) -> tuple[Floats, Floats]:
+    """The lower left and the upper right corner (2,) of a view of places (n, 2)."""
+    low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
+    margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent_of(places))
+    return low - margin, high + margin
+
+
+def draw_legend(canvas: Canvas, entity: str, entries: Mapping[str, Colour], places: Floats) -> None:
+    """What colours stand for in a view of places (n, 2): a dot with its name each, at the left edge."""
+    low, high = bounds_of(places)
+    step = (high[1] - low[1]) / LEGEND_ROWS
+    at = [(low[0], high[1] - (row + 0.5) * step) for row in range(len(entries))]
+    radii = rr.Radius.ui_points(5.0)
+    dots = rr.Points2D(
+        at, labels=[*entries], colors=[*entries.values()], radii=radii, show_labels=True, draw_order=30.0
+    )
+    canvas.fix(entity, dots)
 
 
 def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:

@@ -28,10 +28,15 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     escaped,
     nice,
+    thin,
     thin_curve,
 )
 
 SIGMAS = 2.0
+# What a legend takes of a plot's height: for itself, for each entry, and at most.
+LEGEND_MARGIN, LEGEND_ENTRY, LEGEND_MOST = 0.1, 0.1, 0.6
+# Where plots of shares and probabilities end, below their legends.
+SHARES = 1.5
 WHOLE_RUN = rrb.TimeAxis(
     view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), rr.TimeRangeBoundary.infinite())
 )
@@ -145,7 +150,11 @@ def _draw_squares(
     *,
     legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
-    """Chi-square values of one run, and the band that holds 95 % of consistent ones."""
+    """Chi-square values of one run, and the band that holds 95 % of consistent ones.
+
+    Those above the panel are marks at its upper edge, and its title counts them. It ends above the band;
+    where most values of every estimator are above that, the best one's set its range.
+    """
     views = []
     for degrees, of in sorted({(each.degrees, each.of) for each in found}):
         plot = entity_path("plots", case, f"{name.lower()}_{degrees}{of and '_' + of.partition(',')[0]}")
@@ -158,11 +167,40 @@ def _draw_squares(
         look = rr.Measurements.from_fields(names=["95 %"], colors=[MUTED], widths=[0.0])
         canvas.send(f"{plot}/bounds", np.array(ends), band)
         canvas.fix(f"{plot}/bounds", look)
+        end = _end_of(high, [each.values for each in alike])
+        told = []
         for _, _, estimator, time_ns, values in alike:
-            draw_curve(canvas, plot, estimator, scene.colour(estimator), time_ns, values, style)
+            colour = scene.colour(estimator)
+            draw_curve(canvas, plot, estimator, colour, time_ns, values, style)
+            above = values > end
+            if above.any():
+                _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
+                told.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
         title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
-        views.append(plot_view(plot, title, (-0.3 * high, 2.5 * high), legend=legend))
+        title += f"; 95 % are below {high:.3g}" if end > 2.5 * high else ""
+        title += f"; above {end:.3g}: {', '.join(told)}" if told else ""
+        views.append(plot_view(plot, title, (-0.1 * end, end), legend=legend, zoom_lock=not told))
     return views
+
+
+def _end_of(high: float, values: Sequence[Floats]) -> float:
+    """Where a panel of chi-square values ends whose band ends at `high`."""
+    medians = [np.median(each[np.isfinite(each)]) for each in values if np.isfinite(each).any()]
+    if not medians or min(medians) <= high:
+        return 2.5 * high
+    best = values[int(np.argmin(medians))]
+    return nice(1.5 * max(float(np.quantile(best[np.isfinite(best)], 0.99)), high))
+
+
+def _mark_above(
+    canvas: Canvas, plot: str, name: str, colour: Colour, time_ns: Times, end: float
+) -> None:
+    """Mark at the edge of a panel that ends there when values are above it."""
+    rows = thin(time_ns)
+    edge = rr.Scalars.columns(scalars=np.full(len(rows), 0.98 * end))
+    canvas.send(f"{plot}/{name} above", time_ns[rows], edge)
+    marks = rr.SeriesPoints(names=[name], colors=[colour], markers=["Up"], marker_sizes=[4.0])
+    canvas.fix(f"{plot}/{name} above", marks)
 
 
 def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
@@ -175,7 +213,7 @@ def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesVi
         for mode, probability, colour in curves:
             draw_curve(canvas, plot, mode, colour, stream.publish_time_ns, probability, LINE)
         views.append(
-            plot_view(plot, f"{name.replace('_', ' ').capitalize()} of {estimator}", (-0.05, 1.05))
+            plot_view(plot, f"{name.replace('_', ' ').capitalize()} of {estimator}", (-0.05, SHARES))
         )
     return views
 
@@ -186,7 +224,7 @@ def draw_effective(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeri
     for estimator, stream in scene.outputs_of(case, schemas.EFFECTIVE_PARTICLES):
         share, found = stream["effective"] / stream["particles"], True
         draw_curve(canvas, plot, estimator, scene.colour(estimator), stream.publish_time_ns, share, LINE)
-    return [plot_view(plot, "Effective share of the particles", (-0.05, 1.05))] if found else []
+    return [plot_view(plot, "Effective share of the particles", (-0.05, SHARES))] if found else []
 
 
 def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
@@ -194,15 +232,30 @@ def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSer
     found = [("truth", TRUTH, stream, stream["state"]) for stream in scene.truths_of(case)]
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         found.append((estimator, scene.colour(estimator), stream, stream["mean"]))
-    views: dict[str, rrb.TimeSeriesView] = {}
+    drawn: dict[str, list[Floats]] = {}
     for name, colour, stream, values in found:
         for column, component in enumerate(stream.components):
-            quantity, unit, scale = shown_unit(component)
-            plot = entity_path("plots", case, component)
-            shown = scale * values[:, column]
-            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, shown, LINE)
-            views[component] = plot_view(plot, f"{quantity.capitalize()} ({unit})")
-    return list(views.values())
+            scale, plot = shown_unit(component)[2], entity_path("plots", case, component)
+            drawn.setdefault(component, []).append(scale * values[:, column])
+            draw_curve(canvas, plot, name, colour, stream.publish_time_ns, drawn[component][-1], LINE)
+    views = []
+    for component, curves in drawn.items():
+        quantity, unit, _ = shown_unit(component)
+        plot, title = entity_path("plots", case, component), f"{quantity.capitalize()} ({unit})"
+        views.append(plot_view(plot, title, below_legend(curves), zoom_lock=False))
+    return views
+
+
+def below_legend(curves: Sequence[Floats]) -> tuple[float, float] | None:
+    """The range of a plot that leaves room for its legend above all curves; None where they are NaN."""
+    values = np.concatenate([np.ravel(each) for each in curves] or [np.empty(0)])
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    low, high = float(values.min()), float(values.max())
+    span = high - low or max(abs(high), 1.0)
+    room = min(LEGEND_MARGIN + LEGEND_ENTRY * len(curves), LEGEND_MOST)
+    return low - 0.05 * span, high + span * room / (1.0 - room)
 
 
 def draw_curve(
@@ -222,14 +275,19 @@ def draw_curve(
 
 
 def plot_view(
-    entity: str, name: str, extent: tuple[float, float] | None = None, *, legend: bool = True
+    entity: str,
+    name: str,
+    extent: tuple[float, float] | None = None,
+    *,
+    legend: bool = True,
+    zoom_lock: bool = True,
 ) -> rrb.TimeSeriesView:
-    """A plot of everything below an entity, over the whole run."""
+    """A plot of everything below an entity, over the whole run; a stated range stays by default."""
     return rrb.TimeSeriesView(
         origin=escaped(entity),
         name=name,
         axis_x=WHOLE_RUN,
-        axis_y=rrb.ScalarAxis(range=extent, zoom_lock=extent is not None),
+        axis_y=rrb.ScalarAxis(range=extent, zoom_lock=zoom_lock and extent is not None),
         plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
     )
 

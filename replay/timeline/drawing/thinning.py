@@ -155,7 +155,8 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_ROW
     }
-    return replace(parts[-1], without_truth=sum(part.without_truth for part in parts), **joined)
+    count = sum(part.without_truth for part in parts)
+    return replace(parts[-1], without_truth=count, heading_rad=None, **joined)
 
 
 class Thin:

@@ -23,7 +23,7 @@ from replay.timeline.drawing.canvas import (
     entity_path,
     escaped,
 )
-from replay.timeline.drawing.events import above_events, draw_events, events_view
+from replay.timeline.drawing.events import above_events, draw_events, events_view, stamped
 from replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
@@ -170,7 +170,8 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLo
     times, first = np.unique(links.publish_time_ns, return_index=True)
     texts = [_told(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
     levels = ["WARN" if "lost" in text else "INFO" for text in texts]
-    canvas.send("events/links", times, rr.TextLog.columns(text=texts, level=levels))
+    lines = stamped(canvas, times, texts)
+    canvas.send("events/links", times, rr.TextLog.columns(text=lines, level=levels))
     return [events_view("events")] if texts or any(happened) else []
 
 

@@ -25,11 +25,12 @@ from replay.engine.streams.measurements import PLANE, covariances_of, read_vecto
 from replay.estimators.tracking.scans import ORIGIN
 from replay.judging.errors.evaluation import Floats
 from replay.judging.tracks.errors import NONE, TrackErrors, instants_of, track_errors, tracks_at
-from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Scene, Timeline
+from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
 from replay.timeline.drawing.events import Happened, above_events, draw_events
 from replay.timeline.drawing.plane import (
     ROOT,
     Stroke,
+    draw_legend,
     draw_lines,
     draw_outlines,
     draw_path,
@@ -37,7 +38,7 @@ from replay.timeline.drawing.plane import (
     plane_view,
     turn_up,
 )
-from replay.timeline.drawing.plots import LINE, POINTS, draw_curve, plot_view
+from replay.timeline.drawing.plots import LINE, POINTS, below_legend, draw_curve, plot_view
 from replay.timeline.families.ais import track_colours
 
 # How far rays of bearings are drawn.
@@ -55,9 +56,11 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         draw_path(canvas, entity, stream.publish_time_ns, place, stroke)
         paths.append(entity)
         places.append(place)
-    _draw_scans(canvas, scene)
+    scans = _draw_scans(canvas, scene)
     shown = np.concatenate(places) if places else np.zeros((1, 2))
-    shared = [ground, f"{ROOT}/{SCANS}"]
+    legend = f"{ROOT}/legend"
+    draw_legend(canvas, legend, _legend(scene) | scans, shown)
+    shared = [ground, f"{ROOT}/{SCANS}", legend]
     trackers = scene.outputs_of("", schemas.TRACK_ESTIMATE)
     boards = []
     for name, tracks in trackers:
@@ -88,13 +91,22 @@ def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
             yield topic.name, read_vectors(scene.read(topic.name), "position_m", PLANE), Stroke(MUTED)
 
 
-def _draw_scans(canvas: Canvas, scene: Scene) -> None:
-    """The detections of every sensor, scan by scan."""
+def _legend(scene: Scene) -> dict[str, Colour]:
+    """The colours of what moves with a known position."""
+    schemas_of = {topic.schema_name for topic in scene.source.topics.values()}
+    known = {"truth": (schemas.TRUTH_STATE, TRUTH), "sensors": (schemas.POSITION_FIX, MUTED)}
+    return {name: colour for name, (of, colour) in known.items() if of.full_name in schemas_of}
+
+
+def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
+    """The detections of every sensor, scan by scan; returns the colours by sensor."""
+    colours: dict[str, Colour] = {}
     scans = [each for each in scene.source.topics.values() if each.name.endswith("/scan")]
     for number, topic in enumerate(scans):
         prefix, colour = topic.name.removesuffix("/scan"), PALETTE[number % len(PALETTE)]
         scan, entity = scene.read(topic.name), f"{ROOT}/{SCANS}{prefix}"
         own = _own_places(scene, scan)
+        colours[prefix.removeprefix("/").replace("_", " ")] = colour
         if f"{prefix}/detection" in scene.source.topics:
             seen = scene.read(f"{prefix}/detection")
             place = own[_scan_of(scan, seen)] + read_vectors(seen, "position_m", PLANE)
@@ -106,9 +118,10 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> None:
             seen = scene.read(f"{prefix}/bearing")
             begin, bearing = own[_scan_of(scan, seen)], seen["bearing_rad"]
             away = RAY_M * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-            colours = np.tile(np.array([*colour, 90], np.uint8), (len(seen), 1))
+            faint = np.tile(np.array([*colour, 90], np.uint8), (len(seen), 1))
             lines = np.stack([begin, begin + away], axis=1)
-            draw_lines(canvas, entity, seen.publish_time_ns, lines, colours)
+            draw_lines(canvas, entity, seen.publish_time_ns, lines, faint)
+    return colours
 
 
 def _scan_of(scan: Stream, seen: Stream) -> np.ndarray:
@@ -253,15 +266,18 @@ def _draw_gospa(
     """GOSPA at the instants."""
     for name, of_tracker in errors.items():
         draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, of_tracker.gospa, LINE)
-    return plot_view("plots/gospa", "GOSPA (m), c = 20 m")
+    extent = below_legend([of_tracker.gospa for of_tracker in errors.values()])
+    return plot_view("plots/gospa", "GOSPA (m), c = 20 m", extent, zoom_lock=False)
 
 
 def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
     """How many tracks there are."""
+    drawn = []
     for name, sizes in scene.outputs_of("", schemas.ESTIMATE_SIZE):
         counts = sizes["elements"].astype(float)
         draw_curve(canvas, "plots/count", name, scene.colour(name), sizes.publish_time_ns, counts, LINE)
-    return plot_view("plots/count", "Confirmed tracks")
+        drawn.append(counts)
+    return plot_view("plots/count", "Confirmed tracks", below_legend(drawn), zoom_lock=False)
 
 
 def _draw_existence(

@@ -5,7 +5,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 
 from recorders.errors import BadInput
-from recorders.log import Field, RunMetadata, Schema, Stream, make_stream, schemas
+from recorders.log import Field, RunMetadata, Schema, Stream, Topic, make_stream, schemas
 from recorders.parameters import Parameters
 from recorders.recording import Recording
 from replay.engine.api.functions import batch, each_run, recursive
-from replay.engine.api.inputs import Floats, Given, Messages, OneRun
+from replay.engine.api.inputs import Binding, Floats, Given, Messages, OneRun
 from replay.engine.api.outputs import Diagnostics, Estimates, Measured, Results
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.compiling.kernel_cache import load
 from replay.engine.replaying.estimator import Estimator
 from replay.engine.replaying.replaying import collect, replay
-from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.inference.linear_algebra.small_matrices import predict, solve, update, update_memory
 
@@ -308,8 +308,59 @@ def test_all_runs_at_once_are_one_call() -> None:
     out = run(recursive("all", follow_all=settle, **given), [make_run([1.0, 2.0]), make_run([3.0])])
     assert seen == [2]
     assert out["/estimates/m/a/state"]["mean"][:, 0].tolist() == [1.0, 2.0, 3.0]
-    with pytest.raises(BadInput, match="neither follow nor follow_all is given"):
+    with pytest.raises(BadInput, match="give one of follow, follow_all and advance"):
         recursive("none", **given)
+
+
+def find_ranges(
+    name: str, topics: Mapping[str, Topic], parameters: SeededParameters
+) -> Iterator[Binding]:
+    """Whatever has ranges, from a number on that the name of the estimator is long."""
+    for topic in topics.values():
+        if topic.schema_name == schemas.RANGE.full_name:
+            yield Binding({"seen": topic}, suffix="/found", setup=parameters.seed + len(name))
+
+
+def start_counting(given: Given[SeededParameters]) -> tuple[Given[SeededParameters], list[int]]:
+    return given, [given.setup] * given.runs
+
+
+def count(
+    given: Given[SeededParameters], before: list[int], block: Block
+) -> tuple[list[int], list[Ragged]]:
+    """How many ranges came so far, after every block: a state of any type, and an output of any kind."""
+    seen = block.streams[given.topics["seen"].name]
+    after = [known + int(new) for known, new in zip(before, np.diff(seen.offsets), strict=True)]
+    topic, last_ns = f"/estimates/{given.name}/size", [int(block.events.time_ns.max())]
+    sizes = [make_stream(topic, schemas.ESTIMATE_SIZE, last_ns, elements=[each]) for each in after]
+    return after, [gather(sizes)]
+
+
+def test_topics_and_outputs_may_be_any() -> None:
+    """Found by a function, and bound under a name of their own; of two runs."""
+    counting = recursive(
+        "counts",
+        parameters=SeededParameters,
+        find=find_ranges,
+        requirements="ranges",
+        variant="seed",
+        start=start_counting,
+        advance=count,
+    )
+    assert (counting.requirements, counting.variant) == ("ranges", "seed")
+    out = run(counting, [make_run([1.0] * 4), make_run([2.0] * 4)], seed=10)
+    assert out["/estimates/m/found/size"]["elements"].tolist() == [15, 15]
+
+    def solve(given: Given[SeededParameters]) -> list[Ragged]:
+        return count(given, [given.setup] * given.runs, all_of(given))[1]
+
+    def all_of(given: Given[SeededParameters]) -> Block:
+        streams = {given.topics["seen"].name: given["seen"]}
+        return Block(streams, merge_events(streams, "publish_time"))
+
+    counted = batch("counts", parameters=SeededParameters, find=find_ranges, solve=solve)
+    out = run(counted, [make_run([1.0] * 4), make_run([2.0])])
+    assert out["/estimates/m/found/size"]["elements"].tolist() == [5, 2]
 
 
 @pytest.mark.paper

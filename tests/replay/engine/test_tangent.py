@@ -10,7 +10,13 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import memory_source
-from replay.engine.vectors.tangent import are_kinds, between, difference, tangent_components
+from replay.engine.vectors.tangent import (
+    are_kinds,
+    between,
+    difference,
+    named_now,
+    tangent_components,
+)
 from replay.judging.errors.evaluation import errors_of, truth_at
 from replay.judging.errors.truths import Truths
 from replay.judging.metrics.metrics import ACCURACY
@@ -20,6 +26,19 @@ QUATERNION = ["quaternion"] * 4
 
 def as_array(rotation: Rotation) -> np.ndarray:
     return rotation.as_quat(scalar_first=True)
+
+
+def test_a_rotation_without_a_stem_has_a_sensible_name():
+    """By the old one it is still found where a person wrote it."""
+    two = ["qw", "qx", "qy", "qz", "pw", "px", "py", "pz"]
+    assert [name for name, _ in tangent_components(two, QUATERNION * 2)] == [
+        *(f"rotation_{axis}_rad" for axis in "xyz"),
+        *(f"pw_{axis}_rad" for axis in "xyz"),
+    ]
+    attitude = ["attw", "attx", "atty", "attz"]
+    assert tangent_components(attitude, QUATERNION)[0] == ("att_x_rad", "rotation")
+    given = {"qw_z_rad": 0.1, "rotation_x_rad": 0.2}
+    assert named_now(given, two[:4], QUATERNION) == {"rotation_z_rad": 0.1, "rotation_x_rad": 0.2}
 
 
 def test_errors_of_orientations_are_rotation_vectors_in_the_body_frame():

@@ -17,7 +17,7 @@ from replay.estimators.models.extended_target import EXTENDED_TARGET, measure
 from replay.estimators.models.reactor import REACTOR
 from replay.inference.all_methods import METHODS
 from replay.inference.kalman.regression import regression, sample_memory, sampled_sensor
-from replay.inference.kalman.steps import Gaussian
+from replay.inference.kalman.steps import Gaussian, Interval, Measurement
 from replay.inference.linear_algebra.gaussian import no_innovation
 from replay.inference.model.stage import stage_of
 from replay.sampling import Samples, parse_sampling
@@ -97,7 +97,7 @@ def predicted(method, mean, covariance, *samples):
     steps = METHODS[method].steps(stage_of(REACTOR, REACTOR.motion, REACTOR.sensors))
     belief = Gaussian(mean[None].copy(), covariance[None].copy())
     memory = steps.memory(tuple(as_sets(each) for each in samples))
-    assert steps.predict(0, belief, np.empty(0), 1.0, STEP, 0, memory)
+    assert steps.predict(0, belief, Interval(np.empty(0), 1.0, STEP, 0), memory)
     return belief.mean[0], belief.covariance[0]
 
 
@@ -139,7 +139,8 @@ def innovated(mean, covariance, measured, samples):
     """The same by samples of the target and of the noise."""
     stage = stage_of(EXTENDED_TARGET, EXTENDED_TARGET.motion, EXTENDED_TARGET.sensors)
     work = METHODS["lrkf"].steps(stage).memory((as_sets(samples),))
-    assert sampled_sensor(stage, 0, 0)(mean, covariance, measured, POINT, 0, work)
+    given = Measurement(measured, POINT, np.empty(0), 0)
+    assert sampled_sensor(stage, 0, 0)(mean, covariance, given, work)
     return work.innovations[0]
 
 

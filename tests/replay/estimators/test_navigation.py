@@ -12,10 +12,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import RunMetadata, Stream, make_stream, schemas
+from recorders.log.planes import Origin
 from recorders.models.inertial import earth_rate, from_mounting, gravity, into_body, strapdown
-from recorders.recording import import_run, record_run
+from recorders.recording import Recording, import_run, record_run
 from replay.engine.streams.blocks import gather
+from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import difference
@@ -341,3 +343,36 @@ def test_a_start_without_a_prior_is_no_surer_than_it_may_be(method: str, given: 
     """Where the heading is next to unknown, by a bank: of 10 runs, which err alike for long."""
     nees, _ = aligned_nees(method, 10, prior={"is_told": False}, **given)
     assert 10.0 < nees.mean() < 20.0
+
+
+@pytest.mark.parametrize("states", [True, False])
+def test_gravity_is_that_of_the_fixes(states: bool):
+    """A body that rests at 5 deg: at 45 deg gravity is 0.026 m/s2 more, and would be a bias."""
+    place, stamps_ns = (5.0, 100.0, 30.0), 10**9 * np.arange(1, 61)
+    samples_ns = np.arange(10**9, 61 * 10**9, 10**7)
+    rest = np.tile([0.0, 0.0, gravity(place[0], place[2])], (len(samples_ns), 1))
+    unit = make_stream(
+        "/inertial",
+        schemas.INERTIAL_SAMPLE,
+        samples_ns,
+        specific_force_mps2=rest,
+        turn_rate_radps=np.tile(earth_rate(place[0]), (len(samples_ns), 1)),
+        magnetic_field_ut=np.full_like(rest, np.nan),
+    )
+    latitude, longitude, altitude = (np.full(60, each) for each in place)
+    fix = make_stream(
+        "/fix",
+        schemas.GEODETIC_FIX,
+        stamps_ns,
+        metadata=Origin(*place).metadata if states else {},
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=altitude,
+        covariance_m2=np.tile([0.01, 0.01, 0.01], (60, 1)),
+    )
+    run = RunMetadata("rest", epoch_ns=10**9)
+    found = outputs(INERTIAL, "ekf", [memory_source(Recording([unit, fix]), run)])
+    last = found["state"]["mean"][-1]
+    assert_allclose(last[[2, 5, 15]], 0.0, atol=5e-3)
+    told = sentences_of(found["started"].stream)
+    assert not any("origin_latitude_deg" in each for each in told)

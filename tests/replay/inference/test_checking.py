@@ -31,6 +31,15 @@ def test_right_models_pass(name: str) -> None:
     check_model(MODELS[name], PARAMETERS.get(name), seed=5)
 
 
+def test_what_was_checked_is_said() -> None:
+    said = check_model(VEHICLE_A)
+    assert len(said) == 2 + len(VEHICLE_A.sensors)
+    assert said[0].endswith(f"{1 + len(VEHICLE_A.sensors)} functions at 20 states")
+    assert ": derivatives by state" in said[1]
+    assert "variances" in said[1]
+    assert repr(said) == "\n".join(said)
+
+
 def by_hand(
     state: Any, control: Any, duration_s: Any, parameters: Any, by_state: Any, by_control: Any
 ) -> None:

@@ -20,6 +20,8 @@ from replay.inference.kalman.steps import (
     NOTHING_MEASURED,
     Gaussian,
     InnovationRecord,
+    Interval,
+    Measurement,
     Workspace,
     workspace,
 )
@@ -107,17 +109,15 @@ def correct(
         Model("", all_linear("x", len(mean)), ModelParameters, (sensor,), motion), motion, (sensor,)
     )
 
-    def innovate(
-        mean: Floats, covariance: Floats, data: Floats, parameters: Any, use: int, work: Workspace
-    ) -> bool:
-        for place, value in zip(work.innovations[0], (data, s, c), strict=True):
+    def innovate(mean: Floats, covariance: Floats, measurement: Measurement, work: Workspace) -> bool:
+        for place, value in zip(work.innovations[0], (measurement.data, s, c), strict=True):
             place[:] = value
         return True
 
     record = empty_record(len(v))
     update = kalman_update(stage, 0, innovate)
     plain = noise_of(np.empty(0), np.empty(0))  # no robust update
-    return update(mean, covariance, v, plain, gate, 0, workspace(stage), record), record
+    return update(mean, covariance, Measurement(v, plain, gate, 0), workspace(stage), record), record
 
 
 @given(st.integers(1, 5), st.integers(1, 4), seeds)
@@ -252,7 +252,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
     variance = generator.uniform(0.01, 1.0, size=components)
     noise = noise_of(density, variance)
     belief = Gaussian(x[None].copy(), p[None].copy())
-    assert steps.predict(0, belief, u, 0.5, noise, 0, work)
+    assert steps.predict(0, belief, Interval(u, 0.5, noise, 0), work)
     gain = 0.5 * linear.control
     p = linear.transition @ p @ linear.transition.T + gain @ np.diag(density**2 / 0.5) @ gain.T
     x = linear.transition @ x + gain @ u
@@ -263,7 +263,7 @@ def test_filters_are_exact_for_linear_models_of_any_size(
     measured[-1] += 2 * np.pi  # a turn more is the same angle
     data, record = np.append(measured, target), empty_record(components)
     gate = np.full(components + 1, np.inf)
-    assert steps.updates[0](0, belief, data, noise, gate, 0, work, record) == ALL_WELL
+    assert steps.updates[0](0, belief, Measurement(data, noise, gate, 0), work, record) == ALL_WELL
     spread = linear.look @ p @ linear.look.T + np.diag(variance)
     assert_allclose(record.difference, 0.1, atol=1e-9)
     assert_allclose(record.covariance, spread, atol=1e-9)
@@ -277,7 +277,8 @@ def test_sampling_says_where_the_covariance_is_none():
     work = steps.memory((one_set(2, 0.0),) * 2)
     one = np.ones(2)
     noise, belief = noise_of(one, one), Gaussian(np.zeros((1, 2)), -np.eye(2)[None])
-    assert not steps.predict(0, belief, one, 1.0, noise, 0, work)
+    assert not steps.predict(0, belief, Interval(one, 1.0, noise, 0), work)
     update = steps.updates[0]
-    told = update(0, belief, np.ones(4), noise, np.full(3, np.inf), 0, work, empty_record(2))
+    measurement = Measurement(np.ones(4), noise, np.full(3, np.inf), 0)
+    told = update(0, belief, measurement, work, empty_record(2))
     assert told == NOT_POSITIVE_DEFINITE

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recorders.log import Stream, make_stream, schemas
+from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.models.states import PLANE_MOTION, state_metadata
 from recorders.recording import import_run
-from replay.engine.streams.sources import memory_source
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.judge import Judge
 from replay.judging.tracks.errors import (
     TracksAt,
     as_trajectories,
@@ -115,3 +117,60 @@ def test_what_is_told_later_is_predicted_for_longer():
         [told] = tracks_at(sizes, tracks, at_ns, round(delay_s * 1e9))
         assert told.place.tolist() == [[x_m, 0.0]]
     assert len(tracks_at(sizes, tracks, at_ns, 4 * 10**9)[0].number) == 0
+
+
+def test_a_replay_is_judged_wherever_there_are_truths_and_tracks() -> None:
+    """In blocks as whole; of targets only while they are there, of tracks from the first set told on.
+
+    The first target is there all the time, the second from 20 s on and 3 m beside its track; the number
+    of the first one's track changes at 30 s. A set is told every second, from the first second on.
+    """
+    names = ("x_m", "y_m", "vx_mps", "vy_mps")
+    stamps = np.arange(0, 41, 1) * 1_000_000_000
+    truths = [
+        make_stream(
+            f"/target{number}/truth",
+            schemas.TRUTH_STATE,
+            stamps[begin:],
+            metadata=state_metadata(names[:2]),
+            state=np.stack([stamps[begin:] * 1e-9, np.full(41 - begin, 100.0 * number)], axis=1),
+        )
+        for number, begin in ((1, 0), (2, 20))
+    ]
+    source = MemorySource({each.topic: each for each in truths}, RunMetadata("own", epoch_ns=0), "own")
+    told_ns = stamps[1:]
+    sizes = make_stream("/estimates/t/set", schemas.ESTIMATE_SIZE, told_ns, elements=np.full(40, 2))
+    mean = np.zeros((40, 2, 4))
+    mean[..., 0], mean[..., 2] = told_ns[:, None] * 1e-9, 1.0
+    mean[:, 0, 1], mean[:, 1, 1] = 100.0, 203.0
+    number = np.tile([1, 2], (40, 1))
+    number[30:, 0] = 7
+    tracks = make_stream(
+        "/estimates/t/track",
+        schemas.TRACK_ESTIMATE,
+        np.repeat(told_ns, 2),
+        metadata=state_metadata(names),
+        track_id=number.ravel(),
+        mean=mean.reshape(80, 4),
+        covariance=np.tile(np.eye(4).ravel(), (80, 1)),
+    )
+    found = {}
+    for blocks in (1, 4):
+        judge = Judge([source], gap_limit_s=0.2)
+        for sets in np.array_split(np.arange(40), blocks):
+            rows = slice(2 * sets[0], 2 * sets[-1] + 2)
+            now = sizes.take(slice(sets[0], sets[-1] + 1)), tracks.take(rows)
+            judge.add({each.topic: gather([each]) for each in now})
+        found[blocks] = judge.metrics
+    assert found[1] == found[4]
+    figures = {key.removeprefix("t."): value for key, value in found[1].items()}
+    # judged from 10 to 40 s, twice a second: 61 instants, of which 41 have both targets
+    assert figures["missed_targets"] == figures["breaks"] == 0.0
+    assert figures["false_targets"] == 0.0
+    assert figures["unreferenced_targets"] == pytest.approx(20 / 61)
+    assert figures["followed_share"] == 1.0
+    assert figures["followed_rmse_m"] == pytest.approx(np.sqrt(9.0 * 41 / 102))
+    assert figures["switches"] == 1.0
+    assert figures["idf1"] == pytest.approx(2 * (42 + 41) / (102 + 61 + 61))
+    assert figures["gospa_m"] == pytest.approx(3.0 * 41 / 61)
+    assert figures["gospa_all_m"] > figures["gospa_m"]

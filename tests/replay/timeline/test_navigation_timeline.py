@@ -13,7 +13,7 @@ from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import memory_source
 from replay.timeline.drawing.geodetic import POOR, QUALITIES
 from replay.timeline.show import show
-from tests.replay.timeline.test_timeline import read
+from tests.replay.timeline.test_timeline import read, told
 
 SECOND = 10**9
 STAMPS = SIMULATION_EPOCH_NS + np.arange(60) * SECOND
@@ -132,9 +132,6 @@ def test_biases_have_bands_and_each_sensor_its_innovations(drawn: Drawn):
 def test_the_map_has_the_estimates_and_events_the_solutions_and_stops(drawn: Drawn):
     [[way]] = drawn.still["/geodetic/ekf"]["GeoLineStrings:line_strings"]
     assert_allclose(way[-1], [48.0 + 118.0 / 111_194.0, 9.0], atol=1e-5)
-    told = {
-        sensor: [text for row in drawn.moving[f"/events/{sensor}"]["TextLog:text"] for text in row]
-        for sensor in ("quality", "standing")
-    }
-    assert told["quality"] == ["quality: solution fixed", "quality: solution float"]
-    assert told["standing"] == ["standing: moves", "standing: stands: no velocity"]
+    said = {sensor: told(drawn.moving[f"/events/{sensor}"]) for sensor in ("quality", "standing")}
+    assert said["quality"] == ["quality: solution fixed", "quality: solution float"]
+    assert said["standing"] == ["standing: moves", "standing: stands: no velocity"]

@@ -12,7 +12,7 @@ from replay.judging.judge import Judge
 from replay.judging.sets.evaluation import areas_of, frames_of
 from replay.timeline.families.networks import ARRIVED, LOST
 from replay.timeline.show import show
-from tests.replay.timeline.test_timeline import read
+from tests.replay.timeline.test_timeline import read, told
 
 
 def drawn(scenario, parameters, estimators, folder):
@@ -50,7 +50,7 @@ def test_every_message_is_a_line_and_lost_ones_are_red_and_end_half_way(network)
 def test_the_events_name_the_lost_messages_of_every_time(network):
     source, _, found = network
     links = source.streams["/links"]
-    texts = [row[0] for row in found["/events/links"]["TextLog:text"]]
+    texts = told(found["/events/links"])
     assert len(texts) == 30
     for time_ns, text in zip(np.unique(links.publish_time_ns), texts, strict=True):
         rows = (links.publish_time_ns == time_ns) & (links["lost"] > 0)
@@ -105,10 +105,7 @@ def test_sets_are_polygons_with_their_areas_and_faults_are_told(tmp_path):
         np.testing.assert_allclose(np.ravel(plot), areas_of(frames))
         faults = outputs[f"/estimates/{name}/robot1/fault"].stream
         assert faults.schema.full_name == schemas.RELATIVE_BEARING.full_name
-        texts = [
-            row[0] for row in found[f"/events/robot1/{name.replace(':', chr(92) + ':')}"]["TextLog:text"]
-        ]
-        assert texts == [
+        assert told(found[f"/events/robot1/{name.replace(':', chr(92) + ':')}"]) == [
             f"{name}: empty set: the pair {first}, {second} is to blame"
             for first, second in zip(faults["first_id"], faults["second_id"], strict=True)
         ]

@@ -92,6 +92,14 @@ def read(path: Path, *, static: bool = False) -> dict[str, Columns]:
     return found
 
 
+def told(events: Columns) -> list[str]:
+    """What events say, without the time of the run that each opens with: the viewer's column cuts it."""
+    texts = [text for (text,) in events["TextLog:text"]]
+    stamps = [text.partition(" s, ")[0] for text in texts]
+    assert stamps == [f"{time_ns * 1e-9:.3f}" for time_ns in events["sim_time"]]
+    return [text.partition(" s, ")[2] for text in texts]
+
+
 def views(path: Path) -> set[str]:
     """The names of all views of a file's layout."""
     reader, name = rc.RrdReader(str(path)), "ViewBlueprint:display_name"
@@ -227,7 +235,7 @@ def test_the_map_holds_poses_paths_and_ellipses_in_true_coordinates(
 def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
     """What was left out, and what an estimator went back for, at their stamps."""
     begin_ns = ensemble.sources[0].epoch_ns
-    told = [
+    became = [
         make_stream(
             "/estimates/ekf/robot1/skipped",
             schemas.SKIPPED,
@@ -246,13 +254,13 @@ def test_events_tell_what_came_late(ensemble: Replayed, tmp_path: Path) -> None:
             "/estimates/ekf/robot1/waited", schemas.WAITED, [begin_ns + 3 * 10**9], behind_s=[0.125]
         ),
     ]
-    outputs = {each.topic: gather([each]) for each in told}
+    outputs = {each.topic: gather([each]) for each in became}
     show(ensemble.sources[0], outputs, [], save=tmp_path / "late.rrd")
     events = read(tmp_path / "late.rrd")["/events/robot1/ekf"]
-    assert dict(zip(events["utc"], events["TextLog:text"], strict=True)) == {
-        begin_ns + 10**9: ["ekf: not used: too late"],
-        begin_ns + 2 * 10**9: ["ekf: came 0.250 s late: went back and used 3 after it again"],
-        begin_ns + 3 * 10**9: ["ekf: came late, 0.125 s behind newer ones, which waited for it"],
+    assert dict(zip(events["utc"], told(events), strict=True)) == {
+        begin_ns + 10**9: "ekf: not used: too late",
+        begin_ns + 2 * 10**9: "ekf: came 0.250 s late: went back and used 3 after it again",
+        begin_ns + 3 * 10**9: "ekf: came late, 0.125 s behind newer ones, which waited for it",
     }
 
 
@@ -284,13 +292,13 @@ def test_events_tell_gated_measurements_dropouts_and_failures(
     found = read(rrd)
     innovations = ensemble.outputs["/estimates/ekf/robot1/innovation"].of_run(RUN)
     gated = innovations.take(innovations["accepted"] == 0)
-    texts = [text for (text,) in found["/events/robot1/ekf"]["TextLog:text"]]
+    texts = told(found["/events/robot1/ekf"])
     assert len(texts) == len(gated)
-    assert texts[0].startswith(f"ekf: gated target {gated['target_id'][0]}: NIS ")
+    assert texts[0].startswith(f"ekf: gated range_bearing of target {gated['target_id'][0]}: NIS ")
     outages = ensemble.sources[RUN].streams["/robot1/range_bearing/outages"]
     dropouts = found["/events/robot1/range_bearing"]
     assert dropouts["utc"] == outages.publish_time_ns.tolist()
-    assert {text for (text,) in dropouts["TextLog:text"]} == {"range_bearing: dead for 2.0 s"}
+    assert set(told(dropouts)) == {"range_bearing: dead for 2.0 s"}
 
     source = ensemble.sources[0]
     without = {topic: each for topic, each in source.streams.items() if not topic.endswith("outages")}
@@ -305,8 +313,8 @@ def test_events_tell_gated_measurements_dropouts_and_failures(
         replace(source, streams=without), {failure.topic: gather([failure])}, [], save=tmp_path / "a.rrd"
     )
     found = read(tmp_path / "a.rrd")
-    assert found["/events/robot1/ekf\\:2"]["TextLog:text"] == [["ekf:2: failed: another"]]
-    silent = [text for (text,) in found["/events/robot1/range_bearing"]["TextLog:text"]]
+    assert told(found["/events/robot1/ekf\\:2"]) == ["ekf:2: failed: another"]
+    silent = told(found["/events/robot1/range_bearing"])
     pauses_s = np.diff(np.unique(source.streams["/robot1/range_bearing"].publish_time_ns)) * 1e-9
     assert silent == [f"range_bearing: silent for {pause:.1f} s" for pause in pauses_s if pause > 1]
     assert silent
@@ -334,7 +342,7 @@ def test_a_long_run_is_thinned_and_says_so(tmp_path: Path) -> None:
     rows = {entity: len(columns["utc"]) for entity, columns in found.items()}
     assert rows["/plots/robot1/error_x_m/ekf"] == DRAWN_ROWS
     assert max(rows.values()) <= DRAWN_ROWS
-    assert found["/events/robot1/ekf"]["TextLog:text"][0] == ["ekf: drawn at 16.7 Hz of 20 Hz"]
+    assert told(found["/events/robot1/ekf"])[0] == "ekf: drawn at 16.7 Hz of 20 Hz"
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1), st.integers(1, 50))
@@ -467,9 +475,8 @@ def test_what_sensors_see_is_drawn_about_them_and_on_the_map(tmp_path: Path) -> 
     assert "Events" not in views(tmp_path / "bare.rrd")  # nothing happened
     scans = make_stream("/scan", schemas.SCAN, time_ns, scan_id=range(10), detections=[2] * 10)
     found = drawn_bare([*streams, scans], tmp_path / "bare.rrd")
-    assert found["/events/log"]["TextLog:text"] == [
-        ["log: /scan is not drawn: none of its fields is a quantity over time"]
-    ]
+    why = "none of its fields is a quantity over time"
+    assert told(found["/events/log"]) == [f"log: /scan is not drawn: {why}"]
     assert "Events" in views(tmp_path / "bare.rrd")
 
 

@@ -12,7 +12,7 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.judging.tracks.errors import instants_of, track_errors, tracks_at
 from replay.timeline.show import show
 from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, passing, sensor
-from tests.replay.timeline.test_timeline import read
+from tests.replay.timeline.test_timeline import read, told
 
 
 def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
@@ -57,6 +57,8 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     way = found["/map/jipda/track1/way"]["LineStrips2D:strips"]
     assert len(way) == len(tracks) - 1
     np.testing.assert_allclose(way[-1][0][1], tracks["mean"][-1][[0, 2]], rtol=1e-5)
+    legend = read(tmp_path / "run.rrd", static=True)["/map/legend"]
+    assert legend["Points2D:labels"] == [["truth", "sensors", "radar", "camera"]]
     at_ns, truths = instants_of(source)
     sizes = outputs["/estimates/jipda/set"].stream
     gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
@@ -89,7 +91,7 @@ def test_associations_and_what_happened(tmp_path: Path, uncompiled: None):
     )
     show(source, outputs, [], save=tmp_path / "run.rrd")
     found = read(tmp_path / "run.rrd")
-    texts = [text for row in found["/events/hungarian"]["TextLog:text"] for text in row]
+    texts = told(found["/events/hungarian"])
     tracks = outputs["/estimates/hungarian/track"].stream
     first, second = np.unique(tracks["track_id"])
     assert texts == [

@@ -1,0 +1,64 @@
+"""Reads a run whose positions are in several planes as one in one plane."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+from pipeline.altering.changes import Change
+from recorders.errors import BadInput
+from recorders.log import Stream, Topic, schemas
+from recorders.log.planes import FRAME, LATITUDE, Origin, is_planar, stated_in
+from replay.engine.streams.planes import into_plane_of
+
+
+def in_one_plane(
+    name: str, topics: Mapping[str, Topic], changes: Mapping[str, Change]
+) -> dict[str, Change]:
+    """What is done to topics, and then to those that state another plane: they are taken into one.
+
+    That is the plane of the truth, so that estimates are in its coordinates, else of the first topic.
+
+    Args:
+        name: of the run.
+        topics: as the run states them.
+        changes: by topic, what is done to them before.
+
+    Raises BadInput where planes differ, and a topic of the log's plane does not state which is its.
+    """
+    stating = {
+        topic: changes[topic].stated(topics[changes[topic].stored]) if topic in changes else own
+        for topic, own in topics.items()
+    }
+    stated = {topic: stated_in(topic, own.metadata) for topic, own in stating.items()}
+    origins = {topic: origin for topic, origin in stated.items() if origin is not None}
+    if len(set(origins.values())) < 2:
+        return dict(changes)
+    truths = [each for each in origins if stating[each].schema_name == schemas.TRUTH_STATE.full_name]
+    into = origins[[*truths, *origins][0]]
+    for topic, own in stating.items():
+        silent = LATITUDE not in own.metadata and not own.metadata.get(FRAME)
+        if silent and is_planar(own.schema_name, own.metadata):
+            first, other = (
+                next(each for each, origin in origins.items() if (origin == into) is wanted)
+                for wanted in (True, False)
+            )
+            raise BadInput(
+                f"{name}: {topic} does not state the origin of its plane, and {first} states {into}, "
+                f"{other} {origins[other]}; say which is its, as --set {topic}.plane="
+                f"{into.latitude_deg:.9g},{into.longitude_deg:.9g},{into.altitude_m:.9g}"
+            )
+    made = dict(changes)
+    for topic, origin in origins.items():
+        if origin != into:
+            before = changes.get(topic) or Change(topic, topic)
+            made[topic] = replace(
+                before,
+                columns=(*before.columns, partial(_moved, origin, into)),
+                metadata={**before.metadata, **into.metadata},
+            )
+    return made
+
+
+def _moved(origin: Origin, into: Origin, stream: Stream) -> Stream:
+    own = replace(stream, metadata={**stream.metadata, **origin.metadata})
+    return into_plane_of(own, into)

@@ -1,0 +1,60 @@
+"""Describes what fuselog made and is no log: a timeline, a result folder."""
+
+from collections import Counter
+from pathlib import Path
+from shlex import quote
+
+from pipeline.output.report.verdict import verdict
+from pipeline.output.results import RESULT_FILE, Result, read_result
+from pipeline.output.terminal import print_json, print_others, print_table, print_worst, say
+from recorders.errors import BadInput
+
+
+def show_result(folder: Path, *, as_json: bool) -> None:
+    """Print what a result folder holds: what was run, what came of it, its files."""
+    result = read_result(folder)
+    if as_json:
+        print_json({"path": str(folder), **result.model_dump(mode="json")})
+        return
+    ran, came = verdict(result)
+    say(f"{folder}: a result of {_what(result)}, fuselog {result.fuselog}: {ran}")
+    print_worst(result.alarms)
+    say(came)
+    print_others(result.alarms)
+    counts = Counter(Path(name).parts[0] for name in result.files)
+    rows = [[name, count] for name, count in counts.items() if name != RESULT_FILE]
+    print_table(["in it", "files"], rows)
+    shown = [f"fuselog report {quote(str(folder))}"]
+    if (folder / "timeline.rrd").is_file():
+        shown.append(f"fuselog view {quote(str(folder))}")
+    say(f"To see it: {', '.join(shown)}; to go on with it: fuselog compare, check")
+
+
+def _what(result: Result) -> str:
+    title = result.settings.get("title")
+    return f"{result.experiment} ({title})" if title else result.experiment
+
+
+def show_timeline(path: Path, *, as_json: bool) -> None:
+    """Print what a timeline shows: its entities, and how many rows each has.
+
+    Raises BadInput where it cannot be read.
+    """
+    from rerun.chunk import RrdReader  # which takes long to import
+
+    try:
+        reader = RrdReader(str(path))
+        names = sorted({each.application_id for each in reader.recordings()})
+        rows: Counter[str] = Counter()
+        for chunk in reader.stream():
+            if not chunk.entity_path.startswith("/__"):
+                rows[chunk.entity_path] += chunk.num_rows
+    except Exception as error:  # rerun raises what it likes
+        raise BadInput(f"{path}: is no timeline that can be read ({error}); save it again") from error
+    entities = dict(sorted(rows.items()))
+    if as_json:
+        print_json({"path": str(path), "timeline": names, "entities": entities})
+        return
+    say(f"{path}: {path.stat().st_size / 1e6:.1f} MB, a timeline of {', '.join(names) or 'nothing'}")
+    print_table(["entity", "rows"], list(entities.items()))
+    say(f"To see it: fuselog view {quote(str(path))}")

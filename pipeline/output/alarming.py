@@ -1,0 +1,184 @@
+"""Finds what makes a replay's numbers doubtful, the worst first: a sentence each, and what to do.
+
+A filter whose covariances are right leaves NIS, NEES and the share that its gate keeps out within
+limits in 999 of 1,000 logs; what is beyond them is an alarm, as is an error that stays.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipeline.output.alarms import Alarm
+from replay.distributions import chi2
+from replay.engine.replaying.usage import SILENT, UNTAKEN, Row
+from replay.judging.consistency.consistency import CONSISTENT
+from replay.judging.errors.constant import Constant
+from replay.judging.errors.evaluation import chi_square_interval, split_topic
+from replay.judging.judge import Judge
+from replay.judging.metrics.measuring import metric_key
+
+USUAL_GATE = 0.99  # where it is not known
+RARE = 0.01  # share that a gate keeps out, whose multiples say how bad it is
+LARGEST = 1e300  # as JSON has no infinity
+UNUSED = 0.05  # of a topic's messages
+
+
+def alarms_of(
+    judge: Judge, parameters: Mapping[str, Mapping[str, Any]], coverage: Sequence[Row] = ()
+) -> list[Alarm]:
+    """The alarms of a judged replay, the worst first.
+
+    Args:
+        judge: of all runs.
+        parameters: of the estimators by label, as far as they are known.
+        coverage: what became of the measurements.
+    """
+    found = [
+        *_of_innovations(judge, parameters),
+        *_of_errors(judge),
+        *_of_costs(judge),
+        *_of_measurements(coverage),
+    ]
+    return [*sorted(found, key=lambda each: -each.excess), *_of_gates(judge, parameters)]
+
+
+def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
+    """A gate that keeps out too much, and NIS that is beyond its interval."""
+    for topic, sums in judge.innovations.items():
+        estimator, case = split_topic(topic)
+        gate = float(parameters.get(estimator, {}).get("gate_probability", USUAL_GATE))
+        said, excess = [], 1.0
+        gated = sums["messages"] - sums["accepted"]
+        expected = (1.0 - gate) * sums["messages"]
+        # a count of rare things has Poisson's distribution, whose tail is chi-square's
+        if gated and chi2.sf(2.0 * expected, 2 * gated) > CONSISTENT:
+            share = gated / sums["messages"]
+            excess = max(1.0, gated / max(expected, RARE * sums["messages"]))
+            said.append(
+                f"the gate keeps out {_percent(share)} of {sums['messages']} measurements, where "
+                f"{_percent(1.0 - gate)} {'is' if gate < 1.0 else 'are'} expected"
+            )
+        if not sums["accepted"] and sums["messages"]:
+            said.append("its log-likelihood is that of no measurement")
+        low, high = chi_square_interval(max(sums["degrees"], 1), 1, CONSISTENT)
+        if sums["degrees"] and (sums["squared"] < low or sums["squared"] > high):
+            nis, low, high = (each / sums["degrees"] for each in (sums["squared"], low, high))
+            excess = max(excess, _beyond(nis, low, high))
+            said.append(f"NIS is {nis:.3g} per component, {_expected(nis, low, high)}")
+        if said:
+            words = f"{_name(estimator, case)}: {'; '.join(said)}; "
+            words += f"fuselog diagnose LOG -e {estimator} says why"
+            yield Alarm("innovations", estimator, case, excess, words)
+
+
+def _of_errors(judge: Judge) -> Iterator[Alarm]:
+    """NEES beyond its interval; of positions whose error stays, that."""
+    metrics, intervals, constants = judge.metrics, judge.intervals(CONSISTENT), judge.constants
+    for topic in judge.judged:
+        what = estimator, case = split_topic(topic)
+        of_position = metric_key(estimator, "position_nees", case)
+        of_state = metric_key(estimator, "nees", case)
+        for key in (of_position, of_state):
+            if key not in intervals:
+                continue
+            nees, (low, high) = metrics[key], intervals[key]
+            if not (nees < low or nees > high):
+                continue
+            if what in constants and nees > high:
+                yield _of_constant(estimator, case, constants[what])
+            elif key == of_state:
+                words = f"{_name(*what)}: NEES is {nees:.3g}, {_expected(nees, low, high)}"
+                if any(split_topic(each)[0] == estimator for each in judge.innovations):
+                    words += f"; fuselog diagnose LOG -e {estimator} says why"
+                yield Alarm("errors", estimator, case, _beyond(nees, low, high), words)
+            else:
+                continue
+            break
+
+
+def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:
+    """An error that stays."""
+    offset = ", ".join(f"{each:.3g}" for each in constant.offset_m)
+    name, excess = _name(estimator, case), constant.nees / max(constant.rest, 1e-9)
+    words = f"{name}: {_percent(constant.share)} of the squared error is constant, "
+    if constant.turns:
+        axes = "ahead, to the left, up" if len(constant.offset_m) > 2 else "ahead, to the left"
+        words += (
+            f"({offset}) m {axes}: the truth is of another point of the body (a lever arm), or a sensor "
+            "is off; state the one or the other in the model"
+        )
+        return Alarm("lever arm", estimator, case, excess, words)
+    words += f"({offset}) m: truth and estimate may have other origins: fuselog evaluate --align se2"
+    return Alarm("origin", estimator, case, excess, words)
+
+
+def _of_costs(judge: Judge) -> Iterator[Alarm]:
+    """The search of a trajectory that ended at more than its residuals leave."""
+    metrics = judge.metrics
+    for topic, sums in judge.innovations.items():
+        estimator, case = split_topic(topic)
+        cost = metrics.get(metric_key(estimator, "cost", case))
+        numbers = sums["accepted_degrees"]
+        if cost is None or not np.isfinite(cost) or not numbers:
+            continue
+        _, high = chi_square_interval(numbers, 1, CONSISTENT)
+        high *= 0.5 / judge.runs
+        if cost > high * max(
+            1.0, sums["squared"] / sums["degrees"]
+        ):  # noise that is too small raises both
+            words = (
+                f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
+                f"{numbers / judge.runs:.4g} measured numbers leave up to {high:.4g}: a minimum that is "
+                "not the least one; compare other starts, such as --set start=motion"
+            )
+            yield Alarm("minimum", estimator, case, cost / high, words)
+
+
+def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:
+    """Measurements that came to nothing for a reason; what a tracker leaves over has none."""
+    measuring = {row.estimator for row in coverage if row.used}
+    for row in coverage:
+        is_by_choice = row.why.startswith(UNTAKEN) and (row.why == UNTAKEN or row.estimator in measuring)
+        if not row.sentence or row.why == SILENT or is_by_choice:
+            continue
+        if row.unused > UNUSED * row.messages:
+            excess = row.unused / (UNUSED * row.messages)
+            yield Alarm("unused", row.estimator, "", excess, row.sentence)
+
+
+def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
+    """Estimators with different gates, where one kept something out: they are not judged alike."""
+    gates = {
+        label: float(values["gate_probability"])
+        for label, values in parameters.items()
+        if "gate_probability" in values
+        and any(split_topic(topic)[0] == label for topic in judge.innovations)
+    }
+    is_closed = any(sums["accepted"] < sums["messages"] for sums in judge.innovations.values())
+    if is_closed and len({*gates.values()}) > 1:
+        told = ", ".join(f"{gate:g} of {label}" for label, gate in gates.items())
+        words = (
+            f"gate_probability is {told}: their likelihoods are of different measurements; compare with "
+            "--set gate_probability=1"
+        )
+        yield Alarm("gates", "", "", 1.0, words)
+
+
+def _expected(value: float, low: float, high: float) -> str:
+    size = "small" if value > high else "large"
+    return (
+        f"where a consistent filter is within {low:.3g} and {high:.3g}: its covariances are too {size}"
+    )
+
+
+def _beyond(value: float, low: float, high: float) -> float:
+    return min(value / high if value > high else low / max(value, 1e-9), LARGEST)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.3g} %"
+
+
+def _name(estimator: str, case: str) -> str:
+    return f"{estimator} {case}".strip()

@@ -1,0 +1,109 @@
+"""The planes that positions are in: east, north and up of an origin on the earth, as channels state it.
+
+A channel that states no origin is in the plane of its log, unless it names a frame of its own.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from recorders.errors import BadInput
+from recorders.log.schemas import (
+    COURSE_FIX,
+    GAUSSIAN_ESTIMATE,
+    GEODETIC_FIX,
+    POSE,
+    POSITION_FIX,
+    TRUTH_STATE,
+    VELOCITY_FIX,
+)
+from recorders.log.streams import Stream
+
+LATITUDE, LONGITUDE, ALTITUDE = ORIGIN = (
+    "origin_latitude_deg",
+    "origin_longitude_deg",
+    "origin_altitude_m",
+)
+FRAME = "frame_id"
+EXAMPLE = "latitude and longitude in deg, and altitude in m, such as 49.01,8.4,115"
+_STATES = (TRUTH_STATE.full_name, GAUSSIAN_ESTIMATE.full_name)
+_PLANAR = {each.full_name for each in (POSITION_FIX, VELOCITY_FIX, POSE, COURSE_FIX, GEODETIC_FIX)}
+
+
+class Origin(NamedTuple):
+    """Where a plane touches: latitude and longitude (deg), height above the ellipsoid (m)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float = 0.0
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """Return what the channels of streams in the plane state."""
+        return dict(zip(ORIGIN, map(repr, self), strict=True))
+
+    def __str__(self) -> str:
+        return f"{self.latitude_deg:.9g}, {self.longitude_deg:.9g}, {self.altitude_m:.6g}"
+
+
+def origin_of(parts: Sequence[str]) -> Origin | None:
+    """The origin that two or three numbers state; None where they state none."""
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        return None
+    if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
+        return None
+    found = Origin(*numbers)
+    return found if abs(found.latitude_deg) <= 90.0 and abs(found.longitude_deg) <= 360.0 else None
+
+
+def stated_in(topic: str, metadata: Mapping[str, str]) -> Origin | None:
+    """The origin that a topic's channel states, at height zero where it states none; None without one.
+
+    Raises BadInput where what it states is no place on the earth.
+    """
+    if LATITUDE not in metadata or LONGITUDE not in metadata:
+        return None
+    parts = [metadata[name] for name in ORIGIN if name in metadata]
+    found = origin_of(parts)
+    if found is None:
+        raise BadInput(
+            f"topic {topic} states the origin {', '.join(parts)}; expected {EXAMPLE}: record it again"
+        )
+    return found
+
+
+def is_planar(schema_name: str, metadata: Mapping[str, str]) -> bool:
+    """Tell whether messages have positions or velocities in a plane, or on the earth."""
+    if schema_name in _STATES:
+        return {"x_m", "y_m"} <= set(metadata.get("components", "").split(","))
+    return schema_name in _PLANAR
+
+
+def plane_in_words(metadata: Mapping[str, str]) -> str:
+    """The frame that a channel names, else that it is one of its own."""
+    return f"frame {metadata[FRAME]}" if metadata.get(FRAME) else "a frame of its own"
+
+
+def common_origin(channels: Mapping[str, Mapping[str, str]]) -> Origin | None:
+    """The origin of a log's plane by its topics' metadata: that which all state that state one."""
+    stated = {origin for topic, each in channels.items() if (origin := stated_in(topic, each))}
+    return stated.pop() if len(stated) == 1 else None
+
+
+def in_plane_of_log(streams: Sequence[Stream]) -> list[Stream]:
+    """The streams of one log; where some state its plane, all that have no frame of their own do."""
+    origin = common_origin({stream.topic: stream.metadata for stream in streams})
+    return [in_plane(stream, origin) for stream in streams]
+
+
+def in_plane(stream: Stream, origin: Origin | None) -> Stream:
+    """A stream that states the log's plane, if it is of one and states neither plane nor frame."""
+    own = stream.metadata
+    if origin is None or LATITUDE in own or own.get(FRAME):
+        return stream
+    if not is_planar(stream.schema.full_name, own):
+        return stream
+    return replace(stream, metadata={**own, **origin.metadata})

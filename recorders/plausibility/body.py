@@ -1,0 +1,195 @@
+"""The motion of one body as its topics say it: places, velocities, wheels, turn rates, orientations.
+
+All are columns over time in seconds since the log's first stamp. What holds from one message to the
+next, or lies between two samples, is integrated: a window's distance and turn need no common stamps.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from recorders.models.geodesy import into_tangent_plane
+
+Floats = NDArray[np.float64]
+FEWEST = 20  # messages, below which nothing is said of a topic
+
+
+@dataclass(frozen=True)
+class Series:
+    """One quantity of a topic over time.
+
+    Attributes:
+        topic, field: where it stands.
+        times_s: stamps (n,), which increase.
+        values: (n,) or (n, m).
+        holds: whether a value holds until the next; else it is a sample.
+    """
+
+    topic: str
+    field: str
+    times_s: Floats
+    values: Floats
+    holds: bool = False
+
+    def integral(self, times_s: Floats) -> Floats:
+        """The integral of the values from the first stamp to others (...); NaN beyond the last."""
+        flat = self.values.reshape(len(self.values), -1)
+        means = flat[:-1] if self.holds else 0.5 * (flat[:-1] + flat[1:])
+        total = np.zeros_like(flat)
+        np.cumsum(means * np.diff(self.times_s)[:, None], axis=0, out=total[1:])
+        found = [
+            np.interp(times_s, self.times_s, column, left=np.nan, right=np.nan) for column in total.T
+        ]
+        return np.stack(found, axis=-1).reshape(*np.shape(times_s), *self.values.shape[1:])
+
+    def moved(self, by_s: float, gain: float = 0.0) -> "Series":
+        """The series as it is where its stamps are not late, and its clock does not gain."""
+        first_s = self.times_s[0]
+        times_s = self.times_s - gain * (self.times_s - first_s) - by_s
+        return Series(self.topic, self.field, times_s, self.values, self.holds)
+
+
+@dataclass(frozen=True)
+class Fixes(Series):
+    """Places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
+
+    `is_flat` says that they are metres and not latitudes, so that they may have a scale.
+    """
+
+    variances_m2: Floats = field(default_factory=lambda: np.empty(0))
+    is_flat: bool = True
+
+
+@dataclass
+class Body:
+    """What is said of one body.
+
+    Attributes:
+        fixes: its places.
+        velocities: in the frame of the places (n, 2).
+        speeds: forward, as wheels have them.
+        turns: turn rates about the vertical.
+        rates: turn rates (n, 3) about the body's axes.
+        forces: specific forces (n, 3).
+        orientations: unit quaternions (n, 4), measured ones.
+        references: those of the truth.
+    """
+
+    fixes: list[Fixes] = field(default_factory=list)
+    velocities: list[Series] = field(default_factory=list)
+    speeds: list[Series] = field(default_factory=list)
+    turns: list[Series] = field(default_factory=list)
+    rates: list[Series] = field(default_factory=list)
+    forces: list[Series] = field(default_factory=list)
+    orientations: list[Series] = field(default_factory=list)
+    references: list[Series] = field(default_factory=list)
+
+    @property
+    def roles(self) -> list[Sequence[Series]]:
+        """All lists."""
+        measured = self.rates, self.forces, self.orientations, self.references
+        return [self.fixes, self.velocities, self.speeds, self.turns, *measured]
+
+
+def bodies(streams: Mapping[str, Stream]) -> list[Body]:
+    """The bodies that topics are of: one for every namespace, or one alone where no role comes twice."""
+    first_ns = min(
+        (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
+    )
+    together, apart = Body(), dict[str, Body]()
+    for topic, stream in streams.items():
+        if len(stream) >= FEWEST and not topic.startswith("/estimates/"):
+            own = apart.setdefault(topic.rpartition("/")[0], Body())
+            for each in (own, together):
+                _add(each, stream, first_ns)
+    if all(len({each.topic for each in role}) <= 1 for role in together.roles):
+        return [together]
+    return list(apart.values())
+
+
+def _add(body: Body, stream: Stream, first_ns: int) -> None:
+    """Take up what a topic says of the body."""
+    name, topic = stream.schema.full_name, stream.topic
+    order = np.argsort(stream.publish_time_ns, kind="stable")
+    stamps_ns = stream.publish_time_ns[order]
+    is_new = np.diff(stamps_ns, prepend=stamps_ns[0] - 1) > 0
+    rows = order[is_new]
+    times_s = 1e-9 * (stream.publish_time_ns[rows] - first_ns).astype(float)
+
+    def series(field_: str, values: Floats, *, holds: bool = False) -> Series:
+        known = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        return Series(topic, field_, times_s[known], values[known], holds)
+
+    def column(field_: str) -> Floats:
+        return stream[field_][rows]
+
+    if name in _PLACED and column("position_m").shape[1] >= 2:
+        body.fixes.append(_fixes(series("position_m", column("position_m")[:, :2]), stream, rows))
+    if name == schemas.GEODETIC_FIX.full_name:
+        body.fixes.append(_geodetic(stream, rows, times_s))
+    if name == schemas.VELOCITY_FIX.full_name:
+        body.velocities.append(series("velocity_mps", column("velocity_mps")[:, :2]))
+    if name == schemas.COURSE_FIX.full_name:
+        speed, course = column("speed_mps"), column("course_rad")
+        velocity = speed[:, None] * np.stack([np.sin(course), np.cos(course)], axis=1)
+        body.velocities.append(series("speed_mps", velocity))
+    if name == schemas.ODOMETRY.full_name:
+        body.speeds.append(series("forward_mps", column("forward_mps"), holds=True))
+        body.turns.append(series("turn_radps", column("turn_radps"), holds=True))
+    if name == schemas.TWIST.full_name and column("velocity_mps").shape[1] == 3:
+        body.speeds.append(series("velocity_mps", column("velocity_mps")[:, 0]))
+        body.rates.append(series("turn_rate_radps", column("turn_rate_radps")))
+    if name == schemas.INERTIAL_SAMPLE.full_name:
+        body.rates.append(series("turn_rate_radps", column("turn_rate_radps")))
+        body.forces.append(series("specific_force_mps2", column("specific_force_mps2")))
+    if name in (schemas.TWIST.full_name, schemas.INERTIAL_SAMPLE.full_name) and body.rates:
+        body.turns.append(series("turn_rate_radps", column("turn_rate_radps")[:, 2]))
+    if name in _TURNED and column("quaternion").shape[1] == 4:
+        body.orientations.append(series("quaternion", column("quaternion")))
+    if name == schemas.TRUTH_STATE.full_name:
+        kinds = stream.metadata.get("kinds", "").split(",")
+        if kinds.count("quaternion") == 4:
+            begin = kinds.index("quaternion")
+            body.references.append(series("state", column("state")[:, begin : begin + 4]))
+    for role in body.roles:
+        if role and len(role[-1].times_s) < FEWEST:
+            role.pop()  # type: ignore[attr-defined]
+
+
+_PLACED = {each.full_name for each in (schemas.POSITION_FIX, schemas.POSE, schemas.COURSE_FIX)}
+_TURNED = {each.full_name for each in (schemas.ORIENTATION, schemas.POSE)}
+
+
+def _fixes(places: Series, stream: Stream, rows: NDArray[np.int64], *, is_flat: bool = True) -> Fixes:
+    """Places with the mean of the two variances that they state, NaN where they state none."""
+    column = stream.columns.get("covariance_m2")
+    variances = np.full(len(places.times_s), np.nan)
+    if column is not None and len(places.times_s) == len(rows) and column.shape[1]:
+        width = column.shape[1]
+        size = round(width**0.5)
+        second = size + 1 if size * size == width and width > 1 else 1
+        variances = 0.5 * (column[rows, 0] + column[rows, min(second, width - 1)])
+    return Fixes(
+        places.topic,
+        places.field,
+        places.times_s,
+        places.values,
+        variances_m2=variances,
+        is_flat=is_flat,
+    )
+
+
+def _geodetic(stream: Stream, rows: NDArray[np.int64], times_s: Floats) -> Fixes:
+    """Places about the first one."""
+    place = stream["latitude_deg"][rows], stream["longitude_deg"][rows]
+    known = np.isfinite(place[0]) & np.isfinite(place[1])
+    latitude, longitude = (each[known] for each in place)
+    east, north, _ = into_tangent_plane(
+        (latitude, longitude, np.zeros_like(latitude)), (latitude[:1], longitude[:1], 0.0)
+    )
+    values = np.stack([east, north], axis=1)
+    places = Series(stream.topic, "latitude_deg", times_s[known], values)
+    return _fixes(places, stream, rows[known], is_flat=False)

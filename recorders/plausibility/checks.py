@@ -1,0 +1,74 @@
+"""The checks, in the order in which what they find is named, and what they read of a log.
+
+A check of motion takes a body's topics compared in pairs, one of stamps a topic and all others.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+
+from recorders.errors import BadInput
+from recorders.log import Log, Stream, read_blocks, read_empty
+from recorders.log.streams import concatenate
+from recorders.plausibility import speeds, stamps, turns
+from recorders.plausibility.body import bodies
+from recorders.plausibility.finding import Finding
+from recorders.plausibility.motion import Motion
+
+MOST = 1 << 19  # messages that are looked at: the first of a log, however long it is
+
+OF_STAMPS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] = (
+    stamps.losses,
+    stamps.repeats,
+)
+OF_MOTION: tuple[Callable[[Motion], Iterator[Finding]], ...] = (
+    turns.gravity,
+    turns.quaternions,
+    speeds.clocks,
+    speeds.delays,
+    speeds.factors,
+    turns.degrees,
+    turns.signs,
+    turns.mounting,
+    turns.headings,
+    speeds.rest,
+)
+
+
+def findings(streams: Mapping[str, Stream]) -> list[Finding]:
+    """What topics say of their own faults, the worst first; see `finding.Finding`.
+
+    Estimates are not looked at. A log without a fault has none: thresholds are far from chance.
+    """
+    sensed = {
+        topic: stream
+        for topic, stream in streams.items()
+        if len(stream) and not topic.startswith("/estimates/")
+    }
+    found = [each for stream in sensed.values() for check in OF_STAMPS for each in check(stream, sensed)]
+    for body in bodies(sensed):
+        motion = Motion(body)
+        found += [each for check in OF_MOTION for each in check(motion)]
+    return found + list(stamps.drifts(sensed))
+
+
+def findings_of(log: Log) -> list[Finding]:
+    """The findings of a log file, by its first `MOST` messages; raises BadInput where it is damaged."""
+    topics = [topic for topic in log.topics if _is_sensed(log, topic)]
+    parts: dict[str, list[Stream]] = {}
+    count = 0
+    for block in read_blocks(log, topics, block_messages=MOST >> 3) if topics else ():
+        for topic, stream in block.items():
+            parts.setdefault(topic, []).append(stream)
+            count += len(stream)
+        if count > MOST:
+            break
+    return findings({topic: concatenate(found) for topic, found in parts.items()})
+
+
+def _is_sensed(log: Log, topic: str) -> bool:
+    if topic.startswith("/estimates/"):
+        return False
+    try:
+        read_empty(log, topic)
+    except BadInput:
+        return False
+    return True

@@ -1,0 +1,278 @@
+"""A body's topics, compared in pairs: what lags behind what, and by which factor or angle they differ.
+
+Lags come first: what is 18 s late turns the other way.
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.models.orientation import heading
+from recorders.plausibility.body import Body, Floats, Series
+from recorders.plausibility.timing import Timing, timing
+from recorders.plausibility.windows import (
+    FEWEST,
+    Windows,
+    clear_moves,
+    courses,
+    distances,
+    places_of,
+    travelled,
+    turned,
+    wrapped,
+)
+
+SURE = 2.0  # of the evidence for a lag, which is stated too small: neighbouring windows share a place
+LEAST_LAG_S = 0.15
+LONG_S = 1.0  # a lag that no body makes whose course is not where it heads
+ALIKE = 0.8  # a correlation
+
+
+class Slope(NamedTuple):
+    """What one topic says of windows, as a multiple of what another says.
+
+    Attributes:
+        value: the multiple, by least squares through zero.
+        likeness: the correlation about zero.
+        spread: how much single windows differ from that, of its size.
+        windows: how many there are.
+    """
+
+    value: float
+    likeness: float
+    spread: float
+    windows: int
+
+    @property
+    def sign(self) -> int:
+        """1 or -1, or 0 where the two are not alike."""
+        is_told = self.windows >= FEWEST and abs(self.likeness) > ALIKE
+        return int(np.sign(self.value)) if is_told else 0
+
+
+def slope(x: Floats, y: Floats) -> Slope:
+    """The slope of y (k,) on x (k,) through zero, over windows where both are known."""
+    known = np.isfinite(x) & np.isfinite(y)
+    x, y = x[known], y[known]
+    xx, xy, yy = x @ x, x @ y, y @ y
+    if len(x) < FEWEST or not (xx > 0.0 and yy > 0.0):
+        return Slope(np.nan, 0.0, np.inf, len(x))
+    value = float(xy / xx)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        spread = float(np.nanmedian(np.abs(y / x - value)) / abs(value)) if value else np.inf
+    return Slope(value, float(xy / np.sqrt(xx * yy)), spread, len(x))
+
+
+def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
+    """By what angle a rate says that one turns in windows."""
+    return source.integral(end_s) - source.integral(begin_s)
+
+
+class Lag(NamedTuple):
+    """One topic beside another that it was compared with, which is later by the lag."""
+
+    source: str
+    against: str
+    timing: Timing
+
+
+class Motion:
+    """A body, and what comparing its topics in pairs tells."""
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.places = places_of(body)
+        self.courses = courses(body)
+        self.turn_span_s = 1.0 if body.velocities else 2.0  # places need longer ones
+
+    @cached_property
+    def speed_lags(self) -> list[Lag]:
+        """Of speeds and velocities, beside places."""
+        if self.places is None or (windows := distances(self.places, 1.0)) is None:
+            return []
+        return list(self._lags(windows, self.places.topic))
+
+    def _lags(self, windows: Windows, against: str) -> Iterator[Lag]:
+        for source in chain(self.body.speeds, self.body.velocities):
+            found = timing(windows, source, travelled, tolerance_s=_hold_s(source))
+            if found is not None and source.topic != against:
+                yield Lag(source.topic, against, found)
+
+    @cached_property
+    def turn_lags(self) -> list[Lag]:
+        """Of turn rates, beside courses."""
+        if self.courses is None:
+            return []
+        windows = turned(self.courses, 1.0)
+        found = []
+        for source in self.body.turns:
+            told = timing(windows, source, turn_between, tolerance_s=_hold_s(source))
+            if told is not None:
+                found.append(Lag(source.topic, self.courses.topic, told))
+        return found
+
+    @cached_property
+    def delays_s(self) -> dict[str, float]:
+        """How late each topic's stamps are beside the most of them, where that is sure.
+
+        Of two topics the later one is late: messages come late, and never early.
+        """
+        late_s: dict[str, float] = {}
+        if self.places is not None and self.speed_lags:
+            late_s[self.places.topic] = 0.0
+            for each in self.speed_lags:
+                late_s[each.source] = -_sure_lag_s(each.timing)
+        for each in self.turn_lags:
+            if each.source in late_s:
+                continue  # its speeds tell more
+            late_s.setdefault(each.against, 0.0)
+            lag_s = _sure_lag_s(each.timing)
+            if abs(lag_s) > LONG_S or self._goes_where_it_points(each):
+                late_s[each.source] = late_s[each.against] - lag_s
+        if not late_s:
+            return {}
+        sorted_s = sorted(late_s.values())
+        usual_s = sorted_s[(len(sorted_s) - 1) // 2]
+        return {topic: each_s - usual_s for topic, each_s in late_s.items()}
+
+    def _goes_where_it_points(self, lag: Lag) -> bool:
+        """Whether forces in the body's axes are those of its course: then course is heading."""
+        for force in self.body.forces:
+            if force.topic == lag.source:
+                found = self.forces(force.moved(-lag.timing.lag_s))
+                return found is not None and max(found.fit, found.mirrored) > 0.9
+        return False
+
+    @cached_property
+    def gains(self) -> dict[str, float]:
+        """How many seconds a second the clocks of topics gain beside that of the places."""
+        return {each.source: each.timing.gain for each in self.speed_lags if each.timing.gain}
+
+    def aligned(self, source: Series) -> Series:
+        """A topic on the clock of the places, or of the courses where it has no other."""
+        for each in (*self.speed_lags, *self.turn_lags):
+            if each.source == source.topic:
+                late_s = self.delays_s.get(each.source, 0.0) - self.delays_s.get(each.against, 0.0)
+                if each.timing.gain:
+                    late_s = -each.timing.lag_s
+                return source.moved(late_s, each.timing.gain)
+        return source
+
+    def timed(self, source: Series) -> Series:
+        """A topic on the clock that most topics have."""
+        if source.topic in self.gains:
+            return self.aligned(source)
+        return source.moved(self.delays_s.get(source.topic, 0.0))
+
+    def likened(self, source: Series) -> Series:
+        """A turn rate on the clock by which it is most like the course, be that a delay or not."""
+        aligned = self.aligned(source)
+        for each in self.turn_lags:
+            if each.source == source.topic and source.topic not in self.gains:
+                told = each.timing
+                if told.evidence > SURE and abs(told.likeness) > ALIKE:
+                    return source.moved(-told.lag_s, told.gain)
+        return aligned
+
+    def speed(self, source: Series) -> Slope | None:
+        """How far places move for each metre of a speed or velocity."""
+        if self.places is None or source.topic == self.places.topic:
+            return None
+        if (moved := clear_moves(self.places)) is None:
+            return None
+        told = travelled(self.aligned(source), moved.begin_s, moved.end_s)
+        return slope(told, np.linalg.norm(moved.values, axis=1))
+
+    def turn(self, source: Series) -> Slope | None:
+        """How much the course turns for each radian of a turn rate."""
+        if self.courses is None:
+            return None
+        windows = turned(self.courses, self.turn_span_s)
+        return slope(turn_between(self.likened(source), windows.begin_s, windows.end_s), windows.values)
+
+    def heading_turn(self, orientation: Series, source: Series) -> Slope:
+        """How much a heading turns for each radian of a turn rate."""
+        angles = Series("", "", orientation.times_s, heading(orientation.values))
+        windows = turned(angles, self.turn_span_s)
+        return slope(turn_between(self.timed(source), windows.begin_s, windows.end_s), windows.values)
+
+    def heading_course(self, orientation: Series) -> Slope | None:
+        """How much a heading turns for each radian of the course."""
+        if self.courses is None:
+            return None
+        windows = turned(self.timed(self.courses), self.turn_span_s)
+        begin, end = (heading_at(orientation, each) for each in (windows.begin_s, windows.end_s))
+        return slope(windows.values, end - begin)
+
+    def heading_offsets(self, orientation: Series) -> Floats:
+        """By how much headings exceed the course where the body moves clearly (k,), backwards too."""
+        if self.courses is None:
+            return np.empty(0)
+        course = self.timed(self.courses)
+        offsets = heading_at(orientation, course.times_s) - course.values
+        if self.body.speeds:
+            speed = self.timed(self.body.speeds[0])
+            sign = np.interp(course.times_s, speed.times_s, np.sign(speed.values))
+            offsets = offsets + np.pi * (sign < 0.0)
+        return wrapped(offsets[np.isfinite(offsets)])
+
+    def forces(self, force: Series) -> "Forces | None":
+        """How horizontal forces fit the changes of the velocity; None where these tell nothing."""
+        if not self.body.velocities or self.courses is None:
+            return None
+        velocity = self.body.velocities[0]
+        v = velocity.values[:, 0] + 1j * velocity.values[:, 1]
+        course = np.interp(velocity.times_s, self.courses.times_s, np.unwrap(self.courses.values))
+        step = max(1, round(1.0 / float(np.median(np.diff(velocity.times_s)))))
+        begin_s, end_s = velocity.times_s[:-step], velocity.times_s[step:]
+        middle = np.exp(-0.5j * (course[step:] + course[:-step]))
+        speed = np.abs(v)
+        is_clear = np.minimum(speed[step:], speed[:-step]) > 0.1 * np.quantile(speed, 0.95)
+        change = (v[step:] - v[:-step]) * middle
+        told = force.integral(end_s) - force.integral(begin_s)
+        pushed = told[:, 0] + 1j * told[:, 1]
+        known = np.isfinite(pushed) & is_clear & (end_s - begin_s < 2.0)
+        resting = np.isfinite(pushed) & ~is_clear
+        still = resting if resting.sum() >= FEWEST else known
+        if known.sum() < FEWEST:
+            return None
+        duration_s = end_s - begin_s
+        pushed = pushed - duration_s * np.sum(pushed[still]) / np.sum(duration_s[still])
+        pushed, change = pushed[known], change[known]
+        size = np.sqrt(np.sum(np.abs(pushed) ** 2) * np.sum(np.abs(change) ** 2))
+        as_is = np.sum(np.conj(pushed) * change) / size
+        mirrored = np.sum(pushed * change) / size
+        return Forces(float(np.angle(as_is)), float(np.abs(as_is)), float(np.abs(mirrored)))
+
+
+def heading_at(orientation: Series, times_s: Floats) -> Floats:
+    """Headings (k,) in rad at other times, not wrapped; NaN beyond the first and the last."""
+    angle = np.unwrap(heading(orientation.values))
+    return np.interp(times_s, orientation.times_s, angle, left=np.nan, right=np.nan)
+
+
+class Forces(NamedTuple):
+    """By what angle (rad) horizontal forces are to be turned to be those of the course.
+
+    `fit` is how well they then do, up to 1, and `mirrored` how well their mirror image would.
+    """
+
+    angle_rad: float
+    fit: float
+    mirrored: float
+
+
+def _hold_s(source: Series) -> float:
+    """What may be how a topic is meant: half a step held, or the mean of the step before."""
+    step_s = float(np.median(np.diff(source.times_s)))
+    return step_s if source.values.ndim > 1 else 0.5 * step_s
+
+
+def _sure_lag_s(told: Timing) -> float:
+    """The lag where it is one; a clock that gains has none."""
+    is_lag = abs(told.lag_s) > max(LEAST_LAG_S, told.tolerance_s)
+    is_sure = told.evidence > SURE and abs(told.likeness) > ALIKE and not told.gain
+    return told.lag_s if is_lag and is_sure else 0.0

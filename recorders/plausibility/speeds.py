@@ -1,0 +1,172 @@
+"""Checks of when topics speak, and of how far they say that a body comes."""
+
+from collections.abc import Iterator
+from itertools import chain
+
+import numpy as np
+
+from recorders.plausibility.body import Fixes, Floats, Series
+from recorders.plausibility.finding import Finding, digits
+from recorders.plausibility.motion import Motion
+
+# By what a speed is too large that was logged in another unit and read as m/s.
+UNITS = {3.6: "km/h", 1 / 0.3048: "ft/s", 1 / 0.44704: "mi/h", 1 / 0.514444: "kn"}
+NEAR = 0.05  # of a factor
+SCALE = (0.8, 1.25)  # what a metre of a speed may move places by
+SPREAD = 0.25
+LEAP_S = {18.0: "GPS time runs 18 s ahead of UTC since 2017"}
+LEAP_TOLERANCE_S = 0.6
+REST = 0.05  # of the larger speeds
+FEWEST_AT_REST = 10
+TAIL_SIGMAS = 3.2905  # beyond which, to each side, a Gaussian is in .0005 of all cases
+LEAST_RATIO = 1.5  # of variances, a difference that matters
+
+
+def delays(motion: Motion) -> Iterator[Finding]:
+    """Topics that are later than others of the same body, by how speeds and turns lag."""
+    for topic, late_s in motion.delays_s.items():
+        if not late_s:
+            continue
+        evidence = next(
+            f"the motion of {each.source} is most like that of {each.against} (correlation "
+            f"{abs(each.timing.likeness):.3f}) so"
+            for each in (*motion.speed_lags, *motion.turn_lags)
+            if topic in (each.source, each.against)
+        )
+        leap_s = next((s for s in LEAP_S if abs(abs(late_s) - s) < LEAP_TOLERANCE_S), None)
+        value = late_s if leap_s is None else float(np.copysign(leap_s, late_s))
+        why = "" if leap_s is None else f", and {LEAP_S[leap_s]}"
+        yield Finding(
+            "delay",
+            topic,
+            "",
+            value,
+            f"{topic}: its stamps are {abs(value):.3g} s {'late' if value > 0 else 'early'}: {evidence}"
+            f"{why}",
+            f"{topic}.delay_s",
+            digits(value),
+        )
+
+
+def clocks(motion: Motion) -> Iterator[Finding]:
+    """Clocks that gain on others, by how speeds drift apart."""
+    for topic, gain in motion.gains.items():
+        against = next(each.against for each in motion.speed_lags if each.source == topic)
+        yield Finding(
+            "clock",
+            topic,
+            "",
+            gain,
+            f"{topic}: its clock {'gains' if gain > 0 else 'loses'} {100 * abs(gain):.2g} s in 100 s on "
+            f"that of {against}: only so their speeds stay alike",
+            f"{topic}.clock_gain",
+            digits(gain),
+        )
+
+
+def factors(motion: Motion) -> Iterator[Finding]:
+    """Speeds in other units, by how far places move."""
+    for source in chain(motion.body.speeds, motion.body.velocities):
+        told = motion.speed(source)
+        if told is None or not told.sign or told.spread > SPREAD or SCALE[0] < told.value < SCALE[1]:
+            continue
+        assert motion.places is not None
+        known = {**UNITS, **{1 / factor: name for factor, name in UNITS.items()}}
+        nearest = min(known, key=lambda each: abs(np.log(each * told.value)))
+        is_unit = abs(np.log(nearest * told.value)) < NEAR
+        factor = nearest if is_unit else 1.0 / told.value
+        of = f"{source.topic}: {source.field}"
+        moved = (
+            f"{motion.places.topic} moves {told.value:.4g} m for each metre of it "
+            f"(in {told.windows} windows)"
+        )
+        if not is_unit:
+            what, mapping = f"is {factor:.3g} times what it must be", ""
+        elif factor > 1.0:
+            what = f"is {factor:.4g} times too large, as {known[nearest]} taken for m/s"
+            mapping = f'units.{source.field} = "{known[nearest]}" in the mapping'
+        else:
+            what = f"is {1 / factor:.4g} times too small, as m/s taken for {known[nearest]}"
+            mapping = f'units.{source.field} = "m/s" in the mapping'
+        yield Finding(
+            "unit" if is_unit else "scale",
+            source.topic,
+            source.field,
+            factor,
+            f"{of} {what}: {moved}",
+            f"{source.topic}.{source.field.rpartition('_')[0]}_scale",
+            digits(1.0 / factor),
+            mapping,
+        )
+
+
+def rest(motion: Motion) -> Iterator[Finding]:
+    """Variances of fixes that their scatter at rest belies, where their errors are white."""
+    moving = [*motion.body.speeds, *motion.body.velocities]
+    for fixes in motion.body.fixes:
+        source = next((each for each in moving if each.topic != fixes.topic), None)
+        if source is None:
+            continue
+        found = scatter(fixes, motion.aligned(source))
+        if found is None:
+            continue
+        ratio, degrees, likeness = found
+        low, high = (chance(degrees, sigmas) for sigmas in (-TAIL_SIGMAS, TAIL_SIGMAS))
+        is_white = abs(likeness) < 2.5 / np.sqrt(degrees) + 2.0 / degrees
+        if low < ratio < high or 1 / LEAST_RATIO < ratio < LEAST_RATIO or not is_white:
+            continue
+        yield Finding(
+            "covariance",
+            fixes.topic,
+            "covariance_m2",
+            ratio,
+            f"{fixes.topic}: at rest its errors are white and have {ratio:.3g} times the variance that "
+            f"it states ({degrees // 2 + 1} fixes; {low:.2g} to {high:.2g} is chance)",
+            f"{fixes.topic}.covariance_scale",
+            digits(ratio),
+        )
+
+
+def scatter(fixes: Fixes, source: Series) -> tuple[float, int, float] | None:
+    """How fixes scatter while a speed says that the body rests.
+
+    Returns the variance as a multiple of what is stated, its degrees of freedom, and the correlation of
+    an error with the next; None where the body does not rest, or no variance is stated.
+    """
+    half_s = max(0.5, 2.0 * float(np.median(np.diff(source.times_s))))
+    moved = source.integral(fixes.times_s + half_s) - source.integral(fixes.times_s - half_s)
+    speed = (np.abs(moved) if moved.ndim == 1 else np.linalg.norm(moved, axis=1)) / (2.0 * half_s)
+    # the first and last fixes are at the source's ends
+    speed = _filled(speed)
+    if not np.isfinite(speed).any():
+        return None
+    rests = speed < REST * np.quantile(speed, 0.95)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rests.astype(np.int8), [0]])))
+    squares, degrees, next_ones = 0.0, 0, 0.0
+    for begin, end in edges.reshape(-1, 2):
+        stated = fixes.variances_m2[begin:end]
+        if end - begin < FEWEST_AT_REST or not (stated > 0.0).all():
+            continue
+        place = fixes.values[begin:end]
+        error = (place - np.average(place, axis=0, weights=1.0 / stated)) / np.sqrt(stated)[:, None]
+        squares += float(np.sum(error**2))
+        next_ones += float(np.sum(error[1:] * error[:-1]))
+        degrees += 2 * (end - begin - 1)
+    return (squares / degrees, degrees, next_ones / squares) if degrees and squares else None
+
+
+def _filled(values: Floats) -> Floats:
+    """Values (n,), where they are not known at the ends those next to them."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not len(known):
+        return values
+    return values[np.clip(np.arange(len(values)), known[0], known[-1])]
+
+
+def chance(degrees: int, sigmas: float) -> float:
+    """A quantile of chi-square over its degrees of freedom, by that of a Gaussian.
+
+    Wilson and Hilferty, PNAS 17, 1931: within 2 % from 18 degrees on.
+    """
+    part = 2.0 / (9.0 * degrees)
+    return float((1.0 - part + sigmas * part**0.5) ** 3)

@@ -1,0 +1,298 @@
+"""Checks of angles: turn rates, courses and headings, and how an inertial unit is mounted."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+
+from recorders.models.orientation import compose, conjugate
+from recorders.plausibility.body import Floats, Series
+from recorders.plausibility.finding import Finding, digits
+from recorders.plausibility.motion import Motion, Slope
+from recorders.plausibility.windows import FEWEST, pairs, wrapped
+
+NEAR_DEGREES = 0.1
+TOO_FAST_RADPS = 35.0
+HALF = 0.5  # of a slope, above which a mirror image is one
+CLEARER = 1.5  # times as well as its mirror image do forces fit
+FITS = 0.9
+SMALL_RAD, STEADY_RAD, SURE = 0.05, 0.25, 6.0  # of heading less course: its mean, spread and errors
+TURNED_RAD = np.radians(20.0)
+BETTER = 3.0  # times as near to the turn rates
+TURNS_RADPS = 0.05
+UNIT_TOLERANCE = 1e-3
+NORM_G, NORM_MILLI = (0.9, 1.1), (930.0, 1030.0)
+LARGEST_SHARE = 0.9
+G_MPS2 = 9.80665
+
+
+def signs(motion: Motion) -> Iterator[Finding]:
+    """Turn rates, courses or headings that go the other way round than the others do."""
+    orientations = motion.body.orientations
+    orientation = orientations[0] if orientations else None
+    beside = motion.heading_course(orientation) if orientation else None
+    headed = beside.sign if beside else 0
+    for source in motion.body.turns:
+        told = motion.turn(source)
+        course = told.sign if told else 0
+        heading = motion.heading_turn(orientation, source).sign if orientation else 0
+        if course < 0 and told and (abs(told.value) > HALF or _is_degrees(told)):
+            assert motion.courses is not None
+            yield from _mirrored(motion, source, told, witness=heading or _by_forces(motion, source))
+        elif orientation and heading < 0 and (course > 0 or headed < 0):
+            yield _compass(orientation, f"{source.topic} and the course turn")
+        elif orientation and heading < 0 and headed > 0:
+            yield _sign(source, f"{orientation.topic} and the course turn the other way round")
+    if orientation and headed < 0 and not motion.body.turns:
+        yield _compass(orientation, "the course turns")
+
+
+def _by_forces(motion: Motion, source: Series) -> int:
+    """What horizontal forces say of a frame: -1 where it is as it must be, so that the rate is wrong."""
+    for force in motion.body.forces:
+        if force.topic == source.topic:
+            told = motion.forces(motion.aligned(force))
+            if told and max(told.fit, told.mirrored) > FITS:
+                return 1 if told.mirrored > told.fit else -1
+    return 0
+
+
+def _mirrored(motion: Motion, source: Series, told: Slope, witness: int) -> Iterator[Finding]:
+    """One of a rate and a frame is mirrored; a witness that goes with the rate says that it is right."""
+    assert motion.courses is not None
+    course = motion.courses
+    evidence = f"the course of {course.topic} turns {told.value:.3g} rad for each rad of it"
+    if witness > 0:
+        field = course.field
+        yield Finding(
+            "sign",
+            course.topic,
+            field,
+            -1.0,
+            f"{course.topic}: its frame is mirrored, as where east and north are exchanged: the course "
+            f"turns {told.value:.3g} rad for each rad of {source.topic}, which another sensor confirms",
+            mapping=f"in the mapping exchange the columns of {field}",
+        )
+        return
+    unless = "" if witness else f", unless the frame of {course.topic} has east and north exchanged"
+    yield _sign(source, evidence + unless)
+
+
+def _sign(source: Series, evidence: str) -> Finding:
+    what = source.field.rpartition("_")[0]
+    what = f"{what}_z" if what == "turn_rate" else what
+    return Finding(
+        "sign",
+        source.topic,
+        source.field,
+        -1.0,
+        f"{source.topic}: {source.field} has the wrong sign, anticlockwise from above is positive: "
+        f"{evidence}",
+        f"{source.topic}.{what}_scale",
+        -1,
+        f"factors.{source.field} = -1 in the mapping",
+    )
+
+
+def _compass(orientation: Series, others: str) -> Finding:
+    return Finding(
+        "sign",
+        orientation.topic,
+        orientation.field,
+        -1.0,
+        f"{orientation.topic}: its heading goes clockwise, as a compass has it, and ours anticlockwise "
+        f"from east: {others} the other way round",
+        mapping="in the mapping make it of attitude = { heading = ... }",
+    )
+
+
+def degrees(motion: Motion) -> Iterator[Finding]:
+    """Turn rates in deg/s, or taken for such, by the course or because no body turns so fast."""
+    for source in motion.body.turns:
+        told = motion.turn(source)
+        rates = np.abs(
+            next((each for each in motion.body.rates if each.topic == source.topic), source).values
+        )
+        if told and told.sign and _is_degrees(told):
+            assert motion.courses is not None
+            evidence = f"the course of {motion.courses.topic} turns {told.value:.3g} rad for each of it"
+            is_large = abs(told.value) < 1.0
+        elif not (told and told.sign) and np.mean(rates > TOO_FAST_RADPS) > 1e-3:
+            evidence, is_large = f"in rad/s it would be up to {rates.max():.3g}", True
+        else:
+            continue
+        what = source.field.rpartition("_")[0]
+        given, factor = ("deg/s", np.pi / 180.0) if is_large else ("rad/s", 180.0 / np.pi)
+        taken = "in deg/s" if is_large else "in rad/s, taken for deg/s"
+        yield Finding(
+            "unit",
+            source.topic,
+            source.field,
+            1.0 / factor,
+            f"{source.topic}: {source.field} is {taken}: {evidence}",
+            f"{source.topic}.{what}_scale",
+            digits(factor),
+            f'units.{source.field} = "{given}" in the mapping',
+        )
+
+
+def _is_degrees(told: Slope) -> bool:
+    return any(
+        abs(abs(told.value) / each - 1.0) < NEAR_DEGREES for each in (np.pi / 180.0, 180.0 / np.pi)
+    )
+
+
+def headings(motion: Motion) -> Iterator[Finding]:
+    """Headings that are off the course by one angle, of bodies that go where they head."""
+    for orientation in motion.body.orientations:
+        told = motion.heading_course(orientation)
+        offsets = motion.heading_offsets(orientation)
+        if told is None or told.sign < 1 or len(offsets) < FEWEST:
+            continue
+        mean = float(np.angle(np.mean(np.exp(1j * offsets))))
+        rest = wrapped(offsets - mean)
+        spread = float(np.std(rest))
+        error = spread / np.sqrt(len(rest) / 4.0)  # windows overlap
+        if abs(mean) > max(SMALL_RAD, SURE * error) and spread < STEADY_RAD:
+            yield Finding(
+                "mounting",
+                orientation.topic,
+                orientation.field,
+                mean,
+                f"{orientation.topic}: its heading is {np.degrees(mean):.3g} deg anticlockwise of the "
+                f"course ({len(rest)} windows, spread {np.degrees(spread):.2g} deg): by the sensor's "
+                "mounting, or north is magnetic",
+                mapping="in the mapping turn it back, by mounting_deg",
+            )
+
+
+def mounting(motion: Motion) -> Iterator[Finding]:
+    """Units whose forward is not the body's, by the forces in curves and at changes of speed."""
+    for force in motion.body.forces:
+        told = motion.forces(motion.aligned(force))
+        if told and told.fit > max(FITS, CLEARER * told.mirrored) and abs(told.angle_rad) > TURNED_RAD:
+            angle = np.degrees(told.angle_rad)
+            yield Finding(
+                "mounting",
+                force.topic,
+                force.field,
+                told.angle_rad,
+                f"{force.topic}: it is mounted turned about the vertical: its horizontal forces are "
+                f"those of the course if turned by {angle:.3g} deg (fit {told.fit:.2f} of 1)",
+                mapping=f"mounting_deg = [0, 0, {round(angle)}] in the mapping",
+            )
+
+
+def gravity(motion: Motion) -> Iterator[Finding]:
+    """Forces in g, or with z down, by the quietest second."""
+    for force in motion.body.forces:
+        mean = quietest(force)
+        if mean is None:
+            continue
+        norm = float(np.linalg.norm(mean))
+        scale, given = 1.0, ""
+        if NORM_G[0] <= norm <= NORM_G[1]:
+            scale, given = G_MPS2, "g"
+        elif NORM_MILLI[0] <= norm <= NORM_MILLI[1]:
+            is_milli = abs(norm - 1000.0) < abs(norm - 980.665)
+            scale, given = (1e-3 * G_MPS2, "mg") if is_milli else (0.01, "cm/s^2")
+        if given:
+            yield Finding(
+                "gravity",
+                force.topic,
+                force.field,
+                1.0 / scale,
+                f"{force.topic}: {force.field} is in {given}: at rest its length is {norm:.4g}",
+                f"{force.topic}.specific_force_scale",
+                digits(scale),
+                f'units.{force.field} = "{given}" in the mapping',
+            )
+        moves = motion.places is not None or motion.courses is not None
+        if moves and mean[2] < -LARGEST_SHARE * norm and np.median(force.values[:, 2]) < 0.0:
+            turns = next((each for each in motion.body.turns if each.topic == force.topic), None)
+            told = motion.turn(turns) if turns else None
+            is_down = told is not None and told.sign < 0
+            yield Finding(
+                "gravity",
+                force.topic,
+                force.field,
+                -1.0,
+                f"{force.topic}: its z axis is down, or its forces have the wrong sign: at rest the "
+                f"force along z is {mean[2]:.4g}, where specific force points up",
+                "" if is_down else f"{force.topic}.specific_force_z_scale",
+                "" if is_down else -1,
+                "mounting_deg = [180, 0, 0] in the mapping, if its axes are forward, right, down",
+            )
+
+
+def quietest(force: Series) -> Floats | None:
+    """The mean force (3,) in the second in which forces vary least; None where no second is whole."""
+    second = np.floor(force.times_s - force.times_s[0]).astype(int)
+    edges = np.flatnonzero(np.diff(second, prepend=-1, append=second[-1] + 1))
+    parts = [force.values[begin:end] for begin, end in pairwise(edges) if end - begin >= 10]
+    if not parts:
+        return None
+    return np.asarray(min(parts, key=lambda part: float(part.var(axis=0).sum())).mean(axis=0))
+
+
+ORDERS = {
+    "w, x, y, z": ([0, 1, 2, 3], False),
+    "x, y, z, w": ([3, 0, 1, 2], False),
+    "w, x, y, z of the opposite rotation": ([0, 1, 2, 3], True),
+    "x, y, z, w of the opposite rotation": ([3, 0, 1, 2], True),
+}
+
+
+def quaternions(motion: Motion) -> Iterator[Finding]:
+    """Quaternions that are not unit, or in another order, by turn rates."""
+    for orientation in (*motion.body.orientations, *motion.body.references):
+        norm = np.linalg.norm(orientation.values, axis=1)
+        off = float(np.median(np.abs(norm - 1.0)))
+        if off > UNIT_TOLERANCE:
+            yield Finding(
+                "quaternion",
+                orientation.topic,
+                orientation.field,
+                off,
+                f"{orientation.topic}: its quaternions are no unit ones: half of their lengths differ "
+                f"from 1 by {off:.3g} and more",
+                mapping="normalise them where the log is written",
+            )
+            continue
+        rates = next(iter(motion.body.rates), None)
+        if rates is None:
+            continue
+        errors = rate_errors(orientation, rates)
+        if not errors:
+            continue
+        best = min(errors, key=lambda each: errors[each])
+        stated = next(iter(ORDERS))
+        if BETTER * errors[best] < errors[stated]:
+            yield Finding(
+                "quaternion",
+                orientation.topic,
+                orientation.field,
+                errors[stated] / errors[best],
+                f"{orientation.topic}: its quaternions are {best}, read as {stated}: so they turn as "
+                f"{rates.topic} does but for {errors[best]:.2g} rad/s, as they are {errors[stated]:.2g}",
+                mapping="in the mapping name its four columns in the order w, x, y, z",
+            )
+
+
+def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
+    """By what (rad/s, rms) quaternions in each order turn otherwise than rates say; none at rest."""
+    first, second = pairs(orientation.times_s, 0.1)
+    begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
+    duration_s = (end_s - begin_s)[:, None]
+    told = (rates.integral(end_s) - rates.integral(begin_s)) / duration_s
+    known = np.isfinite(told).all(axis=1)
+    if known.sum() < FEWEST or np.sqrt(np.mean(told[known] ** 2)) < TURNS_RADPS:
+        return {}
+    found = {}
+    for name, (order, is_opposite) in ORDERS.items():
+        q = orientation.values[:, order]
+        q = conjugate(q) if is_opposite else q
+        step = compose(conjugate(q[first]), q[second])
+        turned = 2.0 * step[:, 1:] * np.sign(step[:, :1] + 1e-300) / duration_s
+        found[name] = float(np.sqrt(np.mean(np.sum((turned - told)[known] ** 2, axis=1))))
+    return found

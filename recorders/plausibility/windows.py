@@ -1,0 +1,121 @@
+"""Windows of a motion: how far and by what angle places moved, and a topic's own account of the same."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.plausibility.body import Body, Floats, Series
+
+SPANS_S = (2.0, 5.0, 10.0)
+FEWEST = 12  # windows, below which nothing is said
+CLEAR = 12.0  # times the noise of a place, which a window has to be long
+MOST = 2000  # windows; of more every second, third, ... is taken
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows (k,) from one stamp to a later one, and what was measured in each."""
+
+    begin_s: Floats
+    end_s: Floats
+    values: Floats
+
+    def __len__(self) -> int:
+        return len(self.begin_s)
+
+    def take(self, rows: NDArray[np.bool_] | slice) -> "Windows":
+        """Some of them."""
+        return Windows(self.begin_s[rows], self.end_s[rows], self.values[rows])
+
+
+def noise_of(places: Floats) -> float:
+    """The standard deviation of white noise of samples (n, 2), by how they differ from their neighbours.
+
+    What accelerates differs as well: it is too large rather than too small.
+    """
+    bend = places[1:-1] - 0.5 * (places[:-2] + places[2:])
+    return float(1.4826 * np.median(np.abs(bend)) / np.sqrt(1.5)) if len(bend) else np.nan
+
+
+def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The rows of stamps that are a span apart, or a step where the steps are longer."""
+    step_s = float(np.median(np.diff(times_s)))
+    later = np.searchsorted(times_s, times_s + max(span_s, step_s) - 1e-6)
+    first = np.flatnonzero(later < len(times_s))
+    is_near = times_s[later[first]] - times_s[first] < 1.5 * max(span_s, step_s)
+    first = first[is_near]
+    first = first[:: -(-len(first) // MOST)] if len(first) > MOST else first
+    return first, later[first]
+
+
+def chords(fixes: Series, span_s: float) -> Windows:
+    """How places move (k, 2) in windows of a span."""
+    first, second = pairs(fixes.times_s, span_s)
+    return Windows(
+        fixes.times_s[first], fixes.times_s[second], fixes.values[second] - fixes.values[first]
+    )
+
+
+def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
+    """How far a speed or velocity says that one comes in windows, forward or not."""
+    moved = source.integral(end_s) - source.integral(begin_s)
+    return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
+
+
+def places_of(body: Body) -> Series | None:
+    """Where the body is: its fixes, else what its velocities add up to."""
+    if body.fixes:
+        return body.fixes[0]
+    if body.velocities and body.speeds:
+        of = body.velocities[0]
+        return Series(of.topic, of.field, of.times_s, of.integral(of.times_s))
+    return None
+
+
+def distances(places: Series, span_s: float) -> Windows | None:
+    """How far places move in windows of a span, or longer ones where that varies too little."""
+    for each_s in (span_s, *SPANS_S):
+        moved = chords(places, each_s)
+        found = replace(moved, values=np.linalg.norm(moved.values, axis=1))
+        if len(found) >= FEWEST and np.std(found.values) > 3.0 * noise_of(places.values):
+            return found
+    return None
+
+
+def clear_moves(places: Series) -> Windows | None:
+    """Moves (k, 2) that are well above the noise of places, in the shortest windows that have some."""
+    noise = noise_of(places.values)
+    for span_s in SPANS_S:
+        moved = chords(places, span_s)
+        clear = moved.take(np.linalg.norm(moved.values, axis=1) > CLEAR * noise)
+        if len(clear) >= FEWEST:
+            return clear
+    return None
+
+
+def courses(body: Body) -> Series | None:
+    """The course (n,) in rad where the body moves clearly: of velocities, else of places."""
+    if body.velocities:
+        of: Series = body.velocities[0]
+        moves = np.linalg.norm(of.values, axis=1) > CLEAR * noise_of(of.values)
+        times_s, values = of.times_s[moves], of.values[moves]
+    elif body.fixes and (moved := clear_moves(of := body.fixes[0])) is not None:
+        times_s, values = 0.5 * (moved.begin_s + moved.end_s), moved.values
+    else:
+        return None
+    if len(times_s) < FEWEST:
+        return None
+    return Series(of.topic, of.field, times_s, np.arctan2(values[:, 1], values[:, 0]))
+
+
+def turned(angles: Series, span_s: float) -> Windows:
+    """By how much angles change (k,) in windows of a span, wrapped to half a turn."""
+    first, second = pairs(angles.times_s, span_s)
+    change = angles.values[second] - angles.values[first]
+    return Windows(angles.times_s[first], angles.times_s[second], wrapped(change))
+
+
+def wrapped(angle_rad: Floats) -> Floats:
+    """Angles from -pi to pi."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi

@@ -1,0 +1,160 @@
+"""Takes positions from one tangent plane into another: east, north and up of another origin.
+
+The two planes are turned and shifted against each other as the earth is round. What lacks a height is
+taken to be as high above the ellipsoid as the origin of its plane: where it is 100 m higher, and the
+other origin 1 km away, it comes out 2 cm wrong.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Stream, schemas
+from recorders.log.planes import Origin, stated_in
+from recorders.models.geodesy import SEMI_MAJOR_M, into_tangent_plane, tangent_axes
+from recorders.models.orientation import compose
+from recorders.models.planar import wrap_angle
+from replay.engine.arrays import Floats
+from replay.engine.vectors.components import stated_components
+from replay.engine.vectors.tangent import manifold_blocks, tangent_components
+
+# Components of one vector in the log's frame, which turn together; the first is the position.
+VECTORS = [tuple(f"{of}{axis}_{unit}" for axis in "xyz") for of, unit in (("", "m"), ("v", "mps"))]
+HEADING = "heading_rad"
+# Fields that are vectors in the axes of the plane, and their covariances; positions shift as well.
+_FIELDS = {
+    schemas.POSITION_FIX.full_name: ("position_m", "covariance_m2"),
+    schemas.VELOCITY_FIX.full_name: ("velocity_mps", "covariance_m2ps2"),
+    schemas.POSE.full_name: ("position_m", "covariance"),
+    schemas.LANDMARK.full_name: ("position_m", ""),
+    schemas.COURSE_FIX.full_name: ("position_m", ""),
+}
+_STATES = {schemas.TRUTH_STATE.full_name: "state", schemas.GAUSSIAN_ESTIMATE.full_name: "mean"}
+
+
+class Movement(NamedTuple):
+    """The transform p -> scale rotation p + translation_m from one frame to another."""
+
+    rotation: Floats = np.eye(3)
+    translation_m: Floats = np.zeros(3)
+    scale: float = 1.0
+
+    @property
+    def yaw_rad(self) -> float:
+        """Compute how far it turns about the vertical."""
+        return float(np.arctan2(self.rotation[1, 0], self.rotation[0, 0]))
+
+    @property
+    def quaternion(self) -> Floats:
+        """Return its rotation (4,): w, x, y, z."""
+        from scipy.spatial.transform import Rotation  # which takes long to import
+
+        return np.asarray(Rotation.from_matrix(self.rotation).as_quat(scalar_first=True))
+
+
+def between(origin: Origin, other: Origin) -> Movement:
+    """The transform from the plane of an origin into that of another one."""
+    axes, others = (tangent_axes(*each[:2]) for each in (origin, other))
+    return Movement(others @ axes.T, np.array(into_tangent_plane(origin, other), float))
+
+
+def moved_states(
+    components: Mapping[str, str], mean: Floats, movement: Movement
+) -> tuple[Floats, Floats]:
+    """States (n, d) in another frame, and the Jacobian (t, t) of this in the tangent space.
+
+    Positions and velocities turn, headings and orientations as well; the latter have their covariance in
+    the body's frame, where it stays. All other components are taken to be of the body.
+    """
+    names, kinds = list(components), list(components.values())
+    tangent = [name for name, _ in tangent_components(names, kinds)]
+    mean, jacobian = mean.copy(), np.eye(len(tangent))
+    for vector in VECTORS:
+        there = [axis for axis, name in enumerate(vector) if name in components]
+        if not there:
+            continue
+        turn = movement.scale * movement.rotation[np.ix_(there, there)]
+        columns = [names.index(vector[axis]) for axis in there]
+        rows = [tangent.index(vector[axis]) for axis in there]
+        shift = movement.translation_m[there] if vector == VECTORS[0] else 0.0
+        mean[:, columns] = mean[:, columns] @ turn.T + shift
+        jacobian[np.ix_(rows, rows)] = turn
+    if components.get(HEADING) == "angle":
+        column = names.index(HEADING)
+        mean[:, column] = wrap_angle(mean[:, column] + movement.yaw_rad)
+    for kind, columns_of in manifold_blocks(kinds):
+        if kind == "quaternion":
+            mean[:, columns_of] = compose(movement.quaternion, mean[:, columns_of])
+    return mean, jacobian
+
+
+def into_plane_of(stream: Stream, origin: Origin) -> Stream:
+    """A stream that states the origin of its plane, in the plane of another one.
+
+    Latitudes and longitudes stay: what is stated of them is the plane that they are taken into. Raises
+    BadInput where it is not known how such messages are taken into another plane.
+    """
+    own = stated_in(stream.topic, stream.metadata)
+    if own is None or own == origin:
+        return stream
+    movement, schema = between(own, origin), stream.schema.full_name
+    columns = dict(stream.columns)
+    if schema in _STATES and len(stream):
+        field = _STATES[schema]
+        components = stated_components(stream.metadata, {}, f"topic {stream.topic}")
+        mean = stream[field].reshape(len(stream), len(components))
+        columns[field], jacobian = moved_states(components, mean, movement)
+        if VECTORS[0][2] not in components:
+            place = [list(components).index(name) for name in VECTORS[0][:2]]
+            columns[field][:, place] += _below(mean[:, place], movement)
+        if "covariance" in columns:
+            columns["covariance"] = _turned(columns["covariance"], jacobian)
+    elif schema in _FIELDS:
+        columns |= _moved_fields(stream, movement)
+    elif schema not in (*_STATES, schemas.GEODETIC_FIX.full_name):
+        raise BadInput(
+            f"topic {stream.topic} states the origin {own} of its plane, and others state {origin}: its "
+            f"messages ({schema}) are not taken into another plane; record it with the others' origin"
+        )
+    return replace(stream, columns=columns, metadata={**stream.metadata, **origin.metadata})
+
+
+def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
+    """The fields of messages that are vectors or directions in the axes of the plane."""
+    field, covariance = _FIELDS[stream.schema.full_name]
+    if not len(stream):  # vectors have no width here
+        return {}
+    size = stream[field].shape[1]
+    turn = movement.rotation[:size, :size]
+    shift = movement.translation_m[:size] if field == "position_m" else 0.0
+    moved = {field: stream[field] @ turn.T + shift}
+    if field == "position_m" and size == 2:
+        moved[field] += _below(stream[field], movement)
+    if covariance in stream.columns:
+        given = stream[covariance]
+        axes = np.asarray(np.kron(np.eye(2), turn) if covariance == "covariance" else turn, float)
+        is_diagonal = given.shape[1] == len(axes)
+        full = given[:, :, None] * np.eye(size) if is_diagonal else given
+        moved[covariance] = _turned(np.reshape(full, (len(stream), -1)), axes)
+    if "quaternion" in stream.columns:
+        moved["quaternion"] = compose(movement.quaternion, stream["quaternion"])
+    if "course_rad" in stream.columns:  # clockwise from north
+        moved["course_rad"] = np.mod(stream["course_rad"] - movement.yaw_rad, 2.0 * np.pi)
+    return moved
+
+
+def _below(place_m: Floats, movement: Movement) -> Floats:
+    """What is missing of flat places (n, 2) in another plane, since the earth falls off below theirs."""
+    fall_m = np.sum(place_m**2, axis=1) / (2.0 * SEMI_MAJOR_M)
+    return -fall_m[:, None] * movement.rotation[:2, 2]
+
+
+def _turned(covariance: Floats, jacobian: Floats) -> Floats:
+    """Covariances (n, d d) in other axes; what is unknown stays so."""
+    size, unknown = len(jacobian), np.isnan(covariance)
+    known = np.where(unknown, 0.0, covariance).reshape(-1, size, size)
+    turned = (jacobian @ known @ jacobian.T).reshape(len(covariance), size * size)
+    return np.where(unknown, np.nan, turned)

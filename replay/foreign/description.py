@@ -1,0 +1,218 @@
+"""What a foreign filter says of itself: its topics, its state, its parameters; in JSON."""
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator
+
+from recorders.errors import BadInput
+from recorders.log import Topic
+from recorders.parameters import Parameters, build, unit_of
+from recorders.parsing import parse_json
+from replay.engine.streams.channels import resolved
+from replay.engine.vectors.tangent import Kind, are_kinds, tangent_components
+
+MOST_COMPONENTS = 1000  # of a state: its covariance has a million numbers
+
+
+class ForeignParameters(Parameters):
+    """How a foreign filter is run; beside these it has the parameters of its description.
+
+    Attributes:
+        time_limit_s: a run fails where one message takes longer.
+        memory_limit_mb: a run fails where the filter's process takes more memory.
+        every_s: estimates are given at the multiples of this time, too.
+        seed: of the filter's random numbers.
+    """
+
+    time_limit_s: Annotated[float, Field(gt=0)] = 10.0
+    memory_limit_mb: Annotated[float, Field(gt=0)] = 2000.0
+    every_s: Annotated[float, Field(gt=0)] | None = None
+    seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 0
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class TopicRead(_Part):
+    """Describes a topic that a filter reads.
+
+    Attributes:
+        topic: its name; one without a slash in front is looked for under every prefix.
+        fields: those that the filter is given, in this order; `position_m[2]` is a vector of two.
+        message: name of the message's schema, such as `fuselog.RangeBearing`; "" for any.
+        static: whether all of it is taken before the start, such as a map.
+        optional: whether a log may lack it.
+        estimates: whether an estimate is wanted at its messages.
+        target: the field that says what a message is about.
+    """
+
+    topic: str = Field(min_length=1)
+    fields: tuple[str, ...]
+    message: str = ""
+    static: bool = False
+    optional: bool = False
+    estimates: bool = True
+    target: str = ""
+
+    @field_validator("fields")
+    @classmethod
+    def _are_fields(cls, fields: tuple[str, ...]) -> tuple[str, ...]:
+        for field in fields:
+            name, _, size = field.partition("[")
+            if not name or (size and not (size.endswith("]") and size[:-1].isdecimal())):
+                raise ValueError(f"'{field}' is no field; name it, or name[SIZE] for a vector")
+        return fields
+
+    @cached_property
+    def sizes(self) -> dict[str, int]:
+        """How many numbers a vector field has; 0 for a field that is one number."""
+        parts = (field.partition("[") for field in self.fields)
+        return {name: int(size[:-1]) if size else 0 for name, _, size in parts}
+
+    @property
+    def width(self) -> int:
+        """Count the numbers of a message."""
+        return sum(size or 1 for size in self.sizes.values())
+
+
+class ParameterRead(_Part):
+    """Describes a parameter: its default (none takes what the log's channels state), bounds, meaning."""
+
+    default: float | None = None
+    unit: str = ""
+    meaning: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    exclusiveMinimum: float | None = None  # noqa: N815
+    exclusiveMaximum: float | None = None  # noqa: N815
+
+
+class Description(_Part):
+    """Describes a foreign filter.
+
+    Attributes:
+        summary: what it is, in one line.
+        topics: what it reads.
+        state: the components of the state by name, with their kinds.
+        innovation: those that its innovations have; none where it gives no innovations.
+        parameters: by name.
+        prior: the topic of the prior; "" where it starts by itself.
+        truth: the topic of the truth.
+        output: what its topic of estimates ends with.
+        failures: sentences; a function that returns n means the n-th.
+    """
+
+    summary: str
+    topics: tuple[TopicRead, ...] = Field(min_length=1)
+    state: dict[str, Kind] = Field(min_length=1, max_length=MOST_COMPONENTS)
+    innovation: dict[str, Kind] = {}
+    parameters: dict[str, ParameterRead] = {}
+    prior: str = ""
+    truth: str = ""
+    output: str = Field("state", pattern=r"^\w+$")
+    failures: tuple[str, ...] = ()
+
+    @cached_property
+    def tangent(self) -> int:
+        """Count the components of the tangent space."""
+        return len(tangent_components(list(self.state), list(self.state.values())))
+
+    @cached_property
+    def width(self) -> int:
+        """Count the numbers of the widest message."""
+        return max(each.width for each in self.topics)
+
+    def bindings(self, topics: Mapping[str, Topic]) -> Iterator[tuple[str, dict[str, Topic]]]:
+        """Find where a log has all topics: prefix, and the topics that are there by name."""
+        own = [each.topic for each in self.topics if not each.topic.startswith("/")]
+        prefixes = dict.fromkeys(
+            name.removesuffix(f"/{topic}")
+            for topic in own
+            for name in topics
+            if name.endswith(f"/{topic}") and not name.startswith("/estimates/")
+        )
+        for prefix in prefixes if own else [""]:
+            found = {
+                each.topic: topics[name]
+                for each in self.topics
+                if (name := resolved(each.topic, prefix)) in topics
+                and each.message in ("", topics[name].schema_name)
+            }
+            if all(each.optional or each.topic in found for each in self.topics) and any(
+                not each.static for each in self.topics if each.topic in found
+            ):
+                yield prefix, found
+
+    @property
+    def requirements(self) -> str:
+        """Say what a log must have."""
+        return ", ".join(
+            resolved(each.topic, "...")
+            + (f" ({each.message})" if each.message else "")
+            + (" (optional)" if each.optional else "")
+            for each in self.topics
+        )
+
+    def parameters_over(self, base: type[Parameters]) -> type[Any]:
+        """Make the type of all parameters: those of how it is run, and the filter's own."""
+        fields: dict[str, Any] = {}
+        for name, each in self.parameters.items():
+            bounds = {
+                "ge": each.minimum,
+                "le": each.maximum,
+                "gt": each.exclusiveMinimum,
+                "lt": each.exclusiveMaximum,
+            }
+            told: dict[str, Any] = {key: value for key, value in bounds.items() if value is not None}
+            unit = "" if not each.unit or unit_of(name) else f"in {each.unit}"
+            meaning = ", ".join(filter(None, (each.meaning, unit)))
+            kind: Any = Annotated[float, Field(**told)] if told else float
+            kind = kind | None if each.default is None else kind
+            fields[name] = (kind, Field(each.default, description=meaning))
+        return create_model("FilterParameters", __base__=base, __doc__=base.__doc__, **fields)
+
+
+def read_description(text: str | bytes, where: str) -> Description:
+    """Read a description; raises BadInput where it is none, or contradicts itself.
+
+    Args:
+        text: JSON.
+        where: whose it is, for messages.
+    """
+    try:
+        found = parse_json(text.decode() if isinstance(text, bytes) else text)
+    except (ValueError, RecursionError) as error:
+        raise BadInput(f"{where}: its description is no JSON ({error}); mend what it gives") from None
+    if not isinstance(found, dict):
+        raise BadInput(f"{where}: its description is no JSON object; give {{...}} with topics and state")
+    made = build(_Described, {"description": found}, where).description
+    names = [each.topic for each in made.topics]
+    for name in names:
+        if names.count(name) > 1:
+            raise BadInput(f"{where}: its description has topic {name} twice; name all fields at once")
+    for each in made.topics:
+        if each.target and each.target not in each.sizes:
+            raise BadInput(
+                f"{where}: topic {each.topic}: its target {each.target} is none of its fields; add it"
+            )
+    for name in made.parameters:
+        if not name.isidentifier() or name in ForeignParameters.model_fields or name in _TAKEN:
+            raise BadInput(f"{where}: its parameter '{name}' cannot have this name; give it another")
+    for components in (made.state, made.innovation):
+        if not are_kinds(list(components.values())):
+            raise BadInput(
+                f"{where}: the components {', '.join(components)} are none: an axis has two, "
+                "a quaternion four, side by side"
+            )
+    build(made.parameters_over(ForeignParameters), {}, f"{where}, its defaults")
+    return made
+
+
+_TAKEN = {"kind", "path", "command", "in_process", "topics", "truth", "model_config"}
+
+
+class _Described(Parameters):
+    description: Description

@@ -1,0 +1,333 @@
+"""Makes estimators of foreign filters: bound to the topics of a log like any other.
+
+A filter in this process goes through its messages block by block. One in a process of its own is given
+a run's messages at once, when all are there: so a run that ends its process costs no other run anything.
+"""
+
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from recorders.log import Topic
+from replay.engine.arrays import Floats, Integers
+from replay.engine.replaying.estimator import Bound, Estimator, Recursive
+from replay.engine.streams.blocks import Block, Ragged, copied
+from replay.engine.streams.channels import given_or_stated, resolved
+from replay.engine.streams.failures import Failure
+from replay.engine.streams.priors import gaussians
+from replay.engine.streams.results import ALL_WELL
+from replay.foreign.description import Description, ForeignParameters, read_description
+from replay.foreign.messages import events_of, joined, of_run, static_of, static_of_run, streams_of
+from replay.foreign.naming import what_runs
+from replay.foreign.native.following import (
+    NOT_COPIED,
+    Filters,
+    Static,
+    filters_of,
+    follow_all,
+    followed,
+    offsets_of,
+    reason_of_code,
+)
+from replay.foreign.native.library import Library
+from replay.foreign.processes.isolation import Limits, Ran, describe_apart, follow_runs_apart
+from replay.foreign.processes.tasks import RunGiven, sizes_of
+from replay.foreign.results import begun, results
+from replay.inference.run.recursion import FilterEvents
+from replay.inference.run.timing import add_output_times
+
+Prior = tuple[Integers, Floats, Floats]
+# Takes runs through their filters in other processes; None of a run that takes no part.
+FollowRuns = Callable[[Sequence[RunGiven | None], Limits], list[Ran | None]]
+
+
+class LibraryParameters(ForeignParameters):
+    """A filter of a shared library.
+
+    Attributes:
+        path: the library, which has the functions of `fuselog_filter.h`.
+        in_process: call it in this process: faster, and what it breaks breaks the replay.
+    """
+
+    path: str = ""
+    in_process: bool = False
+
+
+@dataclass(frozen=True)
+class FoundFilter:
+    """Describes a filter that was found in a log.
+
+    Attributes:
+        name: what its output topics begin with, after `/estimates/`.
+        description: what the filter says of itself.
+        prefix: of its topics.
+        topics: those that the log has, by the description's names.
+        prior: the topic of the prior; "" where it starts by itself.
+        parameters: all of them.
+    """
+
+    name: str
+    description: Description
+    prefix: str
+    topics: Mapping[str, Topic]
+    prior: str
+    parameters: Any
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Return the filter's own parameters; raises BadInput where the log does not state one."""
+        asked = list(self.topics.values())
+        return tuple(
+            given_or_stated(self.parameters, asked, name) for name in self.description.parameters
+        )
+
+    @property
+    def truth(self) -> str:
+        """Name the topic of the truth."""
+        return resolved(self.description.truth, self.prefix)
+
+    def bound(self, start: Any, run: Any, finish: Any) -> Recursive:
+        """Return the estimator, from its functions."""
+        read = [each for each in self.description.topics if each.topic in self.topics]
+        static = [self.topics[each.topic].name for each in read if each.static]
+        return Recursive(
+            self.name,
+            tuple(self.topics[each.topic].name for each in read if not each.static),
+            tuple(filter(None, [self.prior, *static])),
+            start,
+            run,
+            {self.prior: self.description.state} if self.prior else {},
+            finish=finish,
+            parameters=self.parameters,
+        )
+
+    def started(self, given: Mapping[str, Ragged], runs: int) -> tuple[Static, Prior | None]:
+        """Return what filters are given before their messages."""
+        prior = gaussians(given[self.prior]) if self.prior else None
+        return static_of(self.description, self.topics, given, runs), prior
+
+    def events(
+        self, block: Block, start_ns: Integers, next_output: Integers
+    ) -> tuple[FilterEvents, Integers]:
+        """Turn a block into events, with those of `every_s`, and the numbers of the next of these."""
+        events = events_of(self.description, self.topics, block)
+        every_s = self.parameters.every_s
+        if every_s is None or not len(events.time_ns):
+            return events, next_output
+        return add_output_times(events, start_ns, next_output, round(every_s * 1e9))
+
+
+def bind_all(
+    label: str, description: Description, topics: Mapping[str, Topic], parameters: Any
+) -> list[FoundFilter]:
+    """Find everything in a log that a filter can estimate."""
+    found = []
+    for prefix, read in description.bindings(topics):
+        prior = resolved(description.prior, prefix)
+        prior = prior if prior in topics else ""
+        found.append(FoundFilter(label + prefix, description, prefix, read, prior, parameters))
+    return found
+
+
+# --- in this process --------------------------------------------------------------------------------
+
+
+class _Running(NamedTuple):
+    """Holds what filters in this process carry from block to block; `owner` ends them with itself."""
+
+    filters: Filters
+    static: Static
+    start_ns: Integers
+    next_output: Integers
+    owner: "_Owner"
+
+
+class _Owner:
+    """Owns filters: they end when nobody refers to it any more."""
+
+    def __init__(self, library: Library, handles: Integers) -> None:
+        weakref.finalize(self, library.destroy_all, handles.tolist())
+
+
+def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
+    """Bind a filter whose library is called in this process."""
+    description, numbers = found.description, found.numbers
+
+    def started(given: Mapping[str, Ragged], runs: int) -> _Running:
+        static, prior = found.started(given, runs)
+        seed = found.parameters.seed
+        filters = filters_of(library, numbers, seed, prior, runs, description)
+        start_ns, owner = filters.time_ns.copy(), _Owner(library, filters.handle)
+        return _Running(filters, static, start_ns, np.zeros(runs, np.int64), owner)
+
+    def start(given: dict[str, Ragged]) -> _Running | None:
+        return started(given, next(iter(given.values())).runs) if given else None
+
+    def run(state: _Running | None, block: Block) -> tuple[_Running, list[Ragged]]:
+        before = state or started({}, len(block.events.offsets) - 1)
+        filters = _copied(library, before.filters)
+        own_start = np.where(filters.has_prior == 1, before.start_ns, _first_ns(block))
+        start_ns = np.where(filters.begun == 1, before.start_ns, own_start)
+        events, next_output = found.events(block, start_ns, before.next_output)
+        due, recorded = offsets_of(description, events)
+        made = begun(results(due, recorded, sizes_of(description)), due, recorded)
+        was = filters.failure.copy()
+        follow_all(library, description, before.static, events, filters, made)
+        failed = np.flatnonzero((filters.failure >= 0) & (was != filters.failure)).tolist()
+        failures = {
+            each: Failure(
+                int(filters.time_ns[each]), reason_of_code(int(filters.failure[each]), description)
+            )
+            for each in failed
+        }
+        told = followed(made, due, recorded)
+        after = _Running(filters, before.static, start_ns, next_output, _Owner(library, filters.handle))
+        return after, streams_of(found.name, description, found.truth, told, failures)
+
+    return found.bound(start, run, None)
+
+
+def _first_ns(block: Block) -> Integers:
+    """Return the stamp of every run's first message (runs,); 0 where it has none."""
+    offsets, times_ns = block.events.offsets, np.append(block.events.time_ns, 0)
+    return np.where(np.diff(offsets) > 0, times_ns[offsets[:-1]], 0)
+
+
+def _copied(library: Library, filters: Filters) -> Filters:
+    """Copy filters: those of a block's beginning stay, since it may have to be processed again."""
+    copies = np.array([library.copy(handle) for handle in filters.handle.tolist()], np.int64)
+    found = copied(filters)._replace(handle=copies)
+    found.failure[(copies == 0) & (found.failure == ALL_WELL)] = NOT_COPIED
+    return found
+
+
+# --- in processes of their own ----------------------------------------------------------------------
+
+
+class _Waiting(NamedTuple):
+    """Holds what came until now."""
+
+    static: Static
+    prior: Prior | None
+    events: tuple[FilterEvents, ...]
+    start_ns: Integers
+    next_output: Integers
+
+
+def bind_apart(found: FoundFilter, follow_runs: FollowRuns) -> Recursive:
+    """Bind a filter that is given a run's messages at once, in a process of its own."""
+    description, numbers = found.description, found.numbers
+
+    def started(given: Mapping[str, Ragged], runs: int) -> _Waiting:
+        static, prior = found.started(given, runs)
+        start_ns = np.full(runs, -1) if prior is None else prior[0]
+        return _Waiting(static, prior, (), start_ns, np.zeros(runs, np.int64))
+
+    def start(given: dict[str, Ragged]) -> _Waiting | None:
+        return started(given, next(iter(given.values())).runs) if given else None
+
+    def run(state: _Waiting | None, block: Block) -> tuple[_Waiting, list[Ragged]]:
+        before = state or started({}, len(block.events.offsets) - 1)
+        start_ns = np.where(before.start_ns < 0, _first_ns(block), before.start_ns)
+        events, next_output = found.events(block, start_ns, before.next_output)
+        start_ns = np.where(np.diff(block.events.offsets) > 0, start_ns, before.start_ns)
+        events_of_all = (*before.events, events)
+        return before._replace(events=events_of_all, start_ns=start_ns, next_output=next_output), []
+
+    def given_of(state: _Waiting, run: int) -> RunGiven | None:
+        prior = None
+        if state.prior is not None:
+            time_ns, mean, covariance = (column[run] for column in state.prior)
+            if not np.isfinite(mean.sum()):
+                return None  # why is told
+            prior = int(time_ns), mean, covariance
+        static = static_of_run(state.static, run)
+        events = of_run(state.events, run)
+        given = RunGiven(static, events, prior, numbers, found.parameters.seed)
+        return given if len(events.time_ns) else None
+
+    def finish(state: _Waiting | None) -> list[Ragged]:
+        if state is None or not state.events:
+            return []
+        runs = len(state.events[0].offsets) - 1
+        ran = follow_runs([given_of(state, each) for each in range(runs)], Limits.of(found.parameters))
+        due = recorded = np.zeros(2, np.int64)
+        nothing = followed(results(due, recorded, sizes_of(description)), due, recorded)
+        told = joined([nothing if each is None else each.followed for each in ran])
+        failures = {
+            number: each.failure
+            for number, each in enumerate(ran)
+            if each is not None and each.failure is not None
+        }
+        return streams_of(found.name, description, found.truth, told, failures)
+
+    return found.bound(start, run, finish)
+
+
+# --- libraries --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _OfLibraries(Estimator[Any]):
+    """Makes an estimator of the library that settings name."""
+
+    def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
+        """Return the estimator of the library."""
+        path = Path(what_runs(label, "lib", settings))
+        in_process = settings.get("in_process", False) is True
+        description = _description(path, in_process)
+
+        def bind(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:
+            bound: list[Bound] = []
+            for found in bind_all(label, description, topics, parameters):
+                if in_process:
+                    bound.append(bind_in_process(found, _loaded(path)))
+                    continue
+
+                def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
+                    return follow_runs_apart(str(path), runs, description, limits)
+
+                bound.append(bind_apart(found, follow_runs))
+            return bound
+
+        parameters = description.parameters_over(LibraryParameters)
+        return Estimator(description.summary, description.requirements, parameters, bind)
+
+
+def _description(path: Path, in_process: bool) -> Description:
+    """Return what a library says of itself; it is asked again where the file has changed."""
+    try:
+        state = path.stat()
+    except OSError:
+        raise BadInput(f"{path}: no such file; give the path of a shared library") from None
+    return _described(path, state.st_mtime_ns, state.st_size, in_process)
+
+
+@lru_cache(maxsize=64)
+def _described(path: Path, changed_ns: int, size: int, in_process: bool) -> Description:  # noqa: ARG001
+    text = _loaded(path).description if in_process else describe_apart(str(path))
+    return read_description(text, str(path))
+
+
+@lru_cache(maxsize=64)
+def _loaded(path: Path) -> Library:
+    return Library(path)
+
+
+def unspecified(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:  # noqa: ARG001
+    """Refuse to bind what no settings specify."""
+    raise BadInput(f"estimator {label}: no program is named; give -e lib:PATH or -e exec:COMMAND")
+
+
+LIB = _OfLibraries(
+    "a filter of your own in C, C++ or Rust, behind fuselog_filter.h: -e lib:PATH",
+    "the topics that the filter's description names",
+    LibraryParameters,
+    unspecified,
+)

@@ -1,0 +1,177 @@
+"""Turns messages into the rows of numbers that a foreign filter takes, and what it says into streams."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from recorders.errors import BadInput, choices
+from recorders.log import Stream, Topic
+from replay.engine.arrays import Booleans, Floats, Integers
+from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.failures import Failure
+from replay.engine.streams.measurements import check_width
+from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream
+from replay.foreign.description import Description, TopicRead
+from replay.foreign.native.following import Followed, Static
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+
+
+def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
+    """Lay the fields of a topic side by side (n, width), NaN beyond; raises BadInput where one lacks."""
+    data, column = np.full((len(stream), width), np.nan), 0
+    for field, size in topic.sizes.items():
+        if field not in stream.columns:
+            raise BadInput(
+                f"topic {stream.topic}: has no field {field}, which the filter reads; "
+                f"{choices(field, stream.columns)}"
+            )
+        values = stream[field]
+        if not len(stream):
+            continue
+        if values.ndim == 1 and size:
+            raise BadInput(
+                f"topic {stream.topic}: {field} is one number, no vector of {size}; name it {field}"
+            )
+        check_width(stream, field, size or 1) if values.ndim == 2 else None
+        data[:, column : column + (size or 1)] = values.reshape(len(stream), -1)
+        column += size or 1
+    return data
+
+
+def static_of(
+    description: Description, found: Mapping[str, Topic], given: Mapping[str, Ragged], runs: int
+) -> Static:
+    """Return the messages of the static topics of all runs, topic by topic."""
+    parts = [
+        (number, topic, given[found[topic.topic].name])
+        for number, topic in enumerate(description.topics)
+        if topic.static and topic.topic in found
+    ]
+    nothing = Static(
+        np.zeros(runs + 1, np.int64),
+        np.empty(0, np.int64),
+        np.empty(0, np.int64),
+        np.empty((0, description.width)),
+    )
+    if not parts:
+        return nothing
+    run = np.concatenate([np.repeat(np.arange(runs), np.diff(each.offsets)) for _, _, each in parts])
+    order = np.argsort(run, kind="stable")
+    return Static(
+        sum((each.offsets for _, _, each in parts), np.zeros(1, np.int64)),
+        np.concatenate([each.stream.publish_time_ns for _, _, each in parts])[order],
+        np.concatenate([np.full(len(each), number) for number, _, each in parts])[order],
+        np.concatenate([numbers_of(topic, each.stream, description.width) for _, topic, each in parts])[
+            order
+        ],
+    )
+
+
+def static_of_run(static: Static, run: int) -> Static:
+    """Return the static messages of one run."""
+    begin, end = static.offsets[run : run + 2].tolist()
+    return Static(
+        np.array([0, end - begin]),
+        static.time_ns[begin:end],
+        static.source[begin:end],
+        static.data[begin:end],
+    )
+
+
+def events_of(description: Description, found: Mapping[str, Topic], block: Block) -> FilterEvents:
+    """Turn a block's messages into events, whose sources count in the description's topics."""
+    numbers = {
+        found[each.topic].name: number
+        for number, each in enumerate(description.topics)
+        if each.topic in found
+    }
+    tables, targets, sources = [], [], []
+    for name, ragged in block.streams.items():
+        topic = description.topics[numbers[name]]
+        tables.append(numbers_of(topic, ragged.stream, description.width))
+        target = ragged[topic.target] if topic.target else np.zeros(len(ragged))
+        targets.append(target.astype(np.int64))
+        sources.append(numbers[name])
+    merged = block.events
+    source = np.array(sources)[merged.topic]
+    wanted = _wanted(merged.is_last, np.array([each.estimates for each in description.topics])[source])
+    return FilterEvents(
+        merged.offsets,
+        merged.time_ns,
+        source,
+        np.ascontiguousarray(np.concatenate(tables)[merged.source]),
+        wanted,
+        np.concatenate(targets)[merged.source],
+        np.empty((len(source), 0), np.int64),
+    )
+
+
+def _wanted(is_last: Booleans, estimates: Booleans) -> Booleans:
+    """Tell which of the last events (n,) of their stamps want an estimate: not where none there does."""
+    if estimates.all() or not len(is_last):
+        return is_last.copy()
+    stamp: Integers = np.cumsum(is_last) - is_last
+    asked = np.zeros(int(stamp[-1]) + 1, bool)
+    asked[stamp[estimates]] = True
+    return is_last & asked[stamp]
+
+
+def streams_of(
+    name: str,
+    description: Description,
+    truth: str,
+    followed: Followed,
+    failures: Mapping[int, Failure],
+) -> list[Ragged]:
+    """Make the output topics of what filters said."""
+    topic, (estimates, offsets, innovations, recorded) = f"/estimates/{name}", followed
+    state = state_stream(
+        f"{topic}/{description.output}",
+        estimates.time_ns,
+        description.state,
+        truth,
+        estimates.mean,
+        estimates.covariance,
+    )
+    made = [Ragged(state, offsets), failures_by_run(topic, failures, len(offsets) - 1)]
+    if description.innovation:
+        stream = innovation_stream(
+            f"{topic}/innovation",
+            innovations.time_ns,
+            description.innovation,
+            truth,
+            target_id=innovations.target_id,
+            accepted=innovations.numbers[:, 2].astype(np.uint32),
+            innovation=innovations.difference,
+            covariance=innovations.covariance,
+            squared=innovations.numbers[:, 0],
+            log_likelihood=innovations.numbers[:, 1],
+        )
+        made.append(Ragged(stream, recorded))
+    return made
+
+
+def of_run(parts: Sequence[FilterEvents], run: int) -> FilterEvents:
+    """Join one run's events of several blocks."""
+    spans = [slice(int(each.offsets[run]), int(each.offsets[run + 1])) for each in parts]
+    columns = [
+        np.concatenate([each[place][span] for each, span in zip(parts, spans, strict=True)])
+        for place in range(1, len(FilterEvents._fields))
+    ]
+    return FilterEvents(np.array([0, len(columns[0])]), *columns)
+
+
+def joined(of_runs: Sequence[Followed]) -> Followed:
+    """Lay what the filters of single runs said end to end."""
+    estimates = zip(*(run.estimates for run in of_runs), strict=True)
+    innovations = zip(*(run.innovations for run in of_runs), strict=True)
+    return Followed(
+        Estimates(*map(np.concatenate, estimates)),
+        _offsets([len(run.estimates.time_ns) for run in of_runs]),
+        Innovations(*map(np.concatenate, innovations)),
+        _offsets([len(run.innovations.time_ns) for run in of_runs]),
+    )
+
+
+def _offsets(counts: Sequence[int]) -> Integers:
+    return np.cumsum([0, *counts])

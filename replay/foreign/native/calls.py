@@ -1,0 +1,73 @@
+"""Has kernels call C functions by address: no Python is between a message and the filter."""
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from replay.engine.compiling.kernels.numbers import REAL, WHOLE, Emitter, Number
+from replay.engine.compiling.kernels.program import Program
+from replay.engine.compiling.kernels.values import Array
+
+_LLVM = {"i32": "i32", "i64": "i64", "pointer": "ptr"}
+_C: dict[str, Any] = {"i32": ctypes.c_int32, "i64": ctypes.c_int64, "pointer": ctypes.c_void_p}
+
+
+class Call:
+    """Calls a C function at an address: `call(address, *arguments)`, in a kernel as in Python.
+
+    A pointer is an array, or an address; the function returns an int32_t.
+    """
+
+    def __init__(self, name: str, *kinds: str) -> None:
+        self.__name__ = name
+        self._kinds = kinds
+        self._prototype = ctypes.CFUNCTYPE(ctypes.c_int32, *(_C[kind] for kind in kinds))
+
+    def __call__(self, address: int, *arguments: Any) -> int:
+        """Call it from Python."""
+        given = (
+            each.ctypes.data
+            if isinstance(each, np.ndarray)
+            else int(each) or (None if kind == "pointer" else 0)
+            for each, kind in zip(arguments, self._kinds, strict=True)
+        )
+        return int(self._prototype(int(address))(*given))
+
+    def kernel_identity(self) -> str:
+        """Return what is part of a kernel's key."""
+        return f"call of {self.__name__}: {' '.join(self._kinds)}"
+
+    def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Number:  # noqa: ARG002
+        """Write a call; see `replay.engine.compiling.kernels.expressions`."""
+        address, *others = arguments
+        given = ", ".join(
+            f"{_LLVM[kind]} {_passed(emitter, each, kind)}"
+            for each, kind in zip(others, self._kinds, strict=True)
+        )
+        function = _passed(emitter, address, "pointer")
+        status = emitter.number(WHOLE, f"call i32 {function}({given})")
+        return emitter.number(WHOLE, f"sext i32 {status.code} to i64")
+
+
+def _passed(emitter: Emitter, value: Any, kind: str) -> str:
+    """Return an argument as C takes it."""
+    if isinstance(value, Array):
+        if kind != "pointer" or value.dtype != "<f8":
+            raise TypeError("C is given arrays of real numbers where it wants a pointer")
+        return value.pointer
+    if isinstance(value, Number) and value.kind == REAL:
+        raise TypeError("C is given whole numbers and arrays here")
+    number = emitter.as_kind(value, WHOLE)
+    if kind == "i64":
+        return number.code
+    text = f"trunc i64 {number.code} to i32" if kind == "i32" else f"inttoptr i64 {number.code} to ptr"
+    return emitter.number(WHOLE, text).code
+
+
+START = Call("start", "pointer", "i64", "pointer", "pointer")
+TAKE = Call("take", "pointer", "i32", "i64", "pointer")
+PREDICT = Call("predict", "pointer", "i64")
+STATE = Call("state", "pointer", "pointer", "pointer")
+INNOVATION = Call("innovation", "pointer", "pointer", "pointer")

@@ -1,0 +1,277 @@
+"""Hands messages to the filters of a library: one loop, which calls its functions by address."""
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function, Integers, varying
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.results import ALL_WELL
+from replay.foreign.description import Description
+from replay.foreign.native.calls import INNOVATION, PREDICT, START, STATE, TAKE
+from replay.foreign.native.library import NOTHING, REJECTED, WELL, Addresses, Library
+from replay.foreign.results import Results
+from replay.inference.linear_algebra.gaussian import (
+    LOG_TWO_PI,
+    Innovation,
+    drop_missing,
+    no_innovation,
+    whiten,
+)
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, fault_of, filled
+
+# What fails whatever the filter is; a status s of the filter's own counts on from there.
+NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, OWN = 5, 6, 7, 7
+FAILURES = {
+    0: "a variance of the filter's covariance is negative",
+    1: "the filter's estimate or covariance is not finite",
+    NOT_CREATED: "fuselog_filter_create returned NULL",
+    NOT_COPIED: "fuselog_filter_copy returned NULL",
+    INNOVATION_UNSOUND: "the covariance of the filter's innovation is not positive definite",
+}
+
+
+class Filters(NamedTuple):
+    """Holds the filters of all runs; first axis = run.
+
+    Attributes:
+        handle: (runs,) addresses; 0 for none.
+        time_ns: (runs,) of the prior, then of the last message.
+        begun: (runs,) 0 before the start.
+        failure: (runs,) ALL_WELL, or what failed; see `reason_of_code`.
+        mean, covariance: (runs, n), (runs, t, t) the priors.
+        has_prior: (runs,) 0 where the filter starts by itself.
+    """
+
+    handle: Integers
+    time_ns: Integers
+    begun: Integers
+    failure: Integers
+    mean: Floats
+    covariance: Floats
+    has_prior: Integers
+
+
+@varying(1)
+class Static(NamedTuple):
+    """Holds messages that are taken before the start: run r owns offsets[r]:offsets[r + 1]."""
+
+    offsets: Integers
+    time_ns: Integers
+    source: Integers
+    data: Floats
+
+
+def follow(
+    run: int,
+    addresses: Addresses,
+    static: Static,
+    events: FilterEvents,
+    carried: Filters,
+    estimates: Estimates,
+    innovations: Innovations,
+    progress: Integers,
+    work: tuple[Innovation, Innovation],
+) -> None:
+    """Hand one run's messages to its filter, and note what it says, until the run fails.
+
+    `progress` (runs,) is the message at work; another process sees it.
+    """
+    for event in range(events.offsets[run], events.offsets[run + 1]):
+        if carried.failure[run] != ALL_WELL:
+            break
+        progress[run] = event
+        time_ns = events.time_ns[event]
+        status = WELL
+        if carried.begun[run] == 0:
+            carried.begun[run] = 1
+            status = begin(run, addresses, static, time_ns, carried)
+        if status == WELL and time_ns >= carried.time_ns[run]:
+            carried.time_ns[run] = time_ns
+            status = take(run, event, addresses, events, carried, innovations, work)
+            if status == WELL and events.wants_estimate[event]:
+                status = tell(run, event, addresses, events, carried, estimates)
+        if status != WELL:
+            carried.failure[run] = OWN + status if status > 0 else -status - 10
+            carried.time_ns[run] = time_ns
+
+
+def begin(run: int, addresses: Addresses, static: Static, time_ns: int, carried: Filters) -> int:
+    """Have the filter take what is static, and start; returns WELL or what failed."""
+    handle = carried.handle[run]
+    for row in range(static.offsets[run], static.offsets[run + 1]):
+        status = TAKE(addresses.take, handle, static.source[row], static.time_ns[row], static.data[row])
+        if status > 0:
+            return status
+    if carried.has_prior[run] == 0:
+        carried.time_ns[run] = time_ns
+        status = START(addresses.start, handle, time_ns, 0, 0)
+    else:
+        start_ns = carried.time_ns[run]
+        status = START(addresses.start, handle, start_ns, carried.mean[run], carried.covariance[run])
+    return max(status, WELL)
+
+
+def take(
+    run: int,
+    event: int,
+    addresses: Addresses,
+    events: FilterEvents,
+    carried: Filters,
+    innovations: Innovations,
+    work: tuple[Innovation, Innovation],
+) -> int:
+    """Have the filter take a message, and note its innovation; returns WELL or what failed."""
+    handle, time_ns = carried.handle[run], events.time_ns[event]
+    if events.source[event] < 0:
+        return max(PREDICT(addresses.predict, handle, time_ns), WELL)
+    status = TAKE(addresses.take, handle, events.source[event], time_ns, events.data[event])
+    if status > 0 or addresses.innovation == 0:
+        return max(status, WELL)
+    given, kept = work
+    for i in range(len(given.difference)):
+        given.difference[i] = np.nan
+    status = INNOVATION(addresses.innovation, handle, given.difference, given.covariance)
+    if status > 0 or status == NOTHING:
+        return max(status, WELL)
+    row = innovations.end[run]
+    for i in range(len(given.difference)):
+        kept.difference[i] = given.difference[i]
+        innovations.difference[row, i] = given.difference[i]
+        for j in range(len(given.difference)):
+            kept.covariance[i, j] = given.covariance[i, j]
+            missing = np.isnan(given.difference[i] + given.difference[j])
+            innovations.covariance[row, i, j] = np.nan if missing else given.covariance[i, j]
+    size = drop_missing(kept)
+    squared, determinant = whiten(kept, size)
+    if np.isnan(squared):
+        return -10 - INNOVATION_UNSOUND
+    accepted = size > 0 and status != REJECTED
+    innovations.numbers[row, 0] = squared
+    innovations.numbers[row, 1] = 0.0
+    innovations.numbers[row, 2] = 1.0 if accepted else 0.0
+    if accepted:
+        innovations.numbers[row, 1] = -0.5 * (squared + determinant + size * LOG_TWO_PI)
+    innovations.time_ns[row] = time_ns
+    innovations.target_id[row] = events.target_id[event]
+    innovations.end[run] = row + 1
+    return WELL
+
+
+def tell(
+    run: int,
+    event: int,
+    addresses: Addresses,
+    events: FilterEvents,
+    carried: Filters,
+    estimates: Estimates,
+) -> int:
+    """Note the filter's estimate; returns WELL or what failed."""
+    row = estimates.end[run]
+    status = STATE(addresses.state, carried.handle[run], estimates.mean[row], estimates.covariance[row])
+    if status > 0 or status == NOTHING:
+        return max(status, WELL)
+    fault = fault_of(estimates.mean[row], estimates.covariance[row])
+    if fault != ALL_WELL:
+        return -10 - fault
+    estimates.time_ns[row] = events.time_ns[event]
+    estimates.end[run] = row + 1
+    return WELL
+
+
+@lru_cache(maxsize=1)
+def _loop() -> Function:
+    return compile_over_runs(follow, allocates=False, title="filters of a library")
+
+
+def reason_of_code(code: int, description: Description) -> str:
+    """Return the sentence of a failure."""
+    if code in FAILURES:
+        return FAILURES[code]
+    number = code - OWN
+    told = description.failures
+    return told[number - 1] if number <= len(told) else f"the filter returned {number}"
+
+
+class Followed(NamedTuple):
+    """Holds what filters said: estimates and innovations, and the offsets of their runs."""
+
+    estimates: Estimates
+    estimate_offsets: Integers
+    innovations: Innovations
+    innovation_offsets: Integers
+
+
+def offsets_of(description: Description, events: FilterEvents) -> tuple[Integers, Integers]:
+    """Return where the estimates, and the innovations, of every run begin: (runs + 1,) each."""
+    due, recorded = (
+        np.concatenate([[0], np.cumsum(chosen)])[events.offsets]
+        for chosen in (events.wants_estimate, events.source >= 0)
+    )
+    return due, recorded if description.innovation else np.zeros_like(recorded)
+
+
+def follow_all(
+    library: Library,
+    description: Description,
+    static: Static,
+    events: FilterEvents,
+    carried: Filters,
+    made: Results,
+) -> None:
+    """Hand the messages of all runs to their filters, which are changed, and fill results."""
+    m = len(description.innovation)
+    _loop()(
+        len(carried.handle),
+        library.addresses if m else library.addresses._replace(innovation=0),
+        static,
+        events,
+        carried,
+        made.estimates,
+        made.innovations,
+        made.progress,
+        scratch=partial(_work, m),
+    )
+
+
+def followed(made: Results, due: Integers, recorded: Integers) -> Followed:
+    """Cut results down to what was filled in."""
+    return Followed(*filled(made.estimates, due), *filled(made.innovations, recorded))
+
+
+def _work(components: int) -> tuple[Innovation, Innovation]:
+    given, kept = (no_innovation(1, max(components, 1)) for _ in range(2))
+    for each in given:
+        each[:] = np.nan
+    return given, kept
+
+
+def filters_of(
+    library: Library,
+    parameters: Sequence[float],
+    seed: int,
+    prior: tuple[Integers, Floats, Floats] | None,
+    runs: int,
+    description: Description,
+) -> Filters:
+    """Make the filters of all runs; a run whose prior is NaN takes no part."""
+    n, t = len(description.state), description.tangent
+    time_ns, mean, covariance = prior or (
+        np.zeros(runs, np.int64),
+        np.zeros((runs, n)),
+        np.zeros((runs, t, t)),
+    )
+    handles = np.array([library.create(parameters, seed) for _ in range(runs)], np.int64)
+    failure = np.where(handles == 0, NOT_CREATED, ALL_WELL)
+    failure[~np.isfinite(mean.sum(axis=1))] = ALL_WELL - 1  # its prior's own reason is told
+    return Filters(
+        handles,
+        time_ns.copy(),
+        np.zeros(runs, np.int64),
+        failure,
+        np.ascontiguousarray(mean),
+        np.ascontiguousarray(covariance),
+        np.full(runs, int(prior is not None)),
+    )

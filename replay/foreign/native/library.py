@@ -1,0 +1,102 @@
+"""Loads shared libraries of `fuselog_filter.h`.
+
+It imports next to nothing, so that a process that only asks a library what it is begins at once.
+"""
+
+import ctypes
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from recorders.errors import BadInput
+
+VERSION = 1
+HEADER = Path(__file__).with_name("fuselog_filter.h")
+WELL, NOTHING, REJECTED = 0, -1, -2  # see the header
+
+
+class Addresses(NamedTuple):
+    """Holds where the functions are that a kernel calls; `innovation` is 0 where there is none."""
+
+    start: int
+    take: int
+    predict: int
+    state: int
+    innovation: int
+
+
+class Library:
+    """Represents a loaded library.
+
+    Attributes:
+        path: the file.
+        description: its JSON.
+        addresses: of what a kernel calls.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Load a library; raises BadInput where the file is none, or of another version."""
+        self.path = path
+        if not path.is_file():
+            raise BadInput(f"{path}: no such file; give the path of a shared library")
+        try:
+            self._library = ctypes.CDLL(str(path.resolve()))
+        except OSError as error:
+            why = str(error).removeprefix(f"{path.resolve()}: ")
+            raise BadInput(
+                f"{path}: cannot be loaded ({why}); compile it as a shared library for this machine, "
+                f"{platform.system()} on {platform.machine()}"
+            ) from None
+        version = self._function("version", ctypes.c_int32)()
+        if version != VERSION:
+            raise BadInput(
+                f"{path}: was compiled with version {version} of fuselog_filter.h; this fuselog has "
+                f"version {VERSION}, so compile it again with {HEADER.name} of this one"
+            )
+        names = (*Addresses._fields[:-1], "describe", "create", "copy", "destroy")
+        functions = {name: self._function(name, None) for name in names}
+        optional = getattr(self._library, "fuselog_filter_innovation", None)
+        required = {name: _address(functions[name]) for name in Addresses._fields[:-1]}
+        self.addresses = Addresses(**required, innovation=_address(optional) if optional else 0)
+        text = self._function("describe", ctypes.c_char_p)()
+        if not text:
+            raise BadInput(f"{path}: fuselog_filter_describe returns no text; it has to return JSON")
+        self.description: bytes = text
+        self._create = self._function("create", ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64)
+        self._copy = self._function("copy", ctypes.c_void_p, ctypes.c_void_p)
+        self._destroy = self._function("destroy", None, ctypes.c_void_p)
+
+    def _function(self, name: str, returns: Any, *takes: Any) -> Any:
+        try:
+            function = self._library[f"fuselog_filter_{name}"]
+        except AttributeError:
+            raise BadInput(
+                f"{self.path}: lacks the function fuselog_filter_{name}; it has to export all of "
+                f"{HEADER.name} but fuselog_filter_innovation"
+            ) from None
+        function.restype, function.argtypes = returns, takes
+        return function
+
+    def create(self, parameters: Iterable[float], seed: int) -> int:
+        """Make a filter; 0 where that fails."""
+        values = (*parameters, 0.0)  # never empty, so that they have an address
+        return self._create((ctypes.c_double * len(values))(*values), seed) or 0
+
+    def copy(self, handle: int) -> int:
+        """Copy a filter; 0 where that fails, or there is none."""
+        return (self._copy(handle) or 0) if handle else 0
+
+    def destroy(self, handle: int) -> None:
+        """End a filter, if it is one."""
+        if handle:
+            self._destroy(handle)
+
+    def destroy_all(self, handles: Iterable[int]) -> None:
+        """End filters."""
+        for handle in handles:
+            self.destroy(handle)
+
+
+def _address(function: Any) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0

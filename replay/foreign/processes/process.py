@@ -1,0 +1,73 @@
+"""Starts programs of others, and keeps the last that they say on standard error."""
+
+import subprocess
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+
+import psutil
+
+from recorders.errors import BadInput, printable
+from replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
+
+TOLD_BYTES = 300  # of what a program says on standard error
+
+
+class Program:
+    """Represents a program that was started, with its standard streams."""
+
+    def __init__(self, words: Sequence[str]) -> None:
+        """Start a program; raises BadInput where it cannot be started."""
+        try:
+            self.process = subprocess.Popen(
+                words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            )
+        except OSError as error:
+            raise BadInput(
+                f"exec:{words[0]}: cannot be started ({error.strerror}); give a program that there is"
+            ) from None
+        self.tail = b""
+        self._told = threading.Thread(target=self._keep_tail, daemon=True)
+        self._told.start()
+
+    def _keep_tail(self) -> None:
+        assert self.process.stderr is not None
+        with suppress(OSError, ValueError):
+            while said := self.process.stderr.read1(4096):  # type: ignore[attr-defined]
+                self.tail = (self.tail + said)[-TOLD_BYTES:]
+
+    def how_ended(self) -> str:
+        """Say how it ended, and its last words."""
+        code = self.process.wait()
+        self._told.join(1.0)
+        lines = self.tail.decode(errors="replace").strip().splitlines()
+        return how_ended(code) + (f": {printable(lines[-1])}" if lines and code else "")
+
+    def end(self) -> None:
+        """End it and all that it started."""
+        end(self.process)
+
+    def wait(self, limits: Limits) -> None:
+        """Wait until it has ended well; raises Ended where it does not. What it prints goes nowhere."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        threading.Thread(target=self._drop, daemon=True).start()
+        watch = Watch(psutil.Process(self.process.pid), limits)
+        while True:
+            try:
+                code = self.process.wait(LOOKS_S)
+                break
+            except subprocess.TimeoutExpired:
+                try:
+                    watch.look(0)
+                except Ended as ended:
+                    self.end()
+                    raise Ended(f"the program {ended}") from None
+        if code:
+            raise Ended(f"the program {self.how_ended()}")
+
+    def _drop(self) -> None:
+        assert self.process.stdout is not None
+        with suppress(OSError, ValueError):
+            while self.process.stdout.read1(65536):  # type: ignore[attr-defined]
+                pass

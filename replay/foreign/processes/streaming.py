@@ -1,0 +1,259 @@
+"""Runs a filter as a program that takes messages on standard input and answers on standard output.
+
+Every frame is its length, 4 bytes, and so many bytes: a letter for what it is, and numbers, all of them
+little-endian. The program begins with its description, and answers every frame but the first, in order:
+
+    D  program: the description, JSON
+    C  create: seed u64, parameters f64 each
+    S  start: time i64, 1 or 0 whether there is a prior, and its mean and covariance f64 each
+    T  take: topic i32, time i64, 1 or 0 whether an estimate is wanted, fields f64 each
+    P  predict: time i64; an estimate is wanted
+    R  program: status i32, flags u8; mean and covariance with flag 1; innovation and its covariance with
+       flag 2, and 4 where a gate kept it out
+
+A status from 1 on counts in the description's failures. The end of standard input is the end.
+"""
+
+import os
+import queue
+import struct
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+import psutil
+
+from recorders.errors import BadInput, printable
+from replay.engine.compiling.compile import core_count
+from replay.engine.streams.failures import Failure
+from replay.foreign.description import Description, read_description
+from replay.foreign.native.following import INNOVATION_UNSOUND, OWN, followed, offsets_of, reason_of_code
+from replay.foreign.processes.isolation import (
+    LOOKS_S,
+    STARTS_S,
+    Ended,
+    Limits,
+    Ran,
+    Watch,
+    failure_at,
+    in_threads,
+)
+from replay.foreign.processes.process import Program
+from replay.foreign.processes.tasks import RunGiven, sizes_of
+from replay.foreign.results import Results, begun, fill_squares, results
+
+MOST_BYTES = 16 << 20  # of a frame
+_REPLY, _HEAD = struct.Struct("<iB"), struct.Struct("<I")
+ESTIMATE, INNOVATION, REJECTED = 1, 2, 4  # flags
+
+
+class _Frame(NamedTuple):
+    """Holds a frame of the program's, or why there are no more."""
+
+    body: bytes
+    fault: str = ""
+
+
+class Stream(Program):
+    """Represents a program that answers frames."""
+
+    def __init__(self, words: Sequence[str], limits: Limits) -> None:
+        super().__init__(words)
+        self._frames: queue.SimpleQueue[_Frame] = queue.SimpleQueue()
+        self._watch = Watch(psutil.Process(self.process.pid), limits)
+        self._count = 0
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        """Cut what it writes into frames, as it comes."""
+        assert self.process.stdout is not None
+        buffer = bytearray()
+        with suppress(OSError, ValueError):
+            while came := os.read(self.process.stdout.fileno(), 1 << 16):
+                buffer += came
+                while len(buffer) >= 4:
+                    size = _HEAD.unpack_from(buffer)[0]
+                    if not 0 < size <= MOST_BYTES:
+                        said = printable(bytes(buffer[:60]).splitlines()[0].decode(errors="replace"))
+                        fault = f"wrote '{said}' to standard output, which is no frame,"
+                        self._frames.put(_Frame(b"", fault))
+                        return
+                    if len(buffer) < 4 + size:
+                        break
+                    self._frames.put(_Frame(bytes(buffer[4 : 4 + size])))
+                    del buffer[: 4 + size]
+        self._frames.put(_Frame(b"", "ended within a frame" if buffer else ""))
+
+    def write(self, frames: Iterator[bytes]) -> None:
+        """Write frames, while answers are read."""
+
+        def work() -> None:
+            assert self.process.stdin is not None
+            with suppress(OSError, ValueError):
+                for frame in frames:
+                    self.process.stdin.write(_HEAD.pack(len(frame)) + frame)
+                self.process.stdin.close()
+
+        threading.Thread(target=work, daemon=True).start()
+
+    def next(self, letter: bytes, allowed_s: float | None = None) -> bytes:
+        """Return what the next frame has behind its letter; raises Ended where there is none."""
+        while True:
+            try:
+                frame = self._frames.get(timeout=LOOKS_S)
+            except queue.Empty:
+                self._watch.look(self._count, allowed_s)
+                continue
+            self._count += 1
+            if frame.fault:
+                raise Ended(frame.fault)
+            if not frame.body:
+                raise Ended(self.how_ended())
+            if frame.body[:1] != letter:
+                raise Ended(f"sent a frame {frame.body[:1]!r} where {letter!r} was due")
+            return frame.body[1:]
+
+
+def describe_stream(words: Sequence[str], where: str, limits: Limits) -> Description:
+    """Ask a program for its description; raises BadInput where it gives none."""
+    stream = Stream(words, limits._replace(time_s=STARTS_S))
+    try:
+        return read_description(stream.next(b"D"), where)
+    except Ended as ended:
+        raise BadInput(f"{where}: the program {ended}, before it gave its description") from None
+    finally:
+        stream.end()
+
+
+def frames_of(given: RunGiven, description: Description) -> Iterator[bytes]:
+    """Write what a filter is given of a run as frames."""
+    static, events = given.static, given.events
+    widths = [each.width for each in description.topics]
+    yield struct.pack("<cQ", b"C", given.seed) + np.array(given.parameters, "<f8").tobytes()
+    taken = struct.Struct("<ciqB")
+    for source, time_ns, row in zip(static.source, static.time_ns, static.data, strict=True):
+        yield taken.pack(b"T", source, time_ns, 0) + row[: widths[source]].astype("<f8").tobytes()
+    if given.prior is None:
+        yield struct.pack("<cqB", b"S", int(events.time_ns[0]), 0)
+    else:
+        time_ns, mean, covariance = given.prior
+        numbers = np.concatenate([mean.ravel(), covariance.ravel()]).astype("<f8").tobytes()
+        yield struct.pack("<cqB", b"S", time_ns, 1) + numbers
+    columns = zip(
+        events.source.tolist(), events.time_ns.tolist(), events.wants_estimate.tolist(), strict=True
+    )
+    for (source, time_ns, wants), row in zip(columns, events.data.astype("<f8"), strict=True):
+        if source < 0:
+            yield struct.pack("<cq", b"P", time_ns)
+        else:
+            yield taken.pack(b"T", source, time_ns, wants) + row[: widths[source]].tobytes()
+
+
+def follow_stream(
+    words: Sequence[str],
+    given: RunGiven,
+    description: Description,
+    limits: Limits,
+    started: list[Program],
+) -> Ran:
+    """Take one run through a program, which joins `started`; what it said before it fails stays."""
+    if given.prior is not None:  # what is older says nothing
+        given = given.from_time(given.prior[0])
+    due, recorded = offsets_of(description, given.events)
+    made = begun(results(due, recorded, sizes_of(description)), due, recorded)
+    made.progress[0] = -1
+    failure: Failure | None = None
+    stream = Stream(words, limits)
+    started.append(stream)
+    try:
+        stream.next(b"D", STARTS_S)
+        stream.write(frames_of(given, description))
+        for _ in range(len(given.static.source) + 1):
+            status, _, _ = _reply(stream.next(b"R"), description)
+            _check(status, description)
+        for event in range(len(given.events.time_ns)):
+            made.progress[0] = event
+            status, mean, innovation = _reply(stream.next(b"R"), description)
+            _check(status, description)
+            _note(made, event, given, mean, innovation)
+    except _Failed as failed:
+        at = max(int(made.progress[0]), 0)
+        failure = Failure(int(given.events.time_ns[at]), str(failed))
+    except Ended as ended:
+        failure = failure_at(int(made.progress[0]), given, description, str(ended))
+    finally:
+        stream.end()
+    unsound = fill_squares(made.innovations)
+    if unsound >= 0:
+        time_ns = int(made.innovations.time_ns[unsound])
+        failure = Failure(time_ns, reason_of_code(INNOVATION_UNSOUND, description))
+    return Ran(followed(made, due, recorded), failure)
+
+
+class _Failed(Exception):
+    """A filter's own failure."""
+
+
+def _check(status: int, description: Description) -> None:
+    if status > 0:
+        raise _Failed(reason_of_code(OWN + status, description))
+
+
+def _reply(
+    body: bytes, description: Description
+) -> tuple[int, np.ndarray | None, tuple[np.ndarray, bool] | None]:
+    """Read a reply: status, mean and covariance, innovation with covariance and whether it was used."""
+    n, t, m = sizes_of(description)
+    status, flags = _REPLY.unpack_from(body) if len(body) >= _REPLY.size else (0, 0xFF)
+    estimate, innovation = (n + t * t) * bool(flags & ESTIMATE), (m + m * m) * bool(flags & INNOVATION)
+    wanted = _REPLY.size + 8 * (estimate + innovation)
+    if len(body) != wanted:
+        sizes = f"{1 + len(body)} bytes with flags {flags}, where {1 + wanted} were due,"
+        raise Ended(f"sent a reply of {sizes}")
+    numbers = np.frombuffer(body, "<f8", offset=_REPLY.size)
+    state = numbers[:estimate] if estimate else None
+    return status, state, (numbers[estimate:], not flags & REJECTED) if innovation else None
+
+
+def _note(
+    made: Results,
+    event: int,
+    given: RunGiven,
+    state: np.ndarray | None,
+    innovation: tuple[np.ndarray, bool] | None,
+) -> None:
+    """Note what a filter said of a message."""
+    events, time_ns = given.events, given.events.time_ns[event]
+    if state is not None and events.wants_estimate[event]:
+        row, estimates = made.estimates.end[0], made.estimates
+        estimates.mean[row] = state[: estimates.mean.shape[1]]
+        estimates.covariance[row].ravel()[:] = state[estimates.mean.shape[1] :]
+        estimates.time_ns[row] = time_ns
+        estimates.end[0] = row + 1
+    if innovation is not None and events.source[event] >= 0:
+        row, innovations = made.innovations.end[0], made.innovations
+        numbers, is_used = innovation
+        m = innovations.difference.shape[1]
+        innovations.difference[row] = numbers[:m]
+        innovations.covariance[row].ravel()[:] = numbers[m:]
+        innovations.numbers[row, 2] = is_used
+        innovations.time_ns[row], innovations.target_id[row] = time_ns, events.target_id[event]
+        innovations.end[0] = row + 1
+
+
+def follow_runs_streaming(
+    words: Sequence[str], runs: Sequence[RunGiven | None], description: Description, limits: Limits
+) -> list[Ran | None]:
+    """Take runs through programs, as many at once as there are cores; None stays None."""
+    started: list[Program] = []
+
+    def one(given: RunGiven | None) -> Ran | None:
+        return None if given is None else follow_stream(words, given, description, limits, started)
+
+    def stop() -> None:
+        for each in started:
+            each.end()
+
+    return in_threads(one, runs, max(1, min(core_count(), len(runs))), stop)

@@ -1,0 +1,259 @@
+"""Makes estimators of programs: those that stream, and those that read a log and write estimates."""
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, create_model
+
+from recorders.atomic import scratch_folder
+from recorders.errors import BadInput, choices
+from recorders.log import RunMetadata, Stream, Topic, schemas, write_log
+from replay.engine.compiling.compile import core_count
+from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.failures import Failure
+from replay.engine.streams.results import failures_by_run
+from replay.foreign.description import Description, ForeignParameters
+from replay.foreign.files.estimates import read_estimates
+from replay.foreign.files.tables import write_tables
+from replay.foreign.filters import bind_all, bind_apart, unspecified
+from replay.foreign.naming import split_command, what_runs
+from replay.foreign.processes.isolation import Ended, Limits, Ran, in_threads
+from replay.foreign.processes.process import Program
+from replay.foreign.processes.streaming import describe_stream, follow_runs_streaming
+from replay.foreign.processes.tasks import RunGiven
+
+_PLACE = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
+LOG, TABLES, OUT = "log", "csv", "out"
+TRUTH, ESTIMATE = schemas.TRUTH_STATE.full_name, "/estimates/"
+
+
+class StreamParameters(ForeignParameters):
+    """A program that answers messages.
+
+    Attributes:
+        command: what is started, with its arguments.
+    """
+
+    command: str = ""
+
+
+class ProgramParameters(StreamParameters):
+    """A program that reads a log and writes estimates.
+
+    Attributes:
+        time_limit_s: a run fails where the program takes longer for it.
+        truth: the topic of the truth; without it the only one of the log.
+    """
+
+    time_limit_s: Annotated[float, Field(gt=0)] = 600.0
+    truth: str = ""
+
+
+@dataclass(frozen=True)
+class _OfPrograms(Estimator[Any]):
+    """Makes an estimator of the command that settings name."""
+
+    def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
+        """Return the estimator of the command; one with {out} among its words reads a log."""
+        words = tuple(split_command(what_runs(label, "exec", settings)))
+        if any("{" + OUT + "}" in word for word in words):
+            return _of_files(label, words)
+        for word in words:
+            if _PLACE.search(word):
+                raise BadInput(
+                    f"estimator {label}: {word}: a program that streams has no places to fill; give "
+                    "{log} and {out} to one that reads a log"
+                )
+        return _of_stream(words)
+
+
+EXEC = _OfPrograms(
+    "a program of your own: -e 'exec:./run_filter {log} {out}', or one that streams",
+    "what the program says that it reads",
+    StreamParameters,
+    unspecified,
+)
+
+
+# --- programs that stream ---------------------------------------------------------------------------
+
+
+def _of_stream(words: tuple[str, ...]) -> Estimator[Any]:
+    description = _described(words, _state_of(words))
+
+    def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
+        return follow_runs_streaming(words, runs, description, limits)
+
+    def bind(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:
+        return [
+            bind_apart(found, follow_runs) for found in bind_all(label, description, topics, parameters)
+        ]
+
+    parameters = description.parameters_over(StreamParameters)
+    return Estimator(description.summary, description.requirements, parameters, bind)
+
+
+def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """The size and the last change of the files that a command names, by which it is asked again."""
+    found = []
+    for word in words:
+        with suppress(OSError, ValueError):
+            state = Path(word).stat()
+            found.append((state.st_size, state.st_mtime_ns))
+    return tuple(found)
+
+
+@lru_cache(maxsize=64)
+def _described(words: tuple[str, ...], state: tuple[tuple[int, int], ...]) -> Description:  # noqa: ARG001
+    return describe_stream(words, f"exec:{words[0]}", Limits.of(StreamParameters()))
+
+
+# --- programs that read a log -----------------------------------------------------------------------
+
+
+def _of_files(label: str, words: tuple[str, ...]) -> Estimator[Any]:
+    defaults = _parameters_in(label, words)
+    fields: dict[str, Any] = {
+        name: (float, Field(value, description="of the program's command"))
+        for name, value in defaults.items()
+    }
+    parameters = create_model(
+        "ProgramParameters", __base__=ProgramParameters, __doc__=ProgramParameters.__doc__, **fields
+    )
+
+    def bind(label: str, topics: Mapping[str, Topic], values: Any) -> list[Bound]:
+        truth = _truth(label, topics, values.truth)
+        read = [
+            name
+            for name, topic in topics.items()
+            if topic.schema_name != TRUTH
+            and not name.startswith(ESTIMATE)
+            and topic.encoding == "protobuf"
+        ]
+        static = [name for name in read if name.endswith("/prior") or _is_map(topics[name])]
+        streams = [name for name in read if name not in static]
+        if not streams:
+            return []
+
+        def solve(given: dict[str, Ragged]) -> list[Ragged]:
+            return _solve(label, words, defaults, values, truth, given)
+
+        return [Batch(label, tuple(streams), tuple(static), solve, parameters=values)]
+
+    return Estimator(f"the program {words[0]}", "messages", parameters, bind)
+
+
+def _parameters_in(label: str, words: Sequence[str]) -> dict[str, float]:
+    """The parameters that places such as {sigma_m=0.1} declare, with their defaults."""
+    found: dict[str, float] = {}
+    for name, default in (place for word in words for place in _PLACE.findall(word)):
+        if name in (LOG, TABLES, OUT) and not default:
+            continue
+        try:
+            found[name] = float(default)
+        except ValueError:
+            raise BadInput(
+                f"estimator {label}: {{{name}}} in its command is nothing that is filled in; give "
+                f"{{log}}, {{csv}}, {{out}}, or a parameter with its default, {{{name}=0.1}}"
+            ) from None
+        if name in ProgramParameters.model_fields:
+            raise BadInput(f"estimator {label}: {{{name}}} in its command cannot have this name")
+    return found
+
+
+def _is_map(topic: Topic) -> bool:
+    return topic.schema_name in (schemas.LANDMARK.full_name, schemas.BODY_POINT.full_name)
+
+
+def _truth(label: str, topics: Mapping[str, Topic], named: str) -> Topic | None:
+    """The truth that estimates are of; raises BadInput where several are."""
+    truths = {
+        name: topic
+        for name, topic in topics.items()
+        if topic.schema_name == TRUTH and not name.startswith(ESTIMATE)
+    }
+    if named and named not in truths:
+        raise BadInput(f"estimator {label}: truth = {named}: the log has none; {choices(named, truths)}")
+    if not named and len(truths) > 1:
+        raise BadInput(
+            f"estimator {label}: the log has the truths {', '.join(truths)}; say which with "
+            f"--set {label}.truth=..."
+        )
+    return truths[named] if named else next(iter(truths.values()), None)
+
+
+def _solve(
+    label: str,
+    words: Sequence[str],
+    defaults: Mapping[str, float],
+    values: Any,
+    truth: Topic | None,
+    given: Mapping[str, Ragged],
+) -> list[Ragged]:
+    """Run the program for every run, some at once, and join what they wrote."""
+    runs = next(iter(given.values())).runs
+    started: list[Program] = []
+
+    def one(run: int) -> dict[str, Stream] | Failure:
+        streams = [ragged.of_run(run) for ragged in given.values()]
+        numbers = {name: getattr(values, name) for name in defaults}
+        stamps = [int(each.publish_time_ns.max()) for each in streams if len(each)]
+        if not stamps:
+            return {}
+        try:
+            return _run(label, words, numbers, Limits.of(values), truth, streams, started)
+        except (Ended, BadInput) as error:
+            return Failure(max(stamps), str(error))
+
+    def stop() -> None:
+        for each in started:
+            each.end()
+
+    made = in_threads(one, range(runs), max(1, min(core_count(), runs)), stop)
+    failures = {run: each for run, each in enumerate(made) if isinstance(each, Failure)}
+    if len(failures) == runs == 1:
+        raise BadInput(f"estimator {label}: {failures[0].reason}")
+    told = [{} if isinstance(each, Failure) else each for each in made]
+    nothing = {topic: stream.take(slice(0, 0)) for each in told for topic, stream in each.items()}
+    return [
+        failures_by_run(f"/estimates/{label}", failures, runs),
+        *(gather([each.get(topic, empty) for each in told]) for topic, empty in nothing.items()),
+    ]
+
+
+def _run(
+    label: str,
+    words: Sequence[str],
+    numbers: Mapping[str, float],
+    limits: Limits,
+    truth: Topic | None,
+    streams: Sequence[Stream],
+    started: list[Program],
+) -> dict[str, Stream]:
+    """Run the program for one run; raises Ended where it fails, BadInput where its file is none."""
+    with scratch_folder("fuselog-program") as folder:
+        places = {LOG: folder / "log.mcap", TABLES: folder / "csv", OUT: folder / "estimates"}
+        command = " ".join(words)
+        if "{" + LOG + "}" in command:
+            write_log(places[LOG], streams, RunMetadata("replayed", epoch_ns=_first_ns(streams)))
+        if "{" + TABLES + "}" in command:
+            write_tables(places[TABLES], streams)
+        filled: Mapping[str, Any] = {**places, **numbers}
+        program = Program([_PLACE.sub(lambda place: str(filled[place[1]]), word) for word in words])
+        started.append(program)
+        program.wait(limits)
+        found = sorted(folder.glob("estimates*"))
+        if not found:
+            raise Ended("the program wrote no estimates: there is nothing in the place {out}")
+        return read_estimates(found[0], label, truth)
+
+
+def _first_ns(streams: Sequence[Stream]) -> int:
+    return int(np.min([each.publish_time_ns.min() for each in streams if len(each)]))

@@ -1,0 +1,126 @@
+"""Lays what filters say into memory: of this process, or of a file that another process fills.
+
+What another process had written before it crashed is there all the same.
+"""
+
+import math
+from collections.abc import Callable
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Integers
+from replay.inference.linear_algebra.gaussian import LOG_TWO_PI
+from replay.inference.run.recursion import Estimates, Innovations
+
+
+class Sizes(NamedTuple):
+    """Holds the numbers of components: of the state n, of its tangent space t, of the innovations m."""
+
+    n: int
+    t: int
+    m: int
+
+
+class Results(NamedTuple):
+    """Holds what is filled in.
+
+    Attributes:
+        progress: (runs,) the message at work; see `following.follow`.
+        estimates, innovations: run r has the rows from the offsets' r-th on.
+    """
+
+    progress: Integers
+    estimates: Estimates
+    innovations: Innovations
+
+
+def results(
+    due: Integers, recorded: Integers, sizes: Sizes, memory: Callable[[int], np.ndarray] = np.zeros
+) -> Results:
+    """Lay out results: run r has the rows from due[r] and recorded[r] up to the next run's.
+
+    Args:
+        due: (runs + 1,) offsets of the estimates.
+        recorded: (runs + 1,) offsets of the innovations.
+        sizes: of states and innovations.
+        memory: makes so many numbers of 8 bytes.
+    """
+    runs, (n, t, m) = len(due) - 1, sizes
+    shapes = [
+        *((runs,) for _ in range(3)),
+        *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
+        *((int(recorded[-1]), *shape) for shape in ((), (), (m,), (m, m), (3,))),
+    ]
+    ends = list(accumulate(map(math.prod, shapes), initial=0))
+    whole = memory(max(ends[-1], 1))
+    progress, due_end, recorded_end, time_ns, mean, covariance, noted_ns, target, *others = (
+        whole[begin:end].reshape(shape)
+        for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
+    )
+    difference, spread, numbers = others
+    estimates = Estimates(due_end.view(np.int64), time_ns.view(np.int64), mean, covariance)
+    target_id = target.view(np.uint32)[: len(target)]
+    innovations = Innovations(
+        recorded_end.view(np.int64), noted_ns.view(np.int64), target_id, difference, spread, numbers
+    )
+    return Results(progress.view(np.int64), estimates, innovations)
+
+
+def begun(made: Results, due: Integers, recorded: Integers) -> Results:
+    """Set the ends of all runs to their beginnings, and what is not filled in to NaN; returns it."""
+    made.estimates.end[:], made.innovations.end[:] = due[:-1], recorded[:-1]
+    for each in (*made.estimates[2:], *made.innovations[3:]):
+        each[:] = np.nan
+    return made
+
+
+def in_file(path: Path) -> Callable[[int], np.ndarray]:
+    """Make memory of a file, which is made where it is not there."""
+
+    def memory(count: int) -> np.ndarray:
+        if not path.exists():
+            with path.open("wb") as file:
+                file.truncate(8 * count)
+        return np.asarray(np.memmap(path, np.float64, "r+", shape=(count,))).view(np.ndarray)
+
+    return memory
+
+
+def fill_squares(innovations: Innovations) -> int:
+    """Fill NIS and log-likelihood of one run's innovations, in place, up to the first without one.
+
+    Returns the row whose covariance is not positive definite, where the innovations end then; else -1.
+    """
+    end = int(innovations.end[0])
+    present = ~np.isnan(innovations.difference[:end])
+    unsound = end
+    for pattern in np.unique(present, axis=0):
+        rows = np.flatnonzero((present == pattern).all(axis=1))
+        at = np.flatnonzero(pattern)
+        missing = np.flatnonzero(~pattern)
+        spread = innovations.covariance[rows][:, at][:, :, at]
+        sound = np.isfinite(spread).all(axis=(1, 2))
+        sound = np.atleast_1d(sound)
+        sound[sound] = np.linalg.eigvalsh(spread[sound]).min(axis=1, initial=np.inf) > 0.0
+        unsound = min(unsound, *rows[~sound].tolist(), end)
+        rows, spread = rows[sound], spread[sound]
+        difference = innovations.difference[rows][:, at]
+        factor = np.linalg.cholesky(spread)
+        white = np.linalg.solve(factor, difference[:, :, None])[:, :, 0]
+        squared = np.einsum("ni,ni->n", white, white)
+        determinant = 2.0 * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+        is_used = (innovations.numbers[rows, 2] > 0.0) & (len(at) > 0)
+        likelihood = -0.5 * (squared + determinant + len(at) * LOG_TWO_PI)
+        innovations.numbers[rows, 0] = squared
+        innovations.numbers[rows, 1] = np.where(is_used, likelihood, 0.0)
+        innovations.numbers[rows, 2] = is_used
+        for each in missing:
+            innovations.covariance[rows, each, :] = np.nan
+            innovations.covariance[rows, :, each] = np.nan
+    if unsound < end:
+        innovations.end[0] = unsound
+        return unsound
+    return -1

@@ -1,0 +1,121 @@
+"""What a replay says of itself: failures, what was skipped or assumed, and how much was estimated."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from recorders.log import schemas
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import Source
+from replay.judging.errors.evaluation import split_topic
+from replay.judging.metrics.measuring import Output, Sums, plus
+from replay.judging.metrics.metrics import covered, estimated_share
+
+ESTIMATE = schemas.GAUSSIAN_ESTIMATE.full_name
+FAILURE, SKIPPED = schemas.FAILURE.full_name, schemas.SKIPPED.full_name
+STARTED, COVERAGE = schemas.STARTED.full_name, schemas.COVERAGE.full_name
+# Leaves of such topics: no estimates, nothing to judge.
+LEAVES = ("failure", "skipped", "started", "coverage")
+# Less than this share of a span is said; a run's first measurements may well be before the prior.
+LEAST_SHARE = 0.995
+
+
+@dataclass
+class StreamDiagnostics:
+    """Collects what one topic says of the replay."""
+
+    failed: dict[int, str] = field(default_factory=dict)
+    with_estimates: set[int] | None = None
+    skipped: Counter[str] = field(default_factory=Counter)
+    started: Counter[str] = field(default_factory=Counter)
+    covered: Sums = field(default_factory=dict)
+
+    def merge(self, other: "StreamDiagnostics") -> None:
+        """Add those of other runs."""
+        self.failed |= other.failed
+        self.skipped.update(other.skipped)
+        self.started.update(other.started)
+        if other.with_estimates is not None:
+            self.with_estimates = other.with_estimates | (self.with_estimates or set())
+        self.covered = plus(self.covered, other.covered)
+
+
+class Diagnostics:
+    """Collects what the topics of a replay say of it, for sentences.
+
+    Args:
+        first_run: the number of the first run in the whole ensemble.
+    """
+
+    def __init__(self, first_run: int) -> None:
+        self._first_run = first_run
+        self._topics: dict[str, StreamDiagnostics] = {}
+
+    def add(self, topic: str, rows: Ragged, sources: Sequence[Source]) -> None:
+        """Add a block of a topic."""
+        schema = rows.stream.schema.full_name
+        found = self._topics.setdefault(topic, StreamDiagnostics())
+        runs = np.flatnonzero(np.diff(rows.offsets)).tolist()
+        if schema == ESTIMATE:
+            estimated = {self._first_run + run for run in runs}
+            found.with_estimates = estimated | (found.with_estimates or set())
+        elif schema == FAILURE:
+            for run in runs:
+                failures = rows.of_run(run)
+                elapsed_s = (int(failures.publish_time_ns[0]) - sources[run].epoch_ns) * 1e-9
+                reason = sentences_of(failures.take(slice(0, 1)))[0]
+                sentence = f"{name_of(topic)} failed at {elapsed_s:.3f} s: {reason}"
+                found.failed.setdefault(self._first_run + run, sentence)
+        elif schema == SKIPPED:
+            found.skipped.update(sentences_of(rows.stream))
+        elif schema == STARTED:
+            found.started.update(sentences_of(rows.stream))
+        elif schema == COVERAGE:
+            found.covered = plus(found.covered, covered(Output("", "", "", rows, sources)))
+
+    def merge(self, other: "Diagnostics") -> None:
+        """Add those of other runs."""
+        for topic, found in other._topics.items():
+            self._topics.setdefault(topic, StreamDiagnostics()).merge(found)
+
+    def failures(self, names: Mapping[int, str]) -> list[str]:
+        """Return a sentence for every run that an estimator did not follow to the end, or not at all.
+
+        Args:
+            names: of all runs, by number.
+        """
+        sentences: dict[tuple[str, int], str] = {}
+        for topic, found in self._topics.items():
+            without: Iterable[int] = (
+                [] if found.with_estimates is None else sorted(names.keys() - found.with_estimates)
+            )
+            sentences |= {
+                (name_of(topic), run): f"{name_of(topic)} gave no estimates" for run in without
+            }
+        for topic, found in self._topics.items():
+            sentences |= {(name_of(topic), run): sentence for run, sentence in found.failed.items()}
+        return [f"{names[run]}: {sentence}" for (_, run), sentence in sentences.items()]
+
+    def notes(self) -> list[str]:
+        """Return a sentence for what was assumed, then for what was not estimated or not used."""
+        notes = []
+        for topic, found in self._topics.items():
+            for reason, count in found.started.items():
+                runs = f" (in {count} runs)" if count > 1 else ""
+                notes.append(f"{name_of(topic)}: {reason}{runs}")
+        for topic, found in self._topics.items():
+            share = estimated_share(found.covered)
+            if share is not None and share < LEAST_SHARE:
+                percent = f"{100 * share:.1f} % of the span was estimated"
+                notes.append(f"{name_of(topic)}: {percent}; its figures are of that")
+            for reason, count in found.skipped.items():
+                notes.append(f"{name_of(topic)}: {count} not used: {reason}")
+        return notes
+
+
+def name_of(topic: str) -> str:
+    """Return the estimator and the case of a topic, as a sentence names them."""
+    return " ".join(filter(None, split_topic(topic)))

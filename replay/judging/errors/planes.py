@@ -1,0 +1,74 @@
+"""Tells whether estimates and their truth are positions in planes that can be compared."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from recorders.log.planes import FRAME, Origin, is_planar, plane_in_words, stated_in
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.geodetic import origins_of
+from replay.engine.streams.sources import Source
+
+ALIGNED = "aligned"  # in the metadata of estimates that are in the truth's frame, whatever theirs was
+# By estimator and case, as in topics: the first fixes that are the origins of every run's plane.
+FirstFixes = Mapping[str, Sequence[Origin | None]]
+
+
+def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]:
+    """Read from a replay's outputs the origins that no channel states: first fixes, run by run."""
+    return {
+        topic.rpartition("/")[0]: [
+            Origin(*map(float, place)) if np.isfinite(place).all() else None
+            for place in origins_of(rows)
+        ]
+        for topic, rows in outputs.items()
+        if topic.endswith("/origin")
+        and topic.startswith("/estimates/")
+        and rows.stream.schema.full_name == schemas.GEODETIC_FIX.full_name
+    }
+
+
+def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | None]:
+    """The origins of the plane of estimates, of every run; None where it is not known."""
+    stated = stated_in(stream.topic, stream.metadata)
+    if stated is None:
+        return list(first.get(stream.topic.rpartition("/")[0], [None] * runs))
+    return [stated] * runs
+
+
+def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
+    """Why estimates cannot be compared with the truth of some run, in words; empty where they can.
+
+    Two planes whose origins are known can be. A truth that states none is in the plane of its log, where
+    that has one, unless it is in a frame of its own; estimates of a filter that found its plane at the
+    first fix are not in it.
+
+    Args:
+        stream: the estimates.
+        sources: the runs.
+        first: see `first_fixes`.
+    """
+    topic = stream.metadata.get("truth", "")
+    if not is_planar(stream.schema.full_name, stream.metadata) or ALIGNED in stream.metadata:
+        return ""
+    for source, own in zip(sources, planes_of(stream, len(sources), first), strict=True):
+        truth = source.topics.get(topic)
+        if truth is None or not is_planar(truth.schema_name, truth.metadata):
+            continue
+        is_first = own is not None and stated_in(stream.topic, stream.metadata) is None
+        frame = stream.metadata.get(FRAME)
+        if stated_in(topic, truth.metadata) is None:
+            if own is not None and (is_first or truth.metadata.get(FRAME)):
+                at = "the first fix" if is_first else "their origin"
+                return (
+                    f"{topic} does not state the origin of its plane, and the estimates are east and "
+                    f"north of {own}, {at}; state it with --set {topic}.plane=LATITUDE,LONGITUDE,HEIGHT "
+                    "or bring one to the other with fuselog evaluate --align se2"
+                )
+        elif own is None and frame:
+            return (
+                f"they are in {plane_in_words(stream.metadata)}, and {topic} is east and north of an "
+                "origin on earth; bring one to the other with fuselog evaluate --align se2"
+            )
+    return ""

@@ -1,0 +1,206 @@
+"""The tracks of a replay against the targets that its log has truths of, block by block.
+
+Instants, pairs and distances are those of `errors`, by which experiments judge trackers, too. A target
+is there from the first to the last stamp of its truth. Judged is what the tracker tells of: from a while
+after the log's begin to the last scan that it took.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from replay.engine.arrays import Floats, Integers
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.measurements import PLANE, read_vectors
+from replay.engine.streams.sources import Source
+from replay.judging.errors.evaluation import split_topic
+from replay.judging.metrics.measuring import Metric
+from replay.judging.tracks.errors import (
+    BURN_IN_S,
+    CUTOFF_M,
+    NONE,
+    PERIOD_S,
+    Judged,
+    TracksAt,
+    as_trajectories,
+    track_errors,
+    track_figures,
+    tracks_at,
+)
+
+# Of a run that is shorter than four burn-ins, tracks have a quarter to begin.
+BURN_IN_SHARE = 0.25
+VELOCITY = ("vx_mps", "vy_mps")
+
+
+class TrackBlock(NamedTuple):
+    """A block of a tracker's sets of tracks: their sizes, the tracks, and the targets of every run."""
+
+    estimator: str
+    case: str
+    sizes: Ragged
+    tracks: Ragged
+    targets: Sequence[Judged | None]
+    first_run: int = 0
+
+
+def targets_of(source: Source) -> Judged | None:
+    """The targets in the plane at the instants of a run, NaN where one is not there; None without any.
+
+    A target is a truth with `x_m` and `y_m`. Instants are PERIOD_S apart, from BURN_IN_S after the epoch
+    to the end of the last truth.
+    """
+    topics = [
+        topic.name
+        for topic in source.topics.values()
+        if topic.schema_name == schemas.TRUTH_STATE.full_name
+        and {*PLANE} <= {*topic.metadata.get("components", "").split(",")}
+    ]
+    truths = [truth for truth in source.read(topics).values() if len(truth)]
+    if not truths:
+        return None
+    last_ns = max(int(truth.publish_time_ns[-1]) for truth in truths)
+    burn_in_s = min(BURN_IN_S, BURN_IN_SHARE * (last_ns - source.epoch_ns) * 1e-9)
+    first_ns = source.epoch_ns + round(burn_in_s * 1e9)
+    at_ns = np.arange(first_ns, last_ns + 1, round(PERIOD_S * 1e9))
+    return Judged(at_ns, np.stack([_places(truth, at_ns) for truth in truths]))
+
+
+def _places(truth: Stream, at_ns: Integers) -> Floats:
+    """Where a target is at instants, (k, 2); NaN before its first stamp and after its last one."""
+    place, begin_ns = read_vectors(truth, "state", PLANE), truth.publish_time_ns[0]
+    stamps = truth.publish_time_ns - begin_ns
+    axes = [np.interp(at_ns - begin_ns, stamps, axis, left=np.nan, right=np.nan) for axis in place.T]
+    return np.stack(axes, axis=1)
+
+
+def track_blocks(
+    outputs: Mapping[str, Ragged], targets: Sequence[Judged | None], first_run: int
+) -> dict[str, TrackBlock]:
+    """The sets of tracks among a replay's outputs, or a block of them, by the topic of their sizes."""
+    found = {}
+    for topic, tracks in outputs.items():
+        sizes = outputs.get(f"{topic.rpartition('/')[0]}/set")
+        is_track = tracks.stream.schema.full_name == schemas.TRACK_ESTIMATE.full_name
+        if is_track and sizes is not None and {*PLANE, *VELOCITY} <= {*tracks.stream.components}:
+            found[topic] = TrackBlock(*split_topic(topic), sizes, tracks, targets, first_run)
+    return found
+
+
+@dataclass
+class Followed:
+    """The tracks of one run as they were told at its instants.
+
+    Attributes:
+        targets: the instants, and where the targets are then.
+        told: the tracks at the first of these.
+        first: how many instants were over before the first set of tracks; they are not judged.
+        last: the last set of tracks.
+    """
+
+    targets: Judged
+    told: list[TracksAt] = field(default_factory=list)
+    first: int | None = None
+    last: tuple[Stream, Stream] | None = None
+
+    def add(self, sizes: Stream, tracks: Stream) -> None:
+        """Take in the next sets of tracks."""
+        if not len(sizes):
+            return
+        at_ns = self.targets.time_ns
+        if self.first is None:
+            self.first = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
+        begin = self.first + len(self.told)
+        # an instant before the block is told by the last set before it
+        before = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
+        if self.last is not None:
+            self.told += tracks_at(*self.last, at_ns[begin:before])
+        end = int(np.searchsorted(at_ns, sizes.publish_time_ns[-1], side="right"))
+        self.told += tracks_at(sizes, tracks, at_ns[max(begin, before) : end])
+        count = int(sizes["elements"][-1])
+        self.last = (
+            sizes.take(slice(len(sizes) - 1, None)),
+            tracks.take(slice(len(tracks) - count, None)),
+        )
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """What the tracks are worth, at the instants told of; {} where there are none, or no target."""
+        from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
+
+        begin = self.first or 0
+        truths = self.targets.truths[:, begin : begin + len(self.told)]
+        if not self.told or not np.isfinite(truths).any():
+            return {}
+        errors = track_errors(self.told, truths)
+        found = {
+            name: value
+            for name, value in track_figures(errors).items()
+            if not name.startswith("target")  # one by one they are of an experiment's own targets
+        }
+        followed = errors.track != NONE
+        squared = errors.distance[followed] ** 2
+        near = _near(self.told, truths)
+        return found | {
+            "followed_share": float(followed.sum() / errors.present.sum()),
+            "followed_rmse_m": float(np.sqrt(squared.mean())) if len(squared) else np.nan,
+            "hota": float(hota(near, truths, CUTOFF_M).hota.mean()),
+            "idf1": idf1(near, truths, CUTOFF_M),
+        }
+
+
+def _near(told: Sequence[TracksAt], truths: Floats) -> Floats:
+    """The tracks (tracks, k, 2) that are ever within the cutoff of a target."""
+    near: set[int] = set()
+    for at, true in zip(told, truths.transpose(1, 0, 2), strict=True):
+        away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
+        near.update(at.number[(away < CUTOFF_M).any(axis=1)].tolist())
+    kept = []
+    for at in told:
+        is_near = np.isin(at.number, list(near))
+        kept.append(TracksAt(at.number[is_near], at.place[is_near]))
+    return as_trajectories(kept)
+
+
+# What is kept of a run: its tracks while there may be more, then their figures alone.
+State = dict[int, Followed | dict[str, float]]
+
+
+def _add(state: State, block: TrackBlock) -> State:
+    for number, targets in enumerate(block.targets):
+        if targets is not None:
+            followed = state.setdefault(block.first_run + number, Followed(targets))
+            assert isinstance(followed, Followed)
+            followed.add(block.sizes.of_run(number), block.tracks.of_run(number))
+    return state
+
+
+def _merge(first: State, second: State) -> State:
+    return {**_figures(first), **_figures(second)}
+
+
+def _figures(state: State) -> dict[int, dict[str, float]]:
+    return {run: of.figures if isinstance(of, Followed) else of for run, of in sorted(state.items())}
+
+
+def _finish(state: State) -> dict[str, float]:
+    """The means over the runs of which they are known."""
+    runs = [figures for figures in _figures(state).values() if figures]
+    found = {}
+    for name in runs[0] if runs else ():
+        known = [figures[name] for figures in runs if np.isfinite(figures[name])]
+        found[name] = float(np.mean(known)) if known else np.nan
+    return found
+
+
+FOLLOWING = Metric(
+    "GOSPA of tracks, cutoff 20 m, HOTA and IDF1 against the truths of targets",
+    TrackBlock,
+    dict,
+    _add,
+    _merge,
+    _finish,
+)

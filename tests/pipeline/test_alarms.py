@@ -1,0 +1,131 @@
+"""Alarms: a replay, an evaluation and a run say themselves what makes their numbers doubtful."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.api.api import record
+from pipeline.api.replays import replay
+from recorders.log import Stream, write_log
+from replay.engine.streams.sources import MemorySource
+from tests.pipeline.conftest import Said
+
+TRUTH, PRIOR, SIGHTINGS = "/robot1/truth", "/robot1/prior", "/robot1/range_bearing"
+
+
+@pytest.fixture(scope="module")
+def log() -> MemorySource:
+    return record("landmarks", seed=5, duration_s=30.0)
+
+
+def _with(log: MemorySource, stream: Stream) -> MemorySource:
+    return MemorySource({**log.streams, stream.topic: stream}, log.run, log.name)
+
+
+def _truth_moved(log: MemorySource, by: Callable[[Any, Any], Any]) -> MemorySource:
+    """The truth moved by what `by` gives of its headings and of times from 0 to 1."""
+    truth = log[TRUTH]
+    state = truth["state"].copy()
+    state[:, :2] += np.stack(by(state[:, 2], np.linspace(0.0, 1.0, len(state))), axis=1)
+    return _with(log, replace(truth, columns={**truth.columns, "state": state}))
+
+
+def _other_origin(_: Any, time: Any) -> Any:
+    return np.full_like(time, 0.65), np.full_like(time, -0.3)
+
+
+def test_no_alarm_where_all_is_well(log: MemorySource) -> None:
+    assert not replay(log, ["ekf", "ukf", "smoother:ekf", "smoother:iterated"]).alarms
+
+
+def test_the_worst_is_said_first(
+    log: MemorySource, tmp_path: Path, fuselog: Callable[..., Said]
+) -> None:
+    """By replay, evaluate and run, in words and in JSON, and by Python."""
+    path, estimates = tmp_path / "run.mcap", tmp_path / "est.mcap"
+    write_log(path, log.streams.values(), log.run)
+    wrong = ["--set", "sigma_range_m=1e-4"]
+    words = "doubtful: ekf robot1: the gate keeps out 9"
+    commands = {
+        "replay": ["replay", path, "-e", "ekf", *wrong, "-o", estimates],
+        "evaluate": ["evaluate", estimates],
+        "run": ["run", path, "-e", "ekf", *wrong, "--out", tmp_path / "result"],
+    }
+    for name, command in commands.items():
+        said = fuselog(*command)
+        assert said.out.lstrip().startswith(words), name
+        assert "% of" in said.out.splitlines()[0]
+        assert "NIS is" in said.out.splitlines()[0]
+        assert "also doubtful: ekf robot1: NEES is" in said.out, name
+        stated = tmp_path / "result" / "result.json"
+        found = json.loads(stated.read_text()) if name == "run" else fuselog(*command, "--json").json
+        worst = found["alarms"][0]
+        assert (worst["kind"], worst["estimator"], worst["case"]) == ("innovations", "ekf", "robot1")
+        assert worst["excess"] > 1000
+    done = replay(log, "ekf", set={"sigma_range_m": 1e-4})
+    assert done.alarms[0].words in repr(done)
+
+
+@pytest.mark.parametrize(
+    ("by", "kind", "offset"),
+    [
+        (_other_origin, "origin", "(-0.6"),
+        (lambda h, _: (0.5 * np.cos(h), 0.5 * np.sin(h)), "lever arm", "(-0.498,"),
+        (lambda _, time: (3.0 * time, 0.0 * time), "errors", "NEES is"),
+        (lambda _, time: (3.0 * np.sin(9.0 * time), 0.0 * time), "errors", "NEES is"),
+    ],
+    ids=["other origin", "lever arm", "drift", "wave"],
+)
+def test_an_error_that_stays(log: MemorySource, by: Any, kind: str, offset: str) -> None:
+    [alarm] = replay(_truth_moved(log, by), "ekf").alarms
+    assert alarm.kind == kind
+    assert offset in alarm.words
+
+
+def test_an_aligned_estimate_has_no_other_origin(
+    log: MemorySource, tmp_path: Path, fuselog: Callable[..., Said]
+) -> None:
+    moved = _truth_moved(log, _other_origin)
+    write_log(tmp_path / "run.mcap", moved.streams.values(), moved.run)
+    fuselog("replay", tmp_path / "run.mcap", "-e", "ekf", "-o", tmp_path / "est.mcap")
+    said = fuselog("evaluate", tmp_path / "est.mcap")
+    assert "other origins: fuselog evaluate --align se2" in said.out.splitlines()[0]
+    assert "doubtful" not in fuselog("evaluate", tmp_path / "est.mcap", "--align", "se2").out
+
+
+def test_measurements_before_a_late_prior_are_counted(log: MemorySource) -> None:
+    prior, stamps_ns = log[PRIOR], log[SIGHTINGS].publish_time_ns
+    late_ns = prior.publish_time_ns + 5_000_000_000
+    done = replay(_with(log, replace(prior, publish_time_ns=late_ns)), "ekf")
+    before = int((stamps_ns < late_ns[0]).sum())
+    assert (
+        f"ekf: {SIGHTINGS}: {before} of {len(stamps_ns)} not used: {before} come before the prior"
+        in [alarm.words for alarm in done.alarms if alarm.kind == "unused"]
+    )
+
+
+def test_a_likelihood_of_nothing(log: MemorySource) -> None:
+    far = replace(log[PRIOR], columns={**log[PRIOR].columns, "mean": log[PRIOR]["mean"] + 100.0})
+    worst = replay(_with(log, far), "ekf").alarms[0]
+    assert "the gate keeps out 100 % of" in worst.words
+    assert "its log-likelihood is that of no measurement" in worst.words
+
+
+def test_gates_that_differ(log: MemorySource) -> None:
+    opened = {"open": {"kind": "ekf", "gate_probability": 1.0}}
+    last = replay(log, ["ekf", opened], set={"sigma_range_m": 0.05}).alarms[-1]
+    assert last.kind == "gates"
+    assert "gate_probability is 0.999 of ekf, 1 of open" in last.words
+
+
+def test_a_minimum_that_is_not_the_least(log: MemorySource) -> None:
+    """By the cost itself, whose residuals leave about half a unit for each measured number."""
+    far = replay(log, "smoother:iterated", set={"start": "prior"})
+    [alarm] = [each for each in far.alarms if each.kind == "minimum"]
+    assert "compare other starts, such as --set start=motion" in alarm.words
+    assert alarm.excess > 10.0

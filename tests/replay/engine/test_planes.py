@@ -1,0 +1,88 @@
+"""Streams taken from the plane of one origin into that of another, 60 km away."""
+
+import numpy as np
+from numpy.testing import assert_allclose
+from numpy.typing import NDArray
+
+from recorders.log import make_stream, schemas
+from recorders.log.planes import Origin
+from recorders.models.geodesy import (
+    earth_centred,
+    into_tangent_plane,
+    out_of_tangent_plane,
+    tangent_axes,
+)
+from replay.engine.streams.planes import into_plane_of
+
+HERE, THERE = Origin(60.0, 10.0, 50.0), Origin(60.3, 10.9, 250.0)
+STAMPS = np.arange(3)
+PLACES = np.array([[0.0, 0.0, 0.0], [900.0, -400.0, 30.0], [-2e3, 5e3, -10.0]])
+Floats = NDArray[np.float64]
+
+
+def over_the_earth(places: Floats) -> Floats:
+    """By way of earth-centred axes, of which the code under test knows nothing."""
+    centred = np.array(earth_centred(*HERE)) + places @ tangent_axes(*HERE[:2])
+    return (centred - np.array(earth_centred(*THERE))) @ tangent_axes(*THERE[:2]).T
+
+
+def test_states_positions_and_poses_are_taken_into_another_plane() -> None:
+    """Places over the earth; directions as those of small steps; covariances as those of steps."""
+    names = "x_m,y_m,z_m,vx_mps,vy_mps,vz_mps,heading_rad"
+    kinds = {"components": names, "kinds": ",".join(["linear"] * 6 + ["angle"])}
+    velocity, heading = np.array([3.0, 4.0, 0.5]), 2.0
+    state = np.hstack([PLACES, np.tile([*velocity, heading], (3, 1))])
+    spread = np.diag([1.0, 9.0, 4.0, 1.0, 1.0, 1.0, 0.01])
+    estimate = make_stream(
+        "/estimate",
+        schemas.GAUSSIAN_ESTIMATE,
+        STAMPS,
+        metadata={**kinds, **HERE.metadata},
+        mean=state,
+        covariance=np.tile(spread.ravel(), (3, 1)),
+    )
+    moved = into_plane_of(estimate, THERE)
+    turn = tangent_axes(*THERE[:2]) @ tangent_axes(*HERE[:2]).T
+    assert_allclose(moved["mean"][:, :3], over_the_earth(PLACES), atol=1e-6)
+    steps = over_the_earth(PLACES + velocity) - over_the_earth(PLACES)
+    assert_allclose(moved["mean"][:, 3:6], steps, atol=1e-6)
+    ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
+    course = (over_the_earth(PLACES + ahead) - over_the_earth(PLACES))[0]
+    assert_allclose(moved["mean"][:, 6], np.arctan2(course[1], course[0]), atol=1e-4)
+    assert abs(moved["mean"][0, 6] - heading) > 0.01  # meridians converge
+    assert_allclose(
+        moved["covariance"][0].reshape(7, 7)[:3, :3], turn @ spread[:3, :3] @ turn.T, rtol=1e-9
+    )
+    assert {name: moved.metadata[name] for name in THERE.metadata} == THERE.metadata
+    assert_allclose(into_plane_of(moved, HERE)["mean"][:, :6], state[:, :6], atol=1e-6)
+
+    unknown = np.full((3, 9), np.nan)
+    unknown[:, 0] = 1.0
+    fix = make_stream(
+        "/fix",
+        schemas.POSITION_FIX,
+        STAMPS,
+        metadata=HERE.metadata,
+        position_m=PLACES,
+        covariance_m2=unknown,
+    )
+    moved = into_plane_of(fix, THERE)
+    assert_allclose(moved["position_m"], over_the_earth(PLACES), atol=1e-6)
+    assert np.isnan(moved["covariance_m2"][:, 1:]).all()
+    assert_allclose(moved["covariance_m2"][:, 0], turn[0, 0] ** 2)
+
+
+def test_what_is_flat_lies_in_its_own_plane() -> None:
+    """East and north alone are taken over at the height of their origin, as latitudes are."""
+    flat = make_stream(
+        "/truth",
+        schemas.TRUTH_STATE,
+        STAMPS,
+        metadata={"components": "x_m,y_m", "kinds": "linear,linear", **HERE.metadata},
+        state=PLACES[:, :2],
+    )
+    latitude, longitude, _ = out_of_tangent_plane(PLACES[:, :2].T, HERE)
+    level = np.column_stack([latitude, longitude, np.full(3, HERE.altitude_m)])
+    found = into_plane_of(flat, THERE)["state"]
+    assert_allclose(found, np.transpose(into_tangent_plane(level.T, THERE))[:, :2], atol=5e-3)
+    assert_allclose(found[0], into_tangent_plane(HERE, THERE)[:2], atol=1e-6)

@@ -1,0 +1,64 @@
+"""What a filter breaks ends its own run: the others are judged, and nothing is left running."""
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from recorders.log import RunMetadata, make_stream, schemas
+from recorders.recording import Recording
+from replay.engine.streams.sources import MemorySource, memory_source
+from tests.replay.foreign.conftest import MISBEHAVING, Compile
+
+CRASH, LOOP, LEAK, PRINT, NOT_A_NUMBER, NEGATIVE, FAIL, LEAVE = (float(-each) for each in range(1, 9))
+MESSAGES, AT = 600, 499
+SANE = 1.0
+LIMITS = {"time_limit_s": 3.0, "memory_limit_mb": 400}
+# what is asked of a run at message 500, and the reason that is given
+RUNS = {
+    SANE: "",
+    PRINT: "",
+    CRASH: "the filter crashed (SIGSEGV) at message 500 (/range)",
+    LOOP: "the filter took longer than 3 s (time_limit_s) at message 500 (/range)",
+    LEAK: "the filter took more than 400 MB of memory (memory_limit_mb) at message 500 (/range)",
+    LEAVE: "the filter ended with exit code 3 at message 500 (/range)",
+    NOT_A_NUMBER: "the filter's estimate or covariance is not finite",
+    NEGATIVE: "a variance of the filter's covariance is negative",
+    FAIL: "it was told to fail",
+}
+
+
+def run_with(command: float) -> MemorySource:
+    """A run with a command among its ranges."""
+    ranges = np.full(MESSAGES, SANE)
+    ranges[AT] = command
+    stamps_ns = np.arange(MESSAGES) * 1_000_000
+    seen = make_stream("/range", schemas.RANGE, stamps_ns, target_id=np.ones(MESSAGES), range_m=ranges)
+    return memory_source(Recording([seen]), RunMetadata("ranges", epoch_ns=0))
+
+
+@pytest.mark.unix
+@pytest.mark.usefixtures("nothing_left")
+def test_a_run_ends_with_its_filter_and_the_others_go_on(compile_filter: Compile) -> None:
+    mine = {"kind": "lib", "path": str(compile_filter(MISBEHAVING)), **LIMITS}
+    done = fl.replay([run_with(each) for each in RUNS], {"mine": mine})
+    said = dict(zip(RUNS, done.estimates, strict=True))
+    for command, reason in RUNS.items():
+        failures = said[command]["/estimates/mine/failure"]
+        told = [each for each in done.failures if reason and reason in each]
+        assert len(failures) == bool(reason), reason
+        assert len(told) == bool(reason), (reason, done.failures)
+        assert failures.publish_time_ns.tolist() == [AT * 1_000_000] * bool(reason)
+        estimates = said[command]["/estimates/mine/state"]
+        assert len(estimates) == (AT if reason else MESSAGES)  # what it said before counts
+    sane = said[SANE]["/estimates/mine/state"]
+    np.testing.assert_allclose(sane["mean"][AT + 1 :], SANE, atol=1e-5)
+
+
+def test_failures_in_this_process(compile_filter: Compile) -> None:
+    """Those that leave the process as it is are told alike."""
+    mine = {"kind": "lib", "path": str(compile_filter(MISBEHAVING)), "in_process": True}
+    commands = [SANE, NOT_A_NUMBER, NEGATIVE, FAIL]
+    done = fl.replay([run_with(each) for each in commands], {"mine": mine})
+    for command, estimates in zip(commands, done.estimates, strict=True):
+        assert len(estimates["/estimates/mine/failure"]) == bool(RUNS[command])
+        assert sum(RUNS[command] in each for each in done.failures) == (1 if RUNS[command] else 3)

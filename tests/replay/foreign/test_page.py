@@ -1,0 +1,90 @@
+"""The page on filters of one's own, worked through; and its filter in C++."""
+
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.command_line.process import main
+from tests.docs.test_worked_pages import blocks_of
+from tests.replay.foreign.conftest import EXAMPLES, HEADER, Compile
+
+EIGEN = ("/usr/include/eigen3", "/usr/local/include/eigen3", "/opt/homebrew/include/eigen3")
+
+
+@pytest.fixture
+def drifter(compile_filter: Compile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The page's filter, in a folder with its log."""
+    monkeypatch.chdir(tmp_path)
+    [source] = [block for block in blocks_of("your-filter") if block.file == "drifter.c"]
+    Path("drifter.c").write_text(source.text, encoding="utf-8")
+    return compile_filter(Path("drifter.c").resolve())
+
+
+def test_the_page_is_worked_through(drifter: Path) -> None:
+    """Its commands; so a new user has a judged filter."""
+    shutil.copy(drifter, "drifter.so")
+    for block in blocks_of("your-filter"):
+        for line in block.text.splitlines() if block.language == "sh" else ():
+            words = shlex.split(line)
+            if words[:1] == ["fuselog"]:
+                assert main(words[1:]) == 0, line
+    done = fl.replay("run.mcap", {"drifter": {"kind": "lib", "path": "./drifter.so"}})
+    metrics = done.metrics.set_index("quantity")["value"]
+    assert metrics["position_rmse_m"] < 5.0
+    assert metrics["failed_runs"] == 0
+
+
+def test_the_client_in_cpp_gives_the_same(drifter: Path) -> None:
+    if shutil.which("c++") is None:
+        pytest.skip("there is no compiler: c++")
+    command = [
+        "c++",
+        "-std=c++17",
+        "-O2",
+        "-Wall",
+        "-Werror",
+        str(EXAMPLES / "drifter.cpp"),
+        "-o",
+        "drifter",
+    ]
+    subprocess.run(command, check=True)
+    log = fl.record("vehicles", seed=7, vehicles=1, duration_s=15.0)
+    ways = {
+        "lib": {"kind": "lib", "path": str(drifter), "in_process": True},
+        "stream": {"kind": "exec", "command": "./drifter"},
+    }
+    if sys.byteorder == "big":
+        pytest.skip("frames are little-endian")
+    for settings in ways.values():
+        settings |= {"every_s": 0.3, "drift_density": 12.0}
+    done = fl.replay(log, ways)
+    [estimates] = done.estimates
+    for leaf in ("state", "innovation"):
+        lib, stream = (estimates[f"/estimates/{label}/vehicle1/{leaf}"] for label in ways)
+        assert len(lib) > 10
+        for name, column in lib.columns.items():
+            np.testing.assert_allclose(stream[name], column, rtol=1e-12, err_msg=name)
+
+
+def test_the_filter_with_eigen_gives_the_same(drifter: Path, tmp_path: Path) -> None:
+    found = [place for place in EIGEN if Path(place).is_dir()]
+    if not found or shutil.which("c++") is None:
+        pytest.skip("Eigen is not installed (libeigen3-dev)")
+    made = tmp_path / "drifter_eigen.so"
+    flags = ["-std=c++17", "-O2", "-shared", "-fPIC", "-I", found[0], "-I", str(HEADER)]
+    subprocess.run(["c++", *flags, str(EXAMPLES / "drifter_eigen.cpp"), "-o", str(made)], check=True)
+    log = fl.record("vehicles", seed=7, vehicles=1, duration_s=15.0)
+    paths = {"c": drifter, "eigen": made}
+    given = {
+        label: {"kind": "lib", "path": str(path), "in_process": True} for label, path in paths.items()
+    }
+    done = fl.replay(log, given)
+    [estimates] = done.estimates
+    c, eigen = (estimates[f"/estimates/{label}/vehicle1/state"] for label in paths)
+    np.testing.assert_allclose(eigen["mean"], c["mean"], rtol=1e-9)

@@ -1,0 +1,162 @@
+"""Programs as filters: those that stream, and those that read a log and write estimates."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import fuselog as fl
+from fuselog import BadInput
+from replay.foreign.naming import Allowed
+from tests.replay.foreign.conftest import EXAMPLES
+from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
+
+HALF, PRINT, LEAVE, OTHER_SIZE, MUTE, FAIL = range(-1, -7, -1)  # as in the program
+PROGRAM = Path(__file__).with_name("program.py")
+RUNS = {
+    SANE: "",
+    HALF: "the filter ended within a frame at message 500 (/range)",
+    PRINT: "the filter wrote 'hello from the filter' to standard output, which is no frame, at message",
+    LEAVE: "the filter ended with exit code 1: no more at message 500 (/range)",
+    OTHER_SIZE: "sent a reply of 14 bytes with flags 1, where 22 were due, at message 500",
+    MUTE: "the filter took longer than 3 s (time_limit_s) at message 500 (/range)",
+    FAIL: "it was told to fail",
+}
+
+
+def program(command: str, **settings: Any) -> dict[str, Any]:
+    return {"kind": "exec", "command": Allowed(command), **settings}
+
+
+def python(path: Path, *arguments: str) -> str:
+    return " ".join([f"'{sys.executable}'", f"'{path}'", *arguments])
+
+
+@pytest.mark.usefixtures("nothing_left")
+def test_programs_that_fail_end_their_own_runs() -> None:
+    mine = program(python(PROGRAM), time_limit_s=3.0)
+    done = fl.replay([run_with(float(each)) for each in RUNS], {"mine": mine})
+    for (command, reason), estimates in zip(RUNS.items(), done.estimates, strict=True):
+        assert sum(reason in each for each in done.failures) == (1 if reason else len(RUNS) - 1), reason
+        assert len(estimates["/estimates/mine/failure"]) == bool(reason)
+        assert len(estimates["/estimates/mine/state"]) == (AT if reason else MESSAGES), command
+
+
+def test_filterpy_as_a_program() -> None:
+    """Its own numbers, and those of our filter of the same model; so the verdicts are alike."""
+    filterpy = pytest.importorskip("filterpy.kalman", reason="FilterPy is not installed")
+    log = fl.record("vehicles", seed=2, duration_s=20.0, vehicles=1)
+    settings = {"model": "vehicle", "turn_rate_radps": 0.0, "acceleration_sigma_mps2": 0.5}
+    given = {"ekf": settings, "walker": program(python(EXAMPLES / "walker.py"))}
+    done = fl.replay(log, given)
+    made = done.estimates[0]
+    [ekf, walker] = (made[f"/estimates/{label}/vehicle1/state"] for label in given)
+    np.testing.assert_array_equal(ekf.publish_time_ns, walker.publish_time_ns)
+    own = filterpy.KalmanFilter(dim_x=4, dim_z=2)
+    prior, fixes = log["/vehicle1/prior"], log["/vehicle1/fix"]
+    own.x, own.P = prior["mean"][0], prior["covariance"][0].reshape(4, 4)
+    own.H = np.eye(4)[[0, 2]]
+    time_ns, means = prior.publish_time_ns[0], []
+    for row, stamp_ns in enumerate(fixes.publish_time_ns):
+        if (s := (stamp_ns - time_ns) * 1e-9) > 0.0:
+            noise = np.kron(np.eye(2), [[s**4 / 4, s**3 / 2], [s**3 / 2, s**2]]) * 0.25
+            own.predict(F=np.kron(np.eye(2), [[1.0, s], [0.0, 1.0]]), Q=noise)
+        own.update(fixes["position_m"][row], R=fixes["covariance_m2"][row].reshape(2, 2))
+        means.append(own.x.copy())
+        time_ns = stamp_ns
+    size = np.abs(means).max()
+    np.testing.assert_allclose(walker["mean"], means, rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(walker["mean"], ekf["mean"], rtol=0, atol=1e-12 * size)
+    nis = [
+        made[f"/estimates/{label}/vehicle1/innovation"]["normalised_innovation_squared"]
+        for label in given
+    ]
+    np.testing.assert_allclose(*nis, rtol=1e-9)
+    judged = done.metrics.set_index(["quantity", "case"])
+    ours, theirs = (judged[judged["estimator"] == label].drop(columns="estimator") for label in given)
+    assert len(theirs) > 10
+    pd.testing.assert_frame_equal(theirs, ours.loc[theirs.index], rtol=1e-9)
+
+
+WRITES = """
+import json, sys
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+
+log, out, how, sigma = sys.argv[1:]
+if Path(log).is_dir():
+    topics = {path.name for path in Path(log).iterdir()}
+    assert "robot1-odometry.csv" in topics and not any("truth" in each for each in topics)
+    rows = np.genfromtxt(Path(log) / "robot1-odometry.csv", delimiter=",", names=True, dtype=None)
+    stamps = rows["time_ns"]
+else:
+    with open(log, "rb") as file:
+        found = [m.publish_time for _, c, m in make_reader(file).iter_messages(["/robot1/odometry"])]
+    stamps = np.array(found)
+variance = float(sigma) ** 2
+if how == "csv":
+    names = "time_ns,x_m,y_m,heading_rad,cov_x_m_x_m,cov_y_m_y_m,cov_heading_rad_heading_rad,cov_x_m_y_m"
+    lines = [f"{t},{k},0,3.0,{variance},{variance},0.01,0.0" for k, t in enumerate(stamps)]
+    Path(out).write_text("\\n".join([names, *lines]))
+elif how == "tum":
+    lines = [f"{t // 10**9}.{t % 10**9:09d} {k} 0 0 0 0 0 1" for k, t in enumerate(stamps)]
+    Path(out).write_text("\\n".join(lines))
+elif how == "fail":
+    sys.exit("no such road")
+elif how == "table":
+    Path(out).write_text("time_ns,z_m\\n0,1\\n")
+"""
+
+
+@pytest.mark.parametrize(("place", "how"), [("{log}", "csv"), ("{csv}", "tum")])
+def test_a_program_that_reads_a_log(tmp_path: Path, place: str, how: str) -> None:
+    """It gets the log without truth, and parameters; what it writes is judged run by run."""
+    script = tmp_path / "writes.py"
+    script.write_text(WRITES)
+    mine = program(python(script, place, "{out}", how, "{sigma_m=0.5}"), sigma_m=0.25)
+    logs = [fl.record("landmarks", seed=1, run=run, duration_s=2.0) for run in range(2)]
+    done = fl.replay(logs, {"writes": mine})
+    for log, estimates in zip(logs, done.estimates, strict=True):
+        made = estimates["/estimates/writes/robot1/state"]
+        np.testing.assert_array_equal(made.publish_time_ns, log["/robot1/odometry"].publish_time_ns)
+        np.testing.assert_array_equal(made["mean"][:, 0], np.arange(len(made)))
+        assert made["covariance"][0, 0] == (0.0625 if how == "csv" else 0.0)
+    assert done.metrics["quantity"].isin(["nees"]).any() == (how == "csv")
+    assert done.done.parameters["writes"]["sigma_m"] == 0.25
+
+
+@pytest.mark.parametrize(
+    ("how", "sentence"),
+    [
+        ("fail", "the program ended with exit code 1: no such road"),
+        ("nothing", "the program wrote no estimates"),
+        ("table", "have a column z_m, which /robot1/truth does not have; it has x_m, y_m, heading_rad"),
+    ],
+)
+def test_a_program_that_writes_no_estimates(tmp_path: Path, how: str, sentence: str) -> None:
+    script = tmp_path / "writes.py"
+    script.write_text(WRITES)
+    log = fl.record("landmarks", duration_s=1.0)
+    with pytest.raises(BadInput, match=sentence):
+        fl.replay(log, {"mine": program(python(script, "{log}", "{out}", how, "1"))})
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("./no_such_filter", "exec:./no_such_filter: cannot be started"),
+        ("x {log} {out} {speed}", "{speed} in its command is nothing that is filled in"),
+        ("x {log}", "a program that streams has no places to fill"),
+        ("x 'open", "close the quote"),
+        (f"'{sys.executable}' -c 'print(12345)'", "wrote '12345' to standard output, which is no frame"),
+    ],
+)
+def test_commands_that_cannot_be_used(command: str, sentence: str) -> None:
+    with pytest.raises(BadInput) as raised:
+        fl.replay(fl.record("landmarks", duration_s=1.0), {"mine": program(command)})
+    assert sentence in str(raised.value)

@@ -1,0 +1,122 @@
+"""What panels of a timeline show first and at their edges, as any reader of the file gets it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.chunk as rc
+
+from recorders.log import RunMetadata, Stream, make_stream, schemas
+from recorders.models.states import state_metadata
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource
+from replay.judging.errors.evaluation import chi_square_interval
+from replay.timeline.show import show
+from tests.replay.timeline.test_timeline import read, told, views
+
+SECONDS = np.arange(50)
+STAMPS = SECONDS * 10**9
+BAND = chi_square_interval(1, 1)[1]
+
+
+def layout(path: Path) -> dict[str, dict[str, list]]:
+    """The parts of a file's layout by their path, each with what is stated of it."""
+    reader = rc.RrdReader(str(path))
+    found: dict[str, dict[str, list]] = {}
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        part = found.setdefault("/".join(chunk.entity_path.strip("/").split("/")[:2]), {})
+        part |= {name: batch.column(name)[0].as_py() for name in batch.schema.names}
+    return found
+
+
+def range_of(path: Path, plot: str) -> tuple[float, float]:
+    """The range of the plot of an entity."""
+    origin = "ViewBlueprint:space_origin"
+    [part] = [part for part in layout(path).values() if part.get(origin) == [plot]]
+    return tuple(part["ScalarAxis:range"][0])
+
+
+def innovations(squared: np.ndarray, accepted: np.ndarray) -> Stream:
+    return make_stream(
+        "/estimates/ekf/innovation",
+        schemas.INNOVATION,
+        STAMPS,
+        metadata={**state_metadata(["room_degC"]), "truth": "/truth"},
+        target_id=np.zeros(50, np.int64),
+        accepted=accepted.astype(np.int64),
+        innovation=np.ones((50, 1)),
+        covariance=np.ones((50, 1)),
+        normalised_innovation_squared=squared,
+        log_likelihood=np.zeros(50),
+    )
+
+
+def a_room(path: Path, inside: int = 50) -> Path:
+    """The timeline of a room's temperature, 20 to 24 degrees; so many innovations are as they should."""
+    squared = np.where(inside > SECONDS, 0.5, 5062.0)
+    degrees = 20.0 + 4.0 * SECONDS[:, None] / 49.0
+    estimate = make_stream(
+        "/estimates/ekf/state",
+        schemas.GAUSSIAN_ESTIMATE,
+        STAMPS,
+        metadata={**state_metadata(["room_degC"]), "truth": "/truth"},
+        sensor_time_ns=STAMPS,
+        mean=degrees,
+        covariance=np.ones((50, 1)),
+    )
+    truth = make_stream(
+        "/truth", schemas.TRUTH_STATE, STAMPS, metadata=state_metadata(["room_degC"]), state=degrees
+    )
+    sensors = [
+        make_stream(
+            f"/{name}",
+            schemas.VECTOR_MEASUREMENT,
+            stamps,
+            metadata={"components": "room_degC"},
+            value=degrees[: len(stamps)],
+        )
+        for name, stamps in (("window", STAMPS), ("door", STAMPS[:45] + 1))
+    ]
+    source = MemorySource(
+        {each.topic: each for each in (truth, *sensors)}, RunMetadata("own", epoch_ns=0), "own"
+    )
+    outputs = [estimate, innovations(squared, squared < 1.0)]
+    show(source, {each.topic: gather([each]) for each in outputs}, [], save=path)
+    return path
+
+
+def test_what_is_above_a_panel_is_marked_and_counted(tmp_path: Path) -> None:
+    """The values themselves are all there; who zooms out sees them."""
+    path = a_room(tmp_path / "nis.rrd", inside=40)
+    found = read(path)
+    assert np.ravel(found["/plots/nis_1/ekf"]["Scalars:scalars"]).max() == 5062.0
+    above = found["/plots/nis_1/ekf\\ above"]
+    assert above["sim_time"] == STAMPS[40:].tolist()
+    assert np.ravel(above["Scalars:scalars"]) == pytest.approx(0.98 * 2.5 * BAND)
+    assert f"NIS of 1 component; above {2.5 * BAND:.3g}: ekf 10 of 50" in views(path)
+    assert range_of(path, "plots/nis_1")[1] == pytest.approx(2.5 * BAND)
+
+
+def test_a_panel_ends_above_what_is_beyond_the_band_throughout(tmp_path: Path) -> None:
+    path = a_room(tmp_path / "nis.rrd", inside=5)
+    assert "/plots/nis_1/ekf\\ above" not in read(path)
+    assert f"NIS of 1 component; 95 % are below {BAND:.3g}" in views(path)
+    assert range_of(path, "plots/nis_1")[1] == 10_000.0
+
+
+def test_what_an_own_model_estimates_comes_first_below_its_legend(tmp_path: Path) -> None:
+    path = a_room(tmp_path / "room.rrd")
+    low, high = range_of(path, "plots/room_degC")
+    assert low == pytest.approx(20.0 - 0.05 * 4.0)
+    assert high - 24.0 > 0.25 * (high - low)
+    parts, contents = layout(path), "ContainerBlueprint:contents"
+    boards = [[parts[each] for each in part[contents]] for part in parts.values() if contents in part]
+    named = [[each.get("ContainerBlueprint:display_name") for each in board] for board in boards]
+    assert [["state"], ["window"], ["door"]] in named
+
+
+def test_events_name_the_topic_of_what_was_gated(tmp_path: Path) -> None:
+    """That with a message of its stamp; a sensor has no target 0."""
+    said = told(read(a_room(tmp_path / "room.rrd", inside=48))["/events/ekf"])
+    assert said == ["ekf: gated window: NIS 5062.0"] * 2
