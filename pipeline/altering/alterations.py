@@ -4,7 +4,7 @@ With the opposite number a fault is undone, but for what is lost. So one set of 
 diagnosis supposes, and what the experiment puts into logs to be found.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream
-from recorders.models.orientation import compose
+from recorders.models.orientation import compose, heading
 from replay.engine.streams.sources import MemorySource
 
 Alteration = Callable[[Stream, float], Stream]
@@ -35,10 +35,10 @@ def shifted(field: str, entry: int | None = None) -> Alteration:
     return partial(_shifted, field, entry)
 
 
-def _shifted(field: str, entry: int | None, stream: Stream, by: float) -> Stream:
+def _shifted(field: str, entry: int | None, stream: Stream, by: float | NDArray[np.float64]) -> Stream:
     column = stream[field].copy()
     if entry is None:
-        column += by
+        column += by if column.ndim == 1 or np.ndim(by) == 0 else np.reshape(by, (-1, 1))
     else:
         column[:, entry] += by
     return _with(stream, **{field: column})
@@ -84,34 +84,104 @@ def _turned(field: str, stream: Stream, angle: float) -> Stream:
     return _with(stream, **columns)
 
 
-def delayed(first_ns: int, last_ns: int) -> Alteration:
-    """Stamps are late by so many seconds; none leaves the run, from `first_ns` to `last_ns`."""
-    return partial(_delayed, first_ns, last_ns)
+def delayed(stream: Stream, by_s: float) -> Stream:
+    """Stamps are late by so many seconds."""
+    return replace(stream, publish_time_ns=stream.publish_time_ns + round(by_s * 1e9))
 
 
-def _delayed(first_ns: int, last_ns: int, stream: Stream, by_s: float) -> Stream:
-    stamps_ns = stream.publish_time_ns + round(by_s * 1e9)
-    return replace(stream, publish_time_ns=np.clip(stamps_ns, first_ns, last_ns))
-
-
-def drifted(first_ns: int, last_ns: int) -> Alteration:
+def drifted(first_ns: int) -> Alteration:
     """The clock of the stamps gains so many seconds a second from the run's begin on."""
-    return partial(_drifted, first_ns, last_ns)
+    return partial(_drifted, first_ns)
 
 
-def _drifted(first_ns: int, last_ns: int, stream: Stream, rate: float) -> Stream:
-    gained = np.rint((stream.publish_time_ns - first_ns) * rate).astype(np.int64)
-    stamps_ns = stream.publish_time_ns + gained
-    return replace(stream, publish_time_ns=np.clip(stamps_ns, first_ns, last_ns))
+def _drifted(first_ns: int, stream: Stream, rate: float) -> Stream:
+    since_ns = (stream.publish_time_ns - first_ns) * pace(rate)
+    return replace(stream, publish_time_ns=first_ns + np.rint(since_ns).astype(np.int64))
 
 
-def heading_turned(stream: Stream, angle: float) -> Stream:
-    """Orientations of a Gaussian estimate are turned about the vertical by an angle in rad."""
+def pace(rate: float) -> float:
+    """How fast a clock goes that gains so many seconds a second; of the opposite rate the inverse.
+
+    >>> pace(0.25), pace(-0.25)
+    (1.25, 0.8)
+    """
+    return 1.0 + rate if rate >= 0.0 else 1.0 / (1.0 - rate)
+
+
+def multiplied(field: str, entry: int | None = None) -> Alteration:
+    """A field, or one entry of it, is e^value times as large."""
+    return lambda stream, logarithm: _scaled(field, entry, stream, float(np.exp(logarithm)))
+
+
+def ramped(first_ns: int, field: str, entry: int | None = None) -> Alteration:
+    """A bias grows by so much a second from the run's begin on."""
+    return partial(_ramped, first_ns, field, entry)
+
+
+def _ramped(first_ns: int, field: str, entry: int | None, stream: Stream, rate: float) -> Stream:
+    return _shifted(field, entry, stream, rate * _since_s(stream, first_ns))
+
+
+def _since_s(stream: Stream, first_ns: int) -> NDArray[np.float64]:
+    return np.asarray(1e-9 * (stream.publish_time_ns - first_ns), np.float64)
+
+
+def permuted(field: str, order: Sequence[int]) -> Alteration:
+    """The entries of a vector, and of its covariance, stand in another order, whatever the number."""
+    return partial(_permuted, field, tuple(order))
+
+
+def _permuted(field: str, order: tuple[int, ...], stream: Stream, _: float) -> Stream:
+    n, m = stream[field].shape
+    order = (*order, *range(len(order), m))
+    columns = {field: stream[field][:, order]}
+    block = _BLOCKS.get(field, "")
+    if block in stream.columns and stream[block].shape == (n, m * m):
+        covariance = stream[block].reshape(n, m, m)[:, order][:, :, order]
+        columns[block] = covariance.reshape(n, m * m)
+    return _with(stream, **columns)
+
+
+def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream:
+    """Orientations, or those of a Gaussian estimate, are turned about the vertical by angles in rad."""
+    half = 0.5 * np.asarray(angle, float)
+    about = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
+    if "quaternion" in stream.columns:
+        return _with(stream, quaternion=compose(about, stream["quaternion"]))
     begin = stream.metadata["kinds"].split(",").index("quaternion")
     mean, places = stream["mean"].copy(), slice(begin, begin + 4)
-    about = np.array([np.cos(0.5 * angle), 0.0, 0.0, np.sin(0.5 * angle)])
     mean[:, places] = compose(about, mean[:, places])
     return _with(stream, mean=mean)
+
+
+def heading_multiplied(stream: Stream, factor: float) -> Stream:
+    """The headings of orientations are multiplied; what else they are turned by stays."""
+    return heading_turned(stream, (factor - 1.0) * heading(stream["quaternion"]))
+
+
+def heading_ramped(first_ns: int) -> Alteration:
+    """Orientations turn about the vertical by so many rad/s from the run's begin on."""
+    return lambda stream, rate: heading_turned(stream, rate * _since_s(stream, first_ns))
+
+
+def heading_from_north(stream: Stream, _: float) -> Stream:
+    """Headings clockwise from north are those anticlockwise from east, and the reverse."""
+    return heading_turned(stream, 0.5 * np.pi - 2.0 * heading(stream["quaternion"]))
+
+
+def spread_stated(name: str) -> Alteration:
+    """Variances that a channel states are multiplied, standard deviations are e^value times as large."""
+    return partial(_spread_stated, name)
+
+
+def _spread_stated(name: str, stream: Stream, logarithm: float) -> Stream:
+    stated = spread_variances(stream.metadata[name], float(np.exp(2.0 * logarithm)))
+    return replace(stream, metadata={**stream.metadata, name: stated})
+
+
+def spread_variances(stated: str, factor: float) -> str:
+    """Variances as a channel states them, multiplied."""
+    return ",".join(repr(float(each) * factor) for each in stated.split(","))
 
 
 def renumbered(field: str, first: int, second: int) -> Alteration:

@@ -17,6 +17,7 @@ from recorders.log.planes import EXAMPLE, is_planar, origin_of, stated_in
 from replay.engine.streams.sources import LogSource, MemorySource
 
 AXES = "xyz"
+STATED = "covariance_rad2"  # by a channel of orientations: their variances
 ALL_TOPICS = "/*"
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
 WHATS = {
@@ -24,8 +25,12 @@ WHATS = {
     "clock_gain": "The clock of the stamps gains so many s a second from the run's begin on.",
     "FIELD_scale": "The field is multiplied by it; covariance_scale is a factor of variances.",
     "FIELD_bias": "The field is too large by it, and is reduced by it.",
+    "FIELD_drift": "The field is too large by it for every s since the run's begin, and is reduced so.",
+    "FIELD_axes": "The order of the vector's entries: yx, where x and y are exchanged.",
     "FIELD_turn": "The vector is turned about the vertical by this angle (rad), and is turned back.",
-    "heading_bias": "The heading of a Gaussian estimate, such as a prior, is too large by it (rad).",
+    "heading_bias": "The heading of orientations, or of a prior, is too large by it (rad); they have "
+    "heading_scale and heading_drift as well.",
+    "heading_convention": "north, where headings of orientations are a compass's, clockwise from there.",
     "origin": "Of geodetic fixes the origin of the plane: latitude and longitude in deg, altitude in m. "
     "Of positions where their zero lies in the plane, in m: it is added.",
     "plane": "Of positions and states the origin of their plane, which counts as stated: latitude and "
@@ -80,7 +85,7 @@ class Change:
         first_ns: where the run begins, from which a clock drifts.
         columns: what is done to its columns, in turn.
         metadata: what is stated of it beside what the log states.
-        gain, delay_ns: its stamps lose `delay_ns`, and `gain` of their time since `first_ns`.
+        gain, delay_ns: its stamps lose `delay_ns`, and what a clock has gained since `first_ns`.
     """
 
     topic: str
@@ -98,12 +103,12 @@ class Change:
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """The stamps (n,) in ns, moved: as `alterations.drifted` and `delayed` undo clock and delay."""
-        lost = self.gain * (stamps_ns - self.first_ns) + self.delay_ns
-        return stamps_ns - np.rint(lost).astype(np.int64)
+        since_ns = (stamps_ns - self.first_ns) * alter.pace(-self.gain) - self.delay_ns
+        return self.first_ns + np.rint(since_ns).astype(np.int64)
 
     def before(self, stamp_ns: int) -> int:
         """A stamp that is moved to this one, but for rounding."""
-        since_ns = (stamp_ns - self.first_ns + self.delay_ns) / (1.0 - self.gain)
+        since_ns = (stamp_ns - self.first_ns + self.delay_ns) * alter.pace(self.gain)
         return self.first_ns + round(since_ns)
 
     def stated(self, topic: Topic) -> Topic:
@@ -195,7 +200,7 @@ def _with(change: Change, given: _Setting) -> Change:
         return replace(change, delay_ns=change.delay_ns + delay_ns)
     if what == "clock_gain":
         gain = given.number("clock_gain", "seconds that the clock gains a second, such as 1e-4")
-        if not gain < 1.0:
+        if not abs(gain) < 1.0:
             raise given.refused("seconds that the clock gains a second, less than 1, such as 1e-4")
         return replace(change, gain=change.gain + gain)
     if what == "origin":
@@ -204,16 +209,44 @@ def _with(change: Change, given: _Setting) -> Change:
         return _plane(change, given)
     if what == "exchanged":
         return _exchange(change, given)
-    return replace(change, columns=(*change.columns, _of_column(given)))
+    own = change.metadata.get(STATED, given.empty.metadata.get(STATED, ""))
+    if what == "covariance_scale" and own and "covariance" not in given.empty.columns:
+        factor = given.number("scale", "a positive factor of variances, such as 4")
+        if factor <= 0.0:
+            raise given.refused("a positive factor of variances, such as 4")
+        return replace(change, metadata={**change.metadata, STATED: alter.spread_variances(own, factor)})
+    return replace(change, columns=(*change.columns, _of_column(given, change.first_ns)))
 
 
-def _of_column(given: _Setting) -> Callable[[Stream], Stream]:
-    """What is done to a field."""
-    name, _, what = given.what.rpartition("_")
-    if given.what == "heading_bias" and "quaternion" in given.empty.metadata.get("kinds", ""):
+def _of_heading(given: _Setting, first_ns: int) -> Callable[[Stream], Stream] | None:
+    """What is done to the headings of orientations, or of a Gaussian estimate; None for all else."""
+    has_field = "quaternion" in given.empty.columns
+    if given.what == "heading_bias" and (
+        has_field or "quaternion" in given.empty.metadata.get("kinds", "")
+    ):
         angle = given.number("heading_rad", "an angle in rad, such as 0.1 or 5 deg")
         return partial(alter.heading_turned, angle=-angle)
-    if not name or what not in ("scale", "bias", "turn"):
+    if not has_field:
+        return None
+    if given.what == "heading_scale":
+        return partial(alter.heading_multiplied, factor=given.number("scale", "a factor, such as -1"))
+    if given.what == "heading_drift":
+        rate = given.number("heading_radps", "a turn rate in rad/s, such as 1e-4")
+        return partial(_by, alter.heading_ramped(first_ns), -rate)
+    if given.what == "heading_convention":
+        if str(given.value) != "north":
+            raise given.refused("north, from where headings are clockwise")
+        return partial(_by, alter.heading_from_north, 0.0)
+    return None
+
+
+def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
+    """What is done to a field."""
+    name, _, what = given.what.rpartition("_")
+    of_heading = _of_heading(given, first_ns)
+    if of_heading is not None:
+        return of_heading
+    if not name or what not in ("scale", "bias", "drift", "axes", "turn"):
         known = f"of a topic can be set {', '.join(WHATS)}"
         raise BadInput(f"--set {given.key}: {known}; {choices(given.what, list(WHATS))}")
     full, (field_, entry) = _field(given, name)
@@ -225,10 +258,25 @@ def _of_column(given: _Setting) -> Callable[[Stream], Stream]:
     if what == "bias":
         unit = f" in {unit_of(full)}" if unit_of(full) else ""
         return partial(_by, alter.shifted(field_, entry), -given.number(full, f"a number{unit}"))
+    if what == "drift":
+        unit = f" in {unit_of(full)} a second" if unit_of(full) else ""
+        rate = given.number("drift", f"a number{unit}")
+        return partial(_by, alter.ramped(first_ns, field_, entry), -rate)
+    if what == "axes":
+        return partial(_by, alter.permuted(field_, _order(given, field_)), 0.0)
     if entry is not None or not field_.startswith(("position", "velocity")):
         raise BadInput(f"--set {given.key}: only positions and velocities are turned, as position_turn")
     angle = given.number("turn_rad", "an angle in rad, such as 0.1 or 5 deg")
     return partial(_by, alter.turned(field_), -angle)
+
+
+def _order(given: _Setting, field_: str) -> list[int]:
+    """The order that axes are to have."""
+    text = str(given.value)
+    order = [AXES.find(each) for each in text]
+    if sorted(order) != list(range(len(order))) or len(order) < 2:
+        raise given.refused(f"the order of the entries of {field_}, such as yx or yxz")
+    return order
 
 
 def _by(alteration: alter.Alteration, value: float, stream: Stream) -> Stream:

@@ -168,6 +168,7 @@ def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) ->
 @click.option("--out", type=RESULT, help="A result folder to write, for fuselog report.")
 @click.option("--save", type=TIMELINE, help="A timeline (.rrd) to write, with the sentences as events.")
 @click.option("--model", help="The model to estimate, where several fit the log.")
+@click.option("--tried", "tells_tried", is_flag=True, help="List what was tried, with what it gains.")
 @recover_option
 @gap_option
 @json_option

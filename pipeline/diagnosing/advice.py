@@ -14,17 +14,24 @@ class Advice(NamedTuple):
         value: of the setting.
         free: the parameter that may be tuned instead.
         otherwise: what may be done instead, in words.
+        more: what is set beside it, by its key.
     """
 
     key: str
     value: float | str
     free: str = ""
     otherwise: str = ""
+    more: tuple[tuple[str, float | str], ...] = ()
+
+    @property
+    def settings(self) -> dict[str, float | str]:
+        """What is set, by its key."""
+        return {self.key: self.value, **dict(self.more)}
 
     @property
     def setting(self) -> str:
-        """The setting as `--set` takes it."""
-        return f"{self.key}={self.value}"
+        """The settings as `--set` takes them, one or several."""
+        return " ".join(f"{key}={value}" for key, value in self.settings.items())
 
 
 @dataclass(frozen=True)
@@ -52,11 +59,12 @@ class Trying:
     def words(self, advice: Advice) -> str:
         """What to type."""
         if self.is_own:
-            line = f"set={json.dumps({advice.key: advice.value})}"
+            line = f"set={json.dumps(advice.settings)}"
             tuning = f'fl.tune(LOG, {{"{self.label}": ...}}, "{advice.free}")'
         else:
-            quoted = f"'{advice.setting}'" if set(advice.setting) & set(" $&;()") else advice.setting
-            line = f"--set {quoted}"
+            given = [f"{key}={value}" for key, value in advice.settings.items()]
+            quoted = [f"'{each}'" if set(each) & set(" $&;()") else each for each in given]
+            line = " ".join(f"--set {each}" for each in quoted)
             tuning = f"fuselog tune LOG -e {self.label} --free {advice.free}"
         instead = tuning if advice.free else advice.otherwise
         return f"{line}, or {instead}" if instead else line

@@ -1,20 +1,34 @@
 """The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from os import cpu_count
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from pipeline.diagnosing.hypotheses import Hypothesis
-from pipeline.diagnosing.likelihood import DROP_95, Gains, Likelihood, Peak, Trial, interval, peak
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from pipeline.diagnosing.hypotheses.listing import hypotheses
+from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.diagnosing.numbers import number
+from pipeline.diagnosing.search import DROP_95, Gains, Peak, interval, peak
 from replay.distributions import chi2
+from replay.engine.replaying.estimator import bind
+from replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
+
+
+SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
+
+
+class Told(NamedTuple):
+    """A number that is told: the component or parameter it is of, and its 95 % interval."""
+
+    part: str
+    value: float
+    low: float
+    high: float
 
 
 class Cause(NamedTuple):
@@ -25,101 +39,226 @@ class Cause(NamedTuple):
         value: by how much.
         ends: of the 95 % interval of that.
         gain: in log-likelihood, after all causes before it.
-        is_rival: whether it is instead of the cause before it, and explains nearly as much.
+        others: causes that explain the log as well, or nearly: it does not tell which of them it is.
     """
 
     hypothesis: Hypothesis
-    value: float
-    ends: tuple[float, float]
+    value: Number
+    ends: tuple[Number, Number]
     gain: float
-    is_rival: bool = False
+    others: tuple["Cause", ...] = ()
+
+    @property
+    def said(self) -> str:
+        """What is wrong, and by how much."""
+        return self.hypothesis.words(self.value, *self.ends)
+
+    @property
+    def numbers(self) -> "list[Told]":
+        """The numbers with their intervals, as they are told: factors, not their logarithms."""
+        of, (low, high) = self.hypothesis, self.ends
+        if not isinstance(self.value, tuple):
+            return [Told(of.part, *(of.told(each) for each in (self.value, low, high)))]
+        names = [of.topic, *of.part.split(", ")]
+        return [Told(*each) for each in zip(names, self.value, low, high, strict=True)]
 
     @property
     def words(self) -> str:
         """What is wrong, by how much, and what that is known by."""
-        said = self.hypothesis.words(self.value, *self.ends)
-        known = f"without this the log-likelihood gains {number(self.gain, 4)}"
-        return f"{'Or instead, nearly as likely: ' if self.is_rival else ''}{said}; {known}"
+        or_else = "".join(
+            f"; or else, which this log does not tell from it, {each.said}" for each in self.others
+        )
+        return f"{self.said}{or_else}; without this the log-likelihood gains {number(self.gain, 4)}"
 
 
-def least_gain(count: int) -> float:
+class Tried(NamedTuple):
+    """A hypothesis that was tried on the log as it is, and the greatest gain that was found."""
+
+    hypothesis: Hypothesis
+    at: Peak
+
+    @property
+    def row(self) -> tuple[str, str, str, str, float]:
+        """Its kind, topic and part; the number, or numbers, that gain most; and that gain."""
+        of, at = self.hypothesis, self.at.value
+        values = at if isinstance(at, tuple) else (of.told(at),)
+        return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
+
+
+def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
+    """A row per hypothesis, the one that gains most first, less what its numbers cost."""
+    ranked = sorted(tried, key=lambda each: -each.at.score(each.hypothesis))
+    names = ("kind", "topic", "part", "value", "gain")
+    return pd.DataFrame([each.row for each in ranked], columns=names)
+
+
+def least_gain(count: int, size: int = 1) -> float:
     """What the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
 
-    Twice the gain is chi-square of one degree of freedom (Wilks), shared among them (Bonferroni).
+    Twice the gain is chi-square with as many degrees of freedom as there are numbers (Wilks), shared
+    among them (Bonferroni).
     """
-    return float(chi2.isf(FALSE_ALARMS / max(count, 1), 1)) / 2.0
+    return float(chi2.isf(FALSE_ALARMS / max(count, 1), size)) / 2.0
 
 
 def find_causes(
     likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
-) -> list[Cause]:
-    """At most so many causes, the likeliest first: each gains most after all before it are undone."""
-    least, found = least_gain(len(tried)), list[Cause]()
+) -> tuple[list[Cause], list[Tried]]:
+    """At most so many causes, the likeliest first, and what each hypothesis gains of the log as it is.
+
+    Each gains most after all before it are undone: most in log-likelihood less what its numbers cost.
+    """
+    found, listed = list[Cause](), list[Tried]()
     candidates, now = list(tried), base
     while candidates and len(found) < most:
-        gains_of = _gains(likelihood, now, candidates)
-        with ThreadPoolExecutor(cpu_count()) as threads:
-            peaks = list(threads.map(partial(_peak, gains_of, least), candidates))
+        peaks, gains = _peaks(likelihood, now, candidates, len(tried))
+        listed = listed or [Tried(each, at) for each, at in zip(candidates, peaks, strict=True)]
         ranked = sorted(
             (
                 (at, each)
                 for at, each in zip(peaks, candidates, strict=True)
-                if at.gain > least and not _is_at_end(gains_of(each), at, each)
+                if _is_named(at, each, len(tried)) and not _is_at_end(gains(each), at, each)
             ),
-            key=lambda pair: -pair[0].gain,
+            key=lambda pair: -pair[0].score(pair[1]),
         )
         if not ranked:
             break
-        (best, first), *others = ranked
-        found.append(_cause(gains_of(first), best, first))
-        found += [
-            _cause(gains_of(each), at, each)._replace(is_rival=True)
-            for at, each in others
-            if at.gain > best.gain - RIVAL
+        first = ranked[0]
+        least = first[0].score(first[1]) - RIVAL
+        alike = [
+            pair for pair in ranked if pair[0].score(pair[1]) > least or _is_other_name(pair, first)
         ]
-        now = first.without(now, best.value)
-        candidates = [each for at, each in others if at.gain <= best.gain - RIVAL]
-    return found[:most]
+        alike.sort(key=_is_early)
+        causes = [_cause(gains(each), at, each) for at, each in alike]
+        found.append(causes[0]._replace(others=tuple(causes[1:])))
+        now = causes[0].hypothesis.without(now, causes[0].value)
+        gone = {id(each) for _, each in alike}
+        candidates = [each for each in candidates if id(each) not in gone]
+    return found, listed
 
 
-def _gains(
-    likelihood: Likelihood, now: Trial, candidates: Sequence[Hypothesis]
-) -> Callable[[Hypothesis], Gains]:
-    """For a hypothesis the gains of its number over a trial; the first of all are replayed at once."""
-    asked = [(each, value) for each in candidates for value in each.tried[:2]]
-    before, *after = likelihood([now, *(each.without(now, value) for each, value in asked)])
-    known = {
-        (id(each), value): found - before for (each, value), found in zip(asked, after, strict=True)
-    }
+def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:
+    """Whether a topic is late by as much as the likeliest cause has another early.
+
+    These are one fault but for what is at the ends of the log.
+    """
+    (at, of), (best, early) = pair, first
+    if not _is_early(first) or of.kind != early.kind or of.topic == early.topic:
+        return False
+    return abs(at.value + best.value) < SAME_SIZE * abs(best.value) and at.gain > SAME_GAIN * best.gain
+
+
+def _is_early(pair: tuple[Peak, Hypothesis]) -> bool:
+    """Whether it is the less usual name of a fault: one topic is late, or all others are early."""
+    at, of = pair
+    return of.kind in ("delay", "clock drift") and isinstance(at.value, float) and at.value < 0.0
+
+
+def _peaks(
+    likelihood: Likelihood, now: Trial, candidates: Sequence[Hypothesis], count: int
+) -> tuple[list[Peak], Callable[[Hypothesis], Gains]]:
+    """The greatest gain of each over a trial, and the gains of any; all are searched side by side."""
+    [before] = likelihood([now])
+    greatest = 0.0
+
+    def gains_of(asked: Sequence[tuple[Hypothesis, Number]]) -> list[float]:
+        return [found - before for found in likelihood([each.without(now, at) for each, at in asked])]
 
     def of(each: Hypothesis) -> Gains:
-        def gains(values: Sequence[float]) -> list[float]:
-            if all((id(each), value) in known for value in values):
-                return [known[id(each), value] for value in values]
-            return [
-                found - before for found in likelihood([each.without(now, value) for value in values])
-            ]
+        return lambda values: gains_of([(each, value) for value in values])
 
-        return gains
+    searches = [peak(each, least_gain(count, each.size), lambda: greatest) for each in candidates]
+    asked = {place: list(next(search)) for place, search in enumerate(searches)}
+    peaks: dict[int, Peak] = {}
+    while asked:
+        found = iter(gains_of([(candidates[place], at) for place, each in asked.items() for at in each]))
+        answers = {place: [next(found) for _ in each] for place, each in asked.items()}
+        greatest = max([greatest, *(gain for each in answers.values() for gain in each)])
+        asked = {}
+        for place, answer in answers.items():
+            try:
+                asked[place] = list(searches[place].send(answer))
+            except StopIteration as end:
+                peaks[place] = end.value
+    return [peaks[place] for place in range(len(candidates))], of
 
-    return of
 
-
-def _peak(gains_of: Callable[[Hypothesis], Gains], least: float, tried: Hypothesis) -> Peak:
-    return peak(gains_of(tried), tried.tried, tried.limit, least)
+def _is_named(at: Peak, of: Hypothesis, count: int) -> bool:
+    """Whether chance does not explain the gain, and the number is a fault's."""
+    is_small = isinstance(at.value, float) and abs(at.value) <= of.floor
+    return at.gain > least_gain(count, of.size) and at.score(of) > 0.0 and not is_small
 
 
 def _is_at_end(gains: Gains, at: Peak, of: Hypothesis) -> bool:
     """Whether the number may as well be the last that is searched: its 95 % go on beyond."""
-    if not of.has_end:
+    if not of.has_end or at.is_special:
         return False
     [last] = gains([float(np.copysign(of.limit, at.value))])
     return last > at.gain - DROP_95
 
 
 def _cause(gains: Gains, at: Peak, of: Hypothesis) -> Cause:
-    if len(of.tried) == 1:  # it is, or is not
+    """The cause with the interval of its number."""
+    if not of.tried:  # it is, or is not
         return Cause(of, at.value, (at.value, at.value), at.gain)
+    if of.size > 1:
+        return Cause(of, at.value, _intervals(gains, at, of), at.gain)
     # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
-    scale = abs(at.value) * min(1.0, (2.0 / at.gain) ** 0.5)
+    scale = abs(float(np.max(at.value))) * min(1.0, (2.0 / at.gain) ** 0.5)
     return Cause(of, at.value, interval(gains, at, scale), at.gain)
+
+
+def _intervals(gains: Gains, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
+    """The 95 % intervals of several numbers, by the curvature of the gain at its greatest."""
+    values, steps = np.array(at.value), np.array(of.tried[0])
+    units = np.diag(steps)
+    pairs = [(row, column) for row in range(of.size) for column in range(row + 1)]
+    asked = [
+        values + a * units[row] + b * units[column]
+        for row, column in pairs
+        for a in (1, -1)
+        for b in (1, -1)
+    ]
+    found = np.array(gains([tuple(map(float, each)) for each in asked])).reshape(-1, 4)
+    bend = np.zeros((of.size, of.size))
+    for (row, column), (both, one, other, none) in zip(pairs, found, strict=True):
+        bend[row, column] = bend[column, row] = 0.25 * (both - one - other + none)
+    spread = 1.96 * np.sqrt(np.abs(np.diag(np.linalg.pinv(-bend)))) * steps
+    return tuple(map(float, values - spread)), tuple(map(float, values + spread))
+
+
+class Sought(NamedTuple):
+    """What was found.
+
+    Attributes:
+        causes: the likeliest first.
+        tried: every hypothesis, with what it gains of the log as it is.
+        log_likelihood: of the log as it is; NaN where its innovations have none, and nothing is tried.
+    """
+
+    causes: Sequence[Cause]
+    tried: Sequence[Tried]
+    log_likelihood: float
+
+
+def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: int) -> Sought:
+    """Find the likeliest causes.
+
+    Args:
+        source: the log.
+        label: the estimator's.
+        settings: its parameters with its `kind`; the gate is open.
+        most: how many causes at most.
+
+    Raises BadInput where the estimator cannot be replayed.
+    """
+    likelihood, base = Likelihood(label), Trial(source, settings)
+    seen = likelihood.begin(base)
+    [before] = likelihood([base])
+    if not np.isfinite(before):
+        return Sought([], [], np.nan)
+    bound = bind(label, [source], settings)
+    causes, tried = find_causes(
+        likelihood, base, hypotheses(bound, base, seen, likelihood.readings), most
+    )
+    return Sought(causes, tried, before)

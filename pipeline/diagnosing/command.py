@@ -27,6 +27,7 @@ def diagnose_log(
     recover: bool,
     gap_limit_s: float,
     as_json: bool,
+    tells_tried: bool,
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
@@ -65,6 +66,7 @@ def diagnose_log(
                 "found": found.told,
                 "hypotheses": found.hypotheses,
                 "least_gain": found.least_gain if found.hypotheses else None,
+                "tried": found.tried.replace({np.nan: None}).to_dict("records"),
                 "sentences": found.causes.replace({np.nan: None}).to_dict("records"),
                 "components": found.components.replace({np.nan: None}).to_dict("records"),
                 "notes": list(found.notes),
@@ -87,5 +89,17 @@ def diagnose_log(
             for row in found.components.to_dict("records")
         ],
     )
+    if tells_tried:
+        print_table(
+            ("fault", "value", "gain"),
+            [
+                [
+                    " ".join(filter(None, (row["kind"], row["topic"], row["part"]))),
+                    row["value"],
+                    row["gain"],
+                ]
+                for row in found.tried.to_dict("records")
+            ],
+        )
     for sentence in [*found.told, *found.notes, *written]:
         say(sentence)

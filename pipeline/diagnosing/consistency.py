@@ -1,23 +1,28 @@
 """Whether NIS and NEES are those of a consistent filter, whatever the cause."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
 from pipeline.api.replays import Replay
 from pipeline.diagnosing.findings import Finding
 from pipeline.output.results import MetricValue, split_metric
-from recorders.log import Stream
+from recorders.log import Stream, schemas
+from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.consistency.consistency import CONSISTENT
 from replay.judging.consistency.whiteness import whitened
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 from replay.judging.metrics.measuring import metric_key
 
+SAME = 0.9  # of the messages: a truth that equals as many of what the filter used is the same
 SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
 
 
-def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
-    """Find errors that innovations do not see."""
+def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
+    """Find errors that innovations do not see, which causes that were found may explain or not."""
+    mend = "let a bias be estimated, or see fuselog observability LOG"
+    if has_causes:
+        mend = "mend what is said above, and look whether it is still so"
     metrics = done.judge.metrics
     for key, (_, high) in done.judge.bounds.items():
         _, quantity, case = split_metric(key)
@@ -29,14 +34,41 @@ def unseen_errors(done: Replay, label: str) -> Iterator[Finding]:
                 _truth(case),
                 f"{case or 'the estimate'}: NEES is {value:.3g}, if consistent up to {high:.3g}, "
                 f"and NIS only {nis:.3g} per component: the innovations do not see an error that "
-                "the state follows; let a bias be estimated, or see fuselog observability LOG",
+                f"the state follows; {mend}",
             )
 
 
-def unnamed(done: Replay, innovations: Mapping[str, Stream], tried: int) -> Iterator[Finding]:
+def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) -> dict[str, str]:
+    """Find truths that are the very positions that the filter used, with a sentence on each."""
+    said = {}
+    for topic, about in source.topics.items():
+        if about.schema_name != schemas.TRUTH_STATE.full_name or topic.startswith("/estimates/"):
+            continue
+        truth = source.read([topic])[topic]
+        columns = [truth.components.index(name) for name in ("x_m", "y_m") if name in truth.components]
+        for used in streamed if len(columns) == 2 else ():
+            stream = source.read([used])[used]
+            if "position_m" not in stream.columns or not len(stream):
+                continue
+            _, here, there = np.intersect1d(
+                stream.publish_time_ns, truth.publish_time_ns, return_indices=True
+            )
+            apart = np.abs(stream["position_m"][here, :2] - truth["state"][there][:, columns])
+            if len(here) >= SAME * len(stream) and np.mean((apart < 1e-6).all(axis=1)) >= SAME:
+                said[topic] = (
+                    f"{topic} is what {used} says, which the filter used: it is no judge of errors and "
+                    "NEES; give a reference of its own"
+                )
+    return said
+
+
+def unnamed(
+    done: Replay, innovations: Mapping[str, Stream], tried: int, no_judges: Collection[str]
+) -> Iterator[Finding]:
     """Find NIS and NEES outside of where a consistent filter has them in CONSISTENT of all logs.
 
-    NIS is of all innovations, those that a gate keeps out too. Errors hang together over a run, so that
+    NIS is of all innovations, those that a gate keeps out too; truths that are `no_judges` do not count.
+    Errors hang together over a run, so that
     the mean of NEES has the interval of a single step.
     """
     faults = f"none of {tried} faults that were tried explains it" if tried else "no fault was tried"
@@ -60,7 +92,7 @@ def unnamed(done: Replay, innovations: Mapping[str, Stream], tried: int) -> Iter
     for key, (low, high) in done.judge.intervals(CONSISTENT).items():
         _, quantity, case = split_metric(key)
         value = metrics[key]
-        if quantity == "nees" and not low <= value <= high:
+        if quantity == "nees" and not low <= value <= high and _truth(case) not in no_judges:
             evidence = (
                 f"NEES is {value:.3g}, where a consistent filter is within {low:.3g} and {high:.3g}"
             )

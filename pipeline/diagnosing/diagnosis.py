@@ -5,9 +5,9 @@ noise is stated too small makes the range's innovations too large as well.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,36 +19,37 @@ from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Trying
-from pipeline.diagnosing.causes import Cause, find_causes, least_gain
-from pipeline.diagnosing.consistency import unnamed, unseen_errors
+from pipeline.diagnosing.causes import Cause, Told, Tried, least_gain, seek, tried_table
+from pipeline.diagnosing.consistency import judged_by_itself, unnamed, unseen_errors
 from pipeline.diagnosing.findings import (
+    FIRST,
     Finding,
     component_table,
     of_estimates,
     of_innovations,
     of_messages,
 )
-from pipeline.diagnosing.hypotheses import Kind, hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.diagnosing.outputs import Outputs
+from pipeline.diagnosing.portion import first_part, on_the_rest
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
 from pipeline.runs.estimates import source_of_estimates, stated_estimators
+from pipeline.tuning.measured import until_last_measured
 from recorders.errors import BadInput, choices
-from recorders.log import RunMetadata, Stream, schemas
-from recorders.log.streams import concatenate
+from recorders.log import Stream, schemas
 from recorders.parameters import merge
-from replay.engine.replaying.estimator import Bound, Estimator, bind
+from replay.engine.replaying.estimator import Estimator, bind
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.foreign.naming import allowed, of_file, refuse_programs
 from replay.judging.errors.evaluation import split_topic
 
 MOST_SENTENCES = 5
-MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
+CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
 PROFILE_BINS = 60
@@ -78,7 +79,9 @@ class Diagnosis:
         replay: the log replayed with it, as it is set.
         sentences: what is wrong, at most five, the likeliest cause first.
         components: a row per measured component; see `component_table`.
-        hypotheses: how many causes were tried, and `least_gain` what the least of those named gains.
+        tried: a row per fault that was tried on the log as it is, the one that gains most first: kind,
+            topic, part, value, gain.
+        least_gain: what the least gains of those that are named.
         notes: what one has to know of the diagnosis.
         log_likelihood: of all measurements that causes were sought by, with an open gate; or NaN.
     """
@@ -87,13 +90,18 @@ class Diagnosis:
     replay: Replay
     sentences: Sequence[Sentence]
     components: pd.DataFrame
-    hypotheses: int
+    tried: pd.DataFrame
     least_gain: float
     notes: Sequence[str]
     log_likelihood: float
 
     def __repr__(self) -> str:
         return "\n".join([f"{self.label} over {self.replay.logs[0].name}", *self.told, *self.notes])
+
+    @property
+    def hypotheses(self) -> int:
+        """How many faults were tried."""
+        return len(self.tried)
 
     @property
     def told(self) -> list[str]:
@@ -105,23 +113,29 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """A row per sentence: its kind, topic and component, number with its interval, gain, setting."""
+        """A row per sentence, or per number of it: kind, topic, part, interval, gain, setting.
+
+        What the log does not tell from a cause has the same number in the column `sentence_number`.
+        """
         rows = []
-        for each in self.sentences:
-            cause = each.cause
-            rows.append(
-                {
-                    "kind": each.kind,
-                    "topic": each.topic,
-                    "part": cause.hypothesis.part if cause else "",
-                    "value": cause.value if cause else np.nan,
-                    "low": cause.ends[0] if cause else np.nan,
-                    "high": cause.ends[1] if cause else np.nan,
-                    "gain": cause.gain if cause else np.nan,
-                    "setting": each.setting,
-                    "sentence": each.words,
-                }
-            )
+        for order, each in enumerate(self.sentences, start=1):
+            told = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
+            nothing = [Told("", np.nan, np.nan, np.nan)]
+            alike = (each.cause, *each.cause.others) if each.cause else ()
+            for cause in alike or (None,):
+                about = cause.hypothesis if cause else None
+                own = {"kind": about.kind, "topic": about.topic} if about else {}
+                for part in cause.numbers if cause else nothing:
+                    rows.append(
+                        {
+                            **told,
+                            **own,
+                            **part._asdict(),
+                            "gain": cause.gain if cause else np.nan,
+                            "setting": each.setting if cause is each.cause else "",
+                            "sentence": each.words,
+                        }
+                    )
         return pd.DataFrame(rows)
 
     @property
@@ -260,6 +274,8 @@ def diagnose(
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
     settings = merge(own, allowed(given))
+    bound = bind(label, [source], {"kind": label, **settings})
+    source = until_last_measured(source, bound)
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
         raise BadInput(f"{done.failures[0]}; solve that first")
@@ -269,47 +285,54 @@ def diagnose(
             f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
             "filter of the same model, such as -e ekf"
         )
-    bound = bind(label, [source], {"kind": label, **settings})
-    gate = float(getattr(bound[0].parameters, "gate_probability", 1.0))
+    gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes = []
-    causes: list[Cause] = []
-    tried, least, likely = 0, np.inf, np.nan
-    if innovations.state("log_likelihood"):
-        opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
-        likelihood = Likelihood(label)
-        part, note = _first_part(source, bound, streamed)
-        notes += note
-        base = Trial(part, opened)
-        alternatives = hypotheses(bound, base, likelihood.begin(base))
-        [likely] = likelihood([base])
-        causes = find_causes(likelihood, base, alternatives, MOST_SENTENCES)
-        tried, least = len(alternatives), least_gain(len(alternatives))
-    else:
+    causes: Sequence[Cause] = []
+    tried: Sequence[Tried] = []
+    least, likely, end_ns = np.inf, np.nan, None
+    opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
+    has_likelihood = innovations.state("log_likelihood")
+    if has_likelihood:
+        part, end_ns, note = first_part(source, bound, streamed)
+        notes += [note] if note else []
+        causes, tried, likely = seek(part, label, opened, MOST_SENTENCES)
+        least = least_gain(len(tried))
+        has_likelihood = bool(np.isfinite(likely))
+    if not has_likelihood:
         notes.append(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
         )
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
-    sentences = [_sentence(each, trying) for each in causes]
+    of_log = list(of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns))
+    of_stamps = [each for each in of_log if each.kind in FIRST]
+    rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
+    sentences = [Sentence(*each) for each in of_stamps]
+    sentences += [_sentence(each, trying, of_stamps, rest) for each in causes]
+    no_judges = judged_by_itself(source, streamed)
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
-        *of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns),
+        *(each for each in of_log if each.kind not in FIRST),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
-        *(unseen_errors(done, label) if not causes else []),
+        *(
+            each
+            for each in unseen_errors(done, label, has_causes=bool(causes))
+            if each.topic not in no_judges
+        ),
     ]
     if not causes and not findings:
-        findings += unnamed(done, innovations, tried)
+        findings += unnamed(done, innovations, len(tried), no_judges)
     sentences += [Sentence(*each) for each in findings]
     return Diagnosis(
         label,
         done,
         sentences[:MOST_SENTENCES],
         component_table(innovations),
-        tried,
+        tried_table(tried),
         least,
-        [*notes, *_notes(done, sentences)],
+        [*notes, *no_judges.values(), *_notes(done, sentences)],
         likely,
     )
 
@@ -338,46 +361,26 @@ def _asked(
     return source, chosen
 
 
-def _first_part(
-    source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
-) -> tuple[MemorySource, list[str]]:
-    """What the estimator reads of a log, of a long one its first MOST_MESSAGES, in memory."""
-    whole = dict.fromkeys(topic for each in bound for topic in each.static)
-    streams = source.read([topic for topic in whole if topic in source.topics])
-    parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
-    stamps_ns = np.empty(0, np.int64)
-    for block in source.blocks(streamed, "publish_time", MOST_MESSAGES):
-        for topic, stream in block.items():
-            parts[topic].append(stream)
-        stamps_ns = np.concatenate([stamps_ns, *(stream.publish_time_ns for stream in block.values())])
-        if len(stamps_ns) > MOST_MESSAGES:
-            break
-    for topic, found in parts.items():
-        streams[topic] = concatenate(found) if found else source.empty(topic)
-    notes = []
-    if len(stamps_ns) > MOST_MESSAGES:
-        end_ns = np.partition(stamps_ns, MOST_MESSAGES)[MOST_MESSAGES]
-        for topic in streamed:
-            streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
-        count = sum(source.topics[topic].messages for topic in streamed)
-        notes.append(
-            f"causes were sought in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
-            f"{MOST_MESSAGES} of {count} messages; all else is of the whole log. For another "
-            "part: fuselog cut"
-        )
-    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    return MemorySource(streams, run, source.name), notes
+def _sentence(
+    cause: Cause,
+    trying: Trying,
+    before: Sequence[Finding],
+    rest: Callable[[Mapping[str, Any]], str] | None,
+) -> Sentence:
+    """A cause, what to try against it, and whether that is good for the rest of a long log.
 
-
-def _sentence(cause: Cause, trying: Trying) -> Sentence:
-    of = cause.hypothesis
+    `before` is what was found in the stamps, of which a cause may be a consequence.
+    """
+    of, words = cause.hypothesis, cause.words
     mend = of.mend(cause.value)
     if mend is None:
-        return Sentence(
-            of.kind, of.topic, f"{cause.words}; the gate that is set keeps these out", None, cause
-        )
+        words += "; the gate that is set keeps these out"
+        return Sentence(of.kind, of.topic, words, None, cause)
     advice = trying.over(mend)
-    words = f"{cause.words}; try {trying.words(advice)}"
+    words += rest(mend.settings) if rest is not None else ""
+    if before and of.kind in CONSEQUENCES:
+        words += f"; this may be a consequence of what is wrong with the stamps of {before[0].topic}"
+    words += f"; try {trying.words(advice)}"
     return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
 
 

@@ -11,13 +11,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
-from pipeline.diagnosing.hypotheses import Kind
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
 from replay.distributions import chi2
 from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
 
 Floats = NDArray[np.float64]
+FIRST = ("lost messages", "stamps")  # what stands before causes: it is seen without any filter
 TAIL = 3.0  # standard deviations
 IMPROBABLE = 1e-4
 WINDOW = 30  # innovations, over which NIS is averaged to see a filter diverge
@@ -161,7 +162,8 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
     stamps_ns = np.unique(stream.publish_time_ns)
     steps = np.diff(stamps_ns)
     if len(steps) >= FEWEST:
-        usual = float(np.median(steps))
+        least = float(np.quantile(steps, 0.1))
+        usual = float(np.median(steps[steps < 1.5 * least]))  # also where half of the messages are lost
         multiples = np.rint(steps / usual)
         is_regular = np.abs(steps / usual - multiples) < 0.2
         gaps = np.flatnonzero(is_regular & (multiples > 1))

@@ -1,5 +1,9 @@
 """What other settings, or a log without a fault, would gain: the log-likelihood of replays.
 
+All trials have the same measurements, and begin by the same rule. What a trial does not score, such
+as a fix that a delay moves out of the odometry's span, has the likelihood of a broad model: the next
+message is as far from the last as messages of its topic usually are.
+
 A measurement that the gate keeps out is an outlier: it may be anywhere in the volume that the
 innovations span, and is one with the share that they have. Without a gate there are none, and the
 log-likelihood is that of the filter. Bar-Shalom, Li and Kirubarajan, Estimation with Applications to
@@ -7,34 +11,62 @@ Tracking and Navigation, 2001, section 5.4; Durbin and Koopman, Time Series Anal
 Methods, 2nd ed. 2012, chapter 7.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq, minimize_scalar
 
-from pipeline.tuning.broad_starts import Starts, begun_at, broad_starts, mean_likelihood, part_count
+from pipeline.tuning.broad_starts import (
+    Starts,
+    begun_at,
+    begun_broadly,
+    broad_starts,
+    mean_likelihood,
+    part_count,
+)
 from recorders.errors import BadInput
 from recorders.log import Stream, schemas
-from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.estimator import Bound, Reading, Recursive, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import Ensemble, MemorySource
 
 Floats = NDArray[np.float64]
-Gains = Callable[[Sequence[float]], Sequence[float]]  # of the values of one number
-DROP_95 = 1.92  # of the log-likelihood, from its greatest to where 95 % of a parameter end
-EVALUATIONS = 16  # of a refinement at most
-DOUBLINGS = 12  # of the way to an end
-LARGEST = 1e12  # a loss, of what cannot be used
+MOST_MESSAGES = 300_000  # of the runs that are replayed together
+EVER_NS = 2**62
+ROOM_NS = 86_400 * 10**9  # before the first stamp
+LEAST_SCORED = 0.5  # of the measurements: a trial that scores fewer is of another log
 
 
 class Trial(NamedTuple):
-    """A run as it may be, and the estimator's settings as they may be."""
+    """A run as it may be, and the estimator's settings as they may be.
+
+    `stretched` is by topic the logarithm of how many times larger the volumes are in which a message's
+    measurement lies, compared with the log's: a density of numbers in other units is another one.
+    """
 
     source: MemorySource
     settings: Mapping[str, Any]
+    stretched: Mapping[str, float] = {}
+
+
+class Scored(NamedTuple):
+    """The part of a trial that a filter can score.
+
+    Attributes:
+        source: its messages.
+        begin_ns: where the filter begins if no prior says so.
+        left: by estimate, what the broad model says of the others.
+        beyond: by estimate, how many these are.
+        stretch: by estimate, what is added since measurements are in other units than the log's.
+    """
+
+    source: MemorySource
+    begin_ns: int
+    left: Mapping[str, float]
+    beyond: Mapping[str, int]
+    stretch: Mapping[str, float]
 
 
 @dataclass
@@ -47,14 +79,20 @@ class Likelihood:
         label: the estimator's.
         volumes: by topic, the extents (m,) of the innovations' components, of which outliers may lie
             anywhere.
-        count: how many innovations all trials have; another number cannot be compared.
-        starts: where all trials begin, where the log does not state it.
+        count: by estimate, how many innovations there are with those that the broad model has.
+        starts: where all trials begin, where neither the log states it nor broad starts are found.
+        readings: by estimate, what is read; those that are known.
+        broad: by topic, the mean log-likelihood of a message by the broad model.
+        later_ns: by how much all stamps are later, so that what is moved is never before 1970.
     """
 
     label: str
     volumes: Mapping[str, Floats] = field(default_factory=dict)
-    count: int = 0
+    count: Mapping[str, int] = field(default_factory=dict)
     starts: Starts = field(default_factory=dict)
+    readings: Mapping[str, Reading] = field(default_factory=dict)
+    broad: Mapping[str, float] = field(default_factory=dict)
+    later_ns: int = 0
     _bound: dict[str, list[Bound]] = field(default_factory=dict)
 
     def begin(self, trial: Trial) -> dict[str, Stream]:
@@ -63,10 +101,28 @@ class Likelihood:
         From the likeliest part of broad starts, where the log does not state one. Raises BadInput where
         the estimator cannot begin.
         """
-        self.starts = broad_starts(trial.source, bind(self.label, [trial.source], trial.settings))
-        [parts] = self._innovations([trial])
-        self.count = max(sum(map(len, part.values())) for part in parts)
+        bound = bind(self.label, [trial.source], trial.settings)
+        self.later_ns = max(0, ROOM_NS - trial.source.extent("publish_time")[0])
+        later = {topic: _later(each, self.later_ns) for topic, each in trial.source.streams.items()}
+        self.starts = broad_starts(replace(trial.source, streams=later), bound)
+        self.readings = {
+            each.name: each.reading()
+            for each in bound
+            if isinstance(each, Recursive) and each.reading is not None
+        }
+        self.broad = {
+            topic: _broad(reading.numbers(trial.source.streams[topic]), kinds)
+            for reading in self.readings.values()
+            for topic, kinds in reading.kinds.items()
+            if topic not in reading.controls and len(trial.source.streams[topic])
+        }
+        scored = self._scored(trial, bound)
+        [parts] = self._innovations([trial], [scored])
         found = max(parts, key=_stated)
+        self.count = {
+            name: max(len(part.get(_topic(name), ())) for part in parts) + scored.beyond.get(name, 0)
+            for name in (each.name for each in bound)
+        }
         self.volumes = {topic: _extents(stream) for topic, stream in found.items()}
         return found
 
@@ -76,21 +132,75 @@ class Likelihood:
         for place, trial in enumerate(trials):
             together.setdefault(_key(trial), []).append(place)
         found = [-np.inf] * len(trials)
-        for places in together.values():
-            outputs = self._innovations([trials[place] for place in places])
-            for place, of_run in zip(places, outputs, strict=True):
-                found[place] = self._total(of_run)
+        for places in (part for each in together.values() for part in self._parts(trials, each)):
+            of_key = [trials[place] for place in places]
+            try:
+                bound = self._bound_to(of_key[0])
+            except BadInput:  # no run can be followed with these
+                continue
+            scored = [self._scored(trial, bound) for trial in of_key]
+            outputs = self._innovations(of_key, scored)
+            for place, part, of_run in zip(places, scored, outputs, strict=True):
+                found[place] = self._total(part, of_run)
         return found
 
-    def _innovations(self, trials: Sequence[Trial]) -> list[list[dict[str, Stream]]]:
+    def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
+        """Trials in portions that memory holds."""
+        messages = sum(map(len, trials[places[0]].source.streams.values())) * part_count(self.starts)
+        size = max(1, MOST_MESSAGES // max(messages, 1))
+        return (places[first : first + size] for first in range(0, len(places), size))
+
+    def _bound_to(self, trial: Trial) -> list[Bound]:
+        key = _key(trial)
+        if key not in self._bound:
+            self._bound[key] = bind(self.label, [trial.source], trial.settings)
+        return self._bound[key]
+
+    def _scored(self, trial: Trial, bound: Sequence[Bound]) -> Scored:
+        """What of a trial a filter can score: within the span of what drives it, after its prior."""
+        streams = dict(trial.source.streams)
+        left, count, stretch = dict[str, float](), dict[str, int](), dict[str, float]()
+        begins = [np.iinfo(np.int64).max]
+        for each in bound:
+            reading = self.readings.get(each.name)
+            if reading is None:
+                continue
+            begin_ns, end_ns, step_ns = _span(reading.controls, each, trial.source.streams)
+            for topic in each.streams:
+                stream = trial.source.streams[topic]
+                if topic not in reading.controls and len(stream):
+                    stamps_ns = stream.publish_time_ns
+                    is_in = (stamps_ns >= begin_ns - step_ns) & (stamps_ns <= end_ns + 2 * step_ns)
+                    lost = int(len(stream) - is_in.sum())
+                    if stamps_ns.min() < begin_ns or lost:
+                        inside = stream.take(is_in)
+                        held_ns = np.maximum(inside.publish_time_ns, begin_ns)
+                        streams[topic] = replace(inside, publish_time_ns=held_ns)
+                    left[each.name] = left.get(each.name, 0.0) + lost * self.broad[topic]
+                    count[each.name] = count.get(each.name, 0) + lost
+                    added = trial.stretched.get(topic, 0.0) * int(is_in.sum())
+                    stretch[each.name] = stretch.get(each.name, 0.0) + added
+                begins += streams[topic].publish_time_ns[:1].tolist()
+        if self.later_ns:
+            streams = {topic: _later(stream, self.later_ns) for topic, stream in streams.items()}
+        source = replace(trial.source, streams=streams)
+        return Scored(source, min(begins) + self.later_ns, left, count, stretch)
+
+    def _innovations(
+        self, trials: Sequence[Trial], scored: Sequence[Scored]
+    ) -> list[list[dict[str, Stream]]]:
         """The innovations of trials of equal settings, of each part by topic; none where it fails."""
-        key, count = _key(trials[0]), part_count(self.starts)
-        sources = [trial.source for trial in trials for _ in range(count)]
+        count = part_count(self.starts)
+        sources = [each.source for each in scored for _ in range(count)]
+        begins_ns = [each.begin_ns for each in scored]
         try:
-            if key not in self._bound:
-                bound = bind(self.label, sources[:1], trials[0].settings)
-                self._bound[key] = [begun_at(each, self.starts) for each in bound]
-            outputs = collect(replay(Ensemble(sources), self._bound[key], is_part=True))
+            bound = [
+                begun_broadly(begun_at(each, self.starts), begins_ns, count)
+                if _is_free(each)
+                else begun_at(each, self.starts)
+                for each in self._bound_to(trials[0])
+            ]
+            outputs = collect(replay(Ensemble(sources), bound, is_part=True))
         except BadInput:  # no run can be followed with these
             return [[{}] * count for _ in trials]
         told = {
@@ -101,25 +211,83 @@ class Likelihood:
         runs = [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(sources))]
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
-    def _total(self, parts: Sequence[Mapping[str, Stream]]) -> float:
-        found = [self._of_part(part) for part in parts]
+    def _total(self, scored: Scored, parts: Sequence[Mapping[str, Stream]]) -> float:
+        found = [self._of_part(scored, part) for part in parts]
         total = sum(mean_likelihood(found).values()) if any(found) else -np.inf
         return total if np.isfinite(total) else -np.inf
 
-    def _of_part(self, innovations: Mapping[str, Stream]) -> dict[str, float]:
-        """The log-likelihood of what is seen of each thing, by topic; nothing where messages lack."""
-        if sum(map(len, innovations.values())) != self.count:
-            return {}
+    def _of_part(self, scored: Scored, innovations: Mapping[str, Stream]) -> dict[str, float]:
+        """The log-likelihood of what is seen of each thing; nothing where too much lacks."""
         found = {}
-        for topic, stream in innovations.items():
+        for name, all_ in self.count.items():
+            topic = _topic(name)
+            stream = innovations.get(topic)
+            if stream is None:
+                if all_:
+                    return {}
+                continue
+            lacking = all_ - scored.beyond.get(name, 0) - len(stream)
+            if len(stream) < LEAST_SCORED * all_ or (lacking and name not in self.readings):
+                return {}
             is_in = stream["accepted"] != 0
-            found[topic] = float(np.sum(stream["log_likelihood"][is_in]))
+            total = float(np.sum(stream["log_likelihood"][is_in]))
             missing = np.isnan(stream["innovation"][~is_in])
-            found[topic] -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
+            total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
             share = len(missing) / len(stream) if len(stream) else 0.0
             if 0.0 < share < 1.0:
-                found[topic] += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
+                total += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
+            if name in self.readings:
+                own = [self.broad[each] for each in self.readings[name].kinds if each in self.broad]
+                total += lacking * float(np.mean(own)) if lacking else 0.0
+                total += scored.left.get(name, 0.0) + scored.stretch.get(name, 0.0)
+            found[name] = total
         return found
+
+
+def _is_free(bound: Bound) -> bool:
+    """Whether broad starts are found for an estimator."""
+    initialization = bound.initialization if isinstance(bound, Recursive) else None
+    return initialization is not None and initialization.find_broad is not None
+
+
+def _topic(name: str) -> str:
+    return f"/estimates/{name}/innovation"
+
+
+def _span(controls: Sequence[str], bound: Bound, streams: Mapping[str, Stream]) -> tuple[int, int, int]:
+    """From where to where a filter can score measurements, and the step of what drives it.
+
+    What is before by a step at most is scored at the begin, and what is after while the last control
+    holds, and once more as long: what a small delay moves over an end stays comparable.
+    """
+    begin_ns, end_ns, longest_ns = -EVER_NS, EVER_NS, 0
+    for topic in controls:
+        stamps_ns = streams[topic].publish_time_ns
+        if len(stamps_ns):
+            step_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0
+            begin_ns = max(begin_ns, int(stamps_ns.min()))
+            end_ns = min(end_ns, int(stamps_ns.max()))
+            longest_ns = max(longest_ns, step_ns)
+    for topic in bound.priors:
+        if topic in streams and len(streams[topic]):
+            begin_ns = int(streams[topic].publish_time_ns[0])
+    return begin_ns, end_ns, longest_ns
+
+
+def _broad(numbers: Floats, kinds: Sequence[str]) -> float:
+    """The mean log-likelihood of messages (n, m) each of which is as far from the last as usual."""
+    steps = np.diff(numbers, axis=0)
+    is_angle = np.array(kinds) == "angle"
+    steps[:, is_angle] = np.remainder(steps[:, is_angle] + np.pi, 2.0 * np.pi) - np.pi
+    known = np.isfinite(steps)
+    squares = np.where(known, steps, 0.0) ** 2
+    squares = squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    there = squares > 0.0
+    return float(-0.5 * np.sum(np.log(2.0 * np.pi * squares[there]) + 1.0))
+
+
+def _later(stream: Stream, by_ns: int) -> Stream:
+    return replace(stream, publish_time_ns=stream.publish_time_ns + by_ns)
 
 
 def _stated(innovations: Mapping[str, Stream]) -> float:
@@ -128,7 +296,9 @@ def _stated(innovations: Mapping[str, Stream]) -> float:
 
 
 def _key(trial: Trial) -> str:
-    return repr(sorted(trial.settings.items()))
+    """What has to be equal of trials that are replayed together."""
+    stated = {topic: stream.metadata for topic, stream in trial.source.streams.items()}
+    return repr((sorted(trial.settings.items()), stated))
 
 
 def _extents(stream: Stream) -> Floats:
@@ -140,91 +310,3 @@ def _extents(stream: Stream) -> Floats:
     extents[is_there] = np.nanmax(known[:, is_there], axis=0) - np.nanmin(known[:, is_there], axis=0)
     extents = np.where(np.array(kinds) == "angle", 2.0 * np.pi, extents)
     return np.where(extents > 0.0, extents, 1.0)
-
-
-class Peak(NamedTuple):
-    """The value of one number at which the gain is greatest, and that gain."""
-
-    value: float
-    gain: float
-
-
-def peak(gains: Gains, tried: Sequence[float], limit: float, floor: float) -> Peak:
-    """The greatest gain of a number, from the best of those that are tried on.
-
-    Args:
-        gains: of several values; zero at zero.
-        tried: values beside zero, the first two of them nearest to it, to either side where it has two.
-        limit: of its magnitude.
-        floor: a gain that is less than this is not worth a search.
-    """
-    known = {0.0: 0.0}
-
-    def look(values: Sequence[float]) -> None:
-        new = [value for value in values if value not in known]
-        known.update(zip(new, gains(new), strict=True) if new else ())
-
-    has_sides = tried[0] < 0.0
-    look(tried[:2])
-    if has_sides and max(known.values()) < 0.5 * floor and _by_parabola(known) < 0.5 * floor:
-        return Peak(0.0, 0.0)  # a smooth function that is about greatest here
-    look(tried)
-    for _ in range(DOUBLINGS):
-        best, low, high = _around(known)
-        if len(tried) == 1 or best == 0.0 or low != high or abs(best) >= limit:
-            break
-        look([float(np.clip(2.0 * best, -limit, limit))])
-    if len(tried) == 1 or (best == 0.0 and not has_sides):
-        return Peak(best, known[best])
-    options = {"maxiter": EVALUATIONS, "xatol": 1e-3 * (high - low)}
-
-    def loss(value: float) -> float:
-        look([float(value)])
-        return -max(known[float(value)], -LARGEST)
-
-    if low < high:
-        minimize_scalar(loss, bounds=(low, high), method="bounded", options=options)
-    best = max(known, key=lambda value: known[value])
-    return Peak(best, known[best])
-
-
-def _around(known: Mapping[float, float]) -> tuple[float, float, float]:
-    """The value of the greatest gain and its neighbours; itself and itself where it is the last one."""
-    values = sorted(known)
-    place = max(range(len(values)), key=lambda place: known[values[place]])
-    if place in (0, len(values) - 1):
-        return values[place], values[place], values[place]
-    return values[place], values[place - 1], values[place + 1]
-
-
-def _by_parabola(known: Mapping[float, float]) -> float:
-    """The greatest gain of the parabola through three of its values; infinite if it has none."""
-    values, gains = np.array(sorted(known.items())).T
-    if not gains.any():  # nothing depends on the number
-        return 0.0
-    if not np.isfinite(gains).all():
-        return np.inf
-    bend, slope, _ = np.polyfit(values / values[-1], gains, 2)
-    return float(-(slope**2) / (4.0 * bend)) if bend < 0.0 else np.inf
-
-
-def interval(gains: Gains, at: Peak, scale: float) -> tuple[float, float]:
-    """The 95 % interval of a number: where the gain is less than its greatest by DROP_95.
-
-    `scale` is a length that is not too long; an end that is not found is infinite.
-    """
-
-    def rest(value: float) -> float:
-        [gain] = gains([value])
-        return max(gain, -LARGEST) - (at.gain - DROP_95)
-
-    def end(sign: float) -> float:
-        inner, step = at.value, sign * scale
-        for _ in range(DOUBLINGS):
-            outer = at.value + step
-            if rest(outer) < 0.0:
-                return float(brentq(rest, inner, outer, xtol=1e-3 * abs(outer - at.value)))
-            inner, step = outer, 2.0 * step
-        return sign * np.inf
-
-    return end(-1.0), end(1.0)

@@ -11,16 +11,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from pydantic import NonNegativeInt
 
 from pipeline.altering import alterations as alter
+from pipeline.diagnosing.battery import battery
 from pipeline.diagnosing.diagnosis import OPEN, Diagnosis, diagnose
-from pipeline.diagnosing.hypotheses import Kind
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
-from recorders.parameters import merge
+from recorders.parameters import Parameters, merge
 from recorders.recording import record_run
 from replay.engine.streams.sources import MemorySource, memory_source
 
@@ -40,6 +42,18 @@ QUANTITIES = (
     "nothing_share",
 )
 CLEAN_RUN = "none"
+
+
+class Options(Parameters):
+    """What is diagnosed beside the scenarios.
+
+    Attributes:
+        battery_seed: the first seed of the battery, see `pipeline.diagnosing.battery.battery`.
+        battery_runs: of each of its cells; none unless given.
+    """
+
+    battery_seed: NonNegativeInt = 0
+    battery_runs: NonNegativeInt = 0
 
 
 class Fault(NamedTuple):
@@ -79,7 +93,7 @@ def _plain(alteration: alter.Alteration) -> Callable[[MemorySource, int], alter.
 
 
 def _drift(source: MemorySource, _: int) -> alter.Alteration:
-    return alter.drifted(*source.extent("publish_time"))
+    return alter.drifted(source.extent("publish_time")[0])
 
 
 def _landmark_numbers(source: MemorySource, seed: int) -> alter.Alteration:
@@ -216,7 +230,7 @@ SCENARIOS = {
                 "/vehicle2/fix",
                 0.05,
                 altered="/vehicle2/fix",
-                alteration=lambda source, _: alter.delayed(*source.extent("publish_time")),
+                alteration=_plain(alter.delayed),
                 by=0.05,
             ),
             "outliers": Fault(
@@ -278,6 +292,12 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         for quantity in QUANTITIES:
             outcome.metrics[f"diagnosis.{quantity}.{case}"] = summary[quantity]
     outcome.metrics |= {f"diagnosis.{name}": share for name, share in _overall(runs).items()}
+    first = setting.options.battery_seed
+    seeds = range(first, first + setting.options.battery_runs)
+    if seeds:
+        planted = battery.planted(seeds, setting.progress)
+        outcome.tables |= {"battery": battery.summary(planted), "battery_runs": planted}
+        outcome.metrics |= battery.metrics_of(planted)
     outcome.input_sha256 = hash_streams(clean)
     return outcome
 
@@ -375,4 +395,6 @@ def _chart(faults: pd.DataFrame) -> Chart:
     )
 
 
-DIAGNOSIS = Study("how often a diagnosis names the fault that was put into a log", study)
+DIAGNOSIS = Study(
+    "how often a diagnosis names the fault that was put into a log", study, options=Options
+)

@@ -3,6 +3,7 @@
 import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,13 +13,13 @@ from pipeline.output import RESULT_FILE
 from pipeline.output.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
 from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
-from recorders.parameters import describe
+from recorders.parameters import build, describe
 from recorders.plausibility.checks import findings_of
 from recorders.plausibility.finding import Finding
 from recorders.recording import Recorder
-from recorders.registry import load
+from recorders.registry import available, foreign_code, load
 from replay.engine.compiling.cache import cache_folder, kept_files
-from replay.engine.replaying.estimator import Bound
+from replay.engine.replaying.estimator import Bound, Estimator
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined, registered_models
 from replay.inference.model.binding import topics_of
@@ -132,6 +133,20 @@ def _fitting(model: Model, topics: Mapping[str, Topic]) -> Fitting:
     return Fitting(list(dict.fromkeys(used)), list(bound), [] if bound else lacks[:1])
 
 
+def estimators_that_fit(topics: Mapping[str, Topic]) -> list[str]:
+    """Return which registered estimators fit a log that are no methods for models, such as trackers."""
+    found = []
+    for name in available("estimators"):
+        if name not in METHODS:
+            with suppress(BadInput):
+                estimator = load("estimators", name, Estimator)
+                parameters = build(estimator.parameters, {}, f"estimator {name}")
+                with foreign_code(f"estimator {name}"):
+                    if estimator.bind(name, topics, parameters):
+                        found.append(name)
+    return found
+
+
 def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
     """Print which models fit the log and how, or that none does; with `is_all` what others lack."""
     fittings = fitting_of(log.topics)
@@ -140,7 +155,13 @@ def _say_what_fits(path: Path, log: Log, *, is_all: bool) -> None:
     if fit:
         say(f"What can be done with it, as in fuselog replay {shlex.quote(str(path))} -e ekf:")
     else:
-        say(f"No registered model fits it: {nearest(registered_models(), log.topics)}; {OWN_MODEL}")
+        others_fit = estimators_that_fit(log.topics)
+        if others_fit:
+            say(f"What can be done with it: fuselog replay {shlex.quote(str(path))} -e NAME, of")
+            say(f"  {' '.join(others_fit)}: see fuselog estimators NAME")
+        else:
+            why = nearest(registered_models(), log.topics)
+            say(f"No registered model fits it: {why}; {OWN_MODEL}")
     for name, each in fit.items():
         say(f"  {name}: -e {' '.join(each.methods)}; from {', '.join(each.topics)}")
     if fit and others and not is_all:

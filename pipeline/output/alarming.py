@@ -45,25 +45,26 @@ def alarms_of(
 
 def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iterator[Alarm]:
     """A gate that keeps out too much, and NIS that is beyond its interval."""
-    for topic, sums in judge.innovations.items():
+    for topic, innovations in judge.innovations.items():
+        sums = innovations.total
         estimator, case = split_topic(topic)
         gate = float(parameters.get(estimator, {}).get("gate_probability", USUAL_GATE))
         said, excess = [], 1.0
-        gated = sums["messages"] - sums["accepted"]
-        expected = (1.0 - gate) * sums["messages"]
+        gated = sums.messages - sums.accepted
+        expected = (1.0 - gate) * sums.messages
         # a count of rare things has Poisson's distribution, whose tail is chi-square's
         if gated and chi2.sf(2.0 * expected, 2 * gated) > CONSISTENT:
-            share = gated / sums["messages"]
-            excess = max(1.0, gated / max(expected, RARE * sums["messages"]))
+            share = gated / sums.messages
+            excess = max(1.0, gated / max(expected, RARE * sums.messages))
             said.append(
-                f"the gate keeps out {_percent(share)} of {sums['messages']} measurements, where "
+                f"the gate keeps out {_percent(share)} of {sums.messages} measurements, where "
                 f"{_percent(1.0 - gate)} {'is' if gate < 1.0 else 'are'} expected"
             )
-        if not sums["accepted"] and sums["messages"]:
+        if not sums.accepted and sums.messages:
             said.append("its log-likelihood is that of no measurement")
-        low, high = chi_square_interval(max(sums["degrees"], 1), 1, CONSISTENT)
-        if sums["degrees"] and (sums["squared"] < low or sums["squared"] > high):
-            nis, low, high = (each / sums["degrees"] for each in (sums["squared"], low, high))
+        low, high = chi_square_interval(max(sums.degrees, 1), 1, CONSISTENT)
+        if sums.degrees and (sums.squared < low or sums.squared > high):
+            nis, low, high = (each / sums.degrees for each in (sums.squared, low, high))
             excess = max(excess, _beyond(nis, low, high))
             said.append(f"NIS is {nis:.3g} per component, {_expected(nis, low, high)}")
         if said:
@@ -116,17 +117,16 @@ def _of_constant(estimator: str, case: str, constant: Constant) -> Alarm:
 def _of_costs(judge: Judge) -> Iterator[Alarm]:
     """The search of a trajectory that ended at more than its residuals leave."""
     metrics = judge.metrics
-    for topic, sums in judge.innovations.items():
+    for topic, innovations in judge.innovations.items():
+        sums = innovations.total
         estimator, case = split_topic(topic)
         cost = metrics.get(metric_key(estimator, "cost", case))
-        numbers = sums["accepted_degrees"]
+        numbers = sums.accepted_degrees
         if cost is None or not np.isfinite(cost) or not numbers:
             continue
         _, high = chi_square_interval(numbers, 1, CONSISTENT)
         high *= 0.5 / judge.runs
-        if cost > high * max(
-            1.0, sums["squared"] / sums["degrees"]
-        ):  # noise that is too small raises both
+        if cost > high * max(1.0, sums.squared / sums.degrees):  # noise that is too small raises both
             words = (
                 f"{_name(estimator, case)}: the search ended at a cost of {cost:.4g}, where "
                 f"{numbers / judge.runs:.4g} measured numbers leave up to {high:.4g}: a minimum that is "
@@ -155,7 +155,7 @@ def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iter
         if "gate_probability" in values
         and any(split_topic(topic)[0] == label for topic in judge.innovations)
     }
-    is_closed = any(sums["accepted"] < sums["messages"] for sums in judge.innovations.values())
+    is_closed = any(each.total.accepted < each.total.messages for each in judge.innovations.values())
     if is_closed and len({*gates.values()}) > 1:
         told = ", ".join(f"{gate:g} of {label}" for label, gate in gates.items())
         words = (

@@ -80,16 +80,16 @@ def formatted(template: str, values: Values) -> str:
     A number that has an interval stands before it; `{EXPRESSION!n:FORMAT}` says the names of numbers
     too. Raises as `evaluate` does.
     """
-    said = []
+    parts = []
     for text, expression, form, conversion in Formatter().parse(template):
-        said.append(text)
+        parts.append(text)
         if expression is not None:
             found = evaluate(expression, values)
             try:
-                said.append(_said(found, form or ".3g", named=conversion == "n"))
+                parts.append(_said(found, form or ".3g", named=conversion == "n"))
             except ValueError:
                 raise BadInput(f"'{form}' is no format of numbers; write as {{value:.2f}}") from None
-    return "".join(said)
+    return "".join(parts)
 
 
 def expressions_in(template: str) -> list[str]:

@@ -160,8 +160,8 @@ def metric_tables(
         quantities = cases.setdefault(case, {})
         quantities.setdefault(quantity, {})[estimator] = measured
         if quantity == "nees" and (estimator, case) in over_runs:
-            said = Measured(over_runs[estimator, case])
-            quantities.setdefault("nees_mean_over_runs", {})[estimator] = said
+            interval = Measured(over_runs[estimator, case])
+            quantities.setdefault("nees_mean_over_runs", {})[estimator] = interval
     return [MetricTable(case, estimators, quantities) for case, quantities in sorted(cases.items())]
 
 
@@ -177,17 +177,17 @@ def _nees_over_runs(runs: "pd.DataFrame") -> dict[tuple[str, str], str]:
 
     if not {"estimator", "case", "nees"} <= {*runs}:
         return {}
-    said = {}
+    intervals = {}
     for (estimator, case), rows in runs.groupby(["estimator", "case"]):
         nees = rows["nees"].dropna()
         if len(nees) >= FEWEST_RUNS:
             mean = float(nees.mean())
             low, high = t.interval(0.95, len(nees) - 1, loc=mean, scale=sem(nees))
             components = rows.filter(regex="^rmse_").notna().any().sum()
-            said[str(estimator), str(case)] = (
+            intervals[str(estimator), str(case)] = (
                 f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim {components}"
             )
-    return said
+    return intervals
 
 
 def result_folder(folder: Path) -> AbstractContextManager[Path]:

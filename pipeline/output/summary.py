@@ -146,11 +146,11 @@ def late_chart(late: pd.DataFrame, case: str) -> Chart:
             curve(str(became), each["elapsed_s"], each["late_s"], "markers")
             for became, each in rows.groupby("became", sort=False)
         ]
-        told = [
+        captions = [
             f"{each.messages} {each.became}"
             + (f", {each.repeated:.0f} used again for them" if each.became == INSERTED else "")
             for each in counts[counts["estimator"] == name].itertuples()
         ]
         x, y = Axis(label="time (s)"), Axis(label="mean delay (s)")
-        panels.append(Panel(x=x, y=y, series=series, title=f"{name}: {'; '.join(told)}"))
+        panels.append(Panel(x=x, y=y, series=series, title=f"{name}: {'; '.join(captions)}"))
     return Chart(title=f"{case or 'messages'}, messages that came late", panels=panels)

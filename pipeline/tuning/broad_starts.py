@@ -66,6 +66,40 @@ def _part_of_runs(parts: Sequence[Initialized], first: Mapping[str, Ragged], *_:
     )
 
 
+def begun_broadly(bound: Bound, begins_ns: Sequence[int], count: int) -> Bound:
+    """Make an estimator of trials that stand there `count` times each, once for each of their parts.
+
+    Each trial has starts of its own, by its own first messages: what is measured may be altered. The
+    stamps of the starts are `begins_ns`. An estimator that finds no broad starts stays as it is.
+    """
+    initialization = initialization_of(bound)
+    if initialization is None or initialization.find_broad is None:
+        return bound
+    return with_find(bound, partial(_own_parts, initialization.find_broad, begins_ns, count))
+
+
+def _own_parts(
+    find_broad: Callable[..., list[Initialized]],
+    begins_ns: Sequence[int],
+    count: int,
+    first: Mapping[str, Ragged],
+    static: Mapping[str, Ragged],
+    clock: Clock,
+) -> Initialized:
+    parts: list[Initialized] = []
+    for trial, begin_ns in enumerate(begins_ns):
+        own, about = (
+            {name: gather([ragged.of_run(trial * count)]) for name, ragged in given.items()}
+            for given in (first, static)
+        )
+        found = find_broad(own, about, clock, begin_ns)
+        parts += (found * count)[:count]
+    topics = parts[0].static
+    return Initialized(
+        {name: gather([each.static[name].stream for each in parts]) for name in topics}, []
+    )
+
+
 def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Compute the log of the mean of likelihoods, by what is estimated; a part that failed has none."""
     names = dict.fromkeys(name for part in parts for name in part)

@@ -32,7 +32,7 @@ from replay.engine.replaying.estimator import Bound, Initialized, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import sentences_of
-from replay.engine.streams.sources import Ensemble, MemorySource, Source
+from replay.engine.streams.sources import Ensemble, LogSource, MemorySource, Source
 from replay.judging.consistency.whiteness import whitened
 from replay.judging.judge import Judge
 from replay.judging.metrics.measuring import Sums, plus
@@ -72,7 +72,9 @@ def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
     if isinstance(source, MemorySource):
         return Run(Ensemble([source]), source.name)
     run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-    held = MemorySource(source.read(sorted(topics)), run, source.name)
+    streams = source.read(sorted(topics))
+    end_ns = source.end_ns if isinstance(source, LogSource) else None
+    held = MemorySource(streams, run, source.name, source.start_ns, end_ns)
     return Run(Ensemble([held]), source.name)
 
 

@@ -18,6 +18,7 @@ from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
+from pipeline.tuning.measured import until_last_measured
 from pipeline.tuning.objective import (
     CRITERIA,
     Best,
@@ -111,6 +112,7 @@ def tune(
     [(label, own)] = chosen.items()
     settings = {"kind": label, **merge(own, allowed(given))}
     bound = bind(label, sources, settings)
+    sources = [until_last_measured(each, bound) for each in sources]
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
     _refuse_random(label, bound, by)
     start = np.array([each.start for each in searched])
@@ -164,7 +166,7 @@ def _pool(
 
 def _gate(bound: Sequence[Bound]) -> float:
     """The probability that a measurement is let in by the gate, if there is one."""
-    return float(getattr(bound[0].parameters, "gate_probability", 1.0))
+    return float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
 
 
 def _refuse_random(label: str, bound: Sequence[Bound], by: By) -> None:

@@ -82,6 +82,11 @@ def is_planar(schema_name: str, metadata: Mapping[str, str]) -> bool:
     return schema_name in _PLANAR
 
 
+def is_framed(metadata: Mapping[str, str]) -> bool:
+    """Tell whether a channel names a frame of its own, and does not state where on earth that is."""
+    return LATITUDE not in metadata and bool(metadata.get(FRAME))
+
+
 def plane_in_words(metadata: Mapping[str, str]) -> str:
     """The frame that a channel names, else that it is one of its own."""
     return f"frame {metadata[FRAME]}" if metadata.get(FRAME) else "a frame of its own"

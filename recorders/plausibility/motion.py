@@ -187,11 +187,18 @@ class Motion:
         return slope(told, np.linalg.norm(moved.values, axis=1))
 
     def turn(self, source: Series) -> Slope | None:
-        """How much the course turns for each radian of a turn rate."""
+        """How much the course turns for each radian of a turn rate.
+
+        One that is like the course as it is needs no lag: half a period of a winding road is none.
+        """
         if self.courses is None:
             return None
         windows = turned(self.courses, self.turn_span_s)
-        return slope(turn_between(self.likened(source), windows.begin_s, windows.end_s), windows.values)
+        for moved in (source, self.aligned(source), self.likened(source)):
+            told = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
+            if told.sign > 0:
+                break
+        return told
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
         """How much a heading turns for each radian of a turn rate."""

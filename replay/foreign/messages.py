@@ -6,14 +6,15 @@ import numpy as np
 
 from recorders.errors import BadInput, choices
 from recorders.log import Stream, Topic
+from recorders.log.streams import check_stream
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.measurements import check_width
-from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream
+from replay.engine.streams.results import failures_by_run, state_stream
 from replay.foreign.description import Description, TopicRead
 from replay.foreign.native.following import Followed, Static
-from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
+from replay.inference.run.recursion import Estimates, FilterEvents, Innovations, recorded_innovations
 
 
 def numbers_of(topic: TopicRead, stream: Stream, width: int) -> Floats:
@@ -135,19 +136,8 @@ def streams_of(
     )
     made = [Ragged(state, offsets), failures_by_run(topic, failures, len(offsets) - 1)]
     if description.innovation:
-        stream = innovation_stream(
-            f"{topic}/innovation",
-            innovations.time_ns,
-            description.innovation,
-            truth,
-            target_id=innovations.target_id,
-            accepted=innovations.numbers[:, 2].astype(np.uint32),
-            innovation=innovations.difference,
-            covariance=innovations.covariance,
-            squared=innovations.numbers[:, 0],
-            log_likelihood=innovations.numbers[:, 1],
-        )
-        made.append(Ragged(stream, recorded))
+        made.append(recorded_innovations(topic, description.innovation, truth, innovations, recorded))
+        check_stream(made[-1].stream)
     return made
 
 

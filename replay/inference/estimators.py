@@ -41,6 +41,7 @@ from replay.inference.requirements import (
 from replay.inference.run.filtering import Filter, samplers_of
 from replay.inference.run.initialization import Initializer
 from replay.inference.run.out_of_sequence import OutOfSequenceFilter
+from replay.inference.run.reading import reading_of
 
 
 @lru_cache(maxsize=256)
@@ -284,6 +285,7 @@ def bind_model(
             assumed=assumed,
             offers=offers_of(model, found, topics),
             is_random=is_random,
+            reading=partial(reading_of, own, found),
         )
         bound.append(replace(made, out_of_sequence=partial(_reprocessing, made, filtering, begun)))
     return bound

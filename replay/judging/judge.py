@@ -34,13 +34,10 @@ from replay.judging.metrics.measuring import (
     Measurement,
     Metric,
     Output,
-    Sums,
     find_metrics,
     metric_key,
-    plus,
 )
-from replay.judging.metrics.metrics import innovation_sums
-from replay.judging.metrics.quantities import Quantities, columns_of
+from replay.judging.metrics.quantities import InnovationSums, Quantities, columns_of
 from replay.judging.metrics.sums import BinnedSums
 from replay.judging.sets.errors import SetErrors, set_errors
 from replay.judging.tracks.errors import Judged as Targets
@@ -80,7 +77,7 @@ class Judge:
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
 
-    `innovations` are their sums by topic, see `innovation_sums`.
+    `innovations` are their sums by topic.
     """
 
     def __init__(
@@ -108,7 +105,7 @@ class Judge:
         self._diagnostics = Diagnostics(first_run)
         self._unjudged: dict[str, str] = {}
         self._first_fixes: dict[str, list[Origin | None]] = {}
-        self.innovations: dict[str, Sums] = {}
+        self.innovations: dict[str, InnovationSums] = {}
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -124,9 +121,9 @@ class Judge:
             elif schema == INNOVATION:
                 innovations = innovations_of(rows, self._first_run)
                 judged.innovations.append(innovations)
-                self.innovations[topic] = plus(
-                    self.innovations.get(topic, {}), innovation_sums(innovations)
-                )
+                if topic not in self.innovations:
+                    self.innovations[topic] = InnovationSums(self._first_run)
+                self.innovations[topic].add(innovations)
                 self._measured.add(topic, innovations)
             self._diagnostics.add(topic, rows, self._sources)
             named = (*split_topic(topic), topic.rpartition("/")[2])
@@ -196,7 +193,7 @@ class Judge:
         self._measured.merge(other._measured)
         self._unjudged |= other._unjudged
         for topic, sums in other.innovations.items():
-            self.innovations[topic] = plus(self.innovations.get(topic, {}), sums)
+            self.innovations.setdefault(topic, InnovationSums(sums.first_run)).merge(sums)
         for topic, quantities in other._quantities.items():
             if topic in self._quantities:
                 self._quantities[topic].merge(quantities)
@@ -233,7 +230,7 @@ class Judge:
                     key = metric_key(errors.estimator, name, errors.case)
                     found[key] = chi_square_interval(size, runs, probability)
         for topic, sums in self.innovations.items():
-            if degrees := sums["degrees"]:
+            if degrees := sums.total.degrees:
                 low, high = chi_square_interval(degrees, 1, probability)
                 estimator, case = split_topic(topic)
                 key = metric_key(estimator, "nis_per_component", case)
@@ -294,10 +291,10 @@ class Judge:
 
     @property
     def runs_table(self) -> "pd.DataFrame":
-        """Return one row per estimator, case and run: estimates, RMSE of each quantity, mean NEES."""
-        from replay.judging.tables import joined, run_table
+        """Return one row per estimator, case and run: see `tables.table_of_runs`."""
+        from replay.judging.tables import table_of_runs
 
-        return joined(run_table(each) for each in self._quantities.values())
+        return table_of_runs(self._quantities.values(), self.innovations)
 
     @property
     def times(self) -> "pd.DataFrame":

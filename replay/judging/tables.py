@@ -3,15 +3,15 @@
 They are made of the judge's sums when they are asked for: what prints metrics alone needs no pandas.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pandas as pd
 
 from replay.judging.consistency.bounds import Bounds
-from replay.judging.errors.evaluation import Errors, Floats, rmse_interval
+from replay.judging.errors.evaluation import Errors, Floats, rmse_interval, split_topic
 from replay.judging.metrics.metrics import step_bounds
-from replay.judging.metrics.quantities import Quantities
+from replay.judging.metrics.quantities import InnovationSums, Quantities
 
 
 def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
@@ -62,6 +62,36 @@ def time_table(quantities: Quantities) -> pd.DataFrame:
         "estimates": count.astype(np.int64),
     }
     return pd.DataFrame({**columns, **_means(errors, count, sums)})
+
+
+def table_of_runs(
+    quantities: Iterable[Quantities], innovations: Mapping[str, InnovationSums]
+) -> pd.DataFrame:
+    """Return one row per estimator, case and run.
+
+    How many estimates, the RMSE of each quantity and mean NEES; of what gives innovations NIS per
+    component, the share that a gate kept out, and the log-likelihood of what it let in.
+    """
+    keys = ["estimator", "case", "run"]
+    errors = joined(run_table(each) for each in quantities)
+    measured = joined(innovation_table(topic, sums) for topic, sums in innovations.items())
+    if errors.empty or measured.empty:
+        return errors if measured.empty else measured
+    there, own = (pd.MultiIndex.from_frame(each[keys]) for each in (errors, measured))
+    return joined([errors.merge(measured, on=keys, how="left"), measured[~own.isin(there)]])
+
+
+def innovation_table(topic: str, sums: InnovationSums) -> pd.DataFrame:
+    """Return one row per run that has innovations."""
+    estimator, case = split_topic(topic)
+    run, of = sums.by_run()
+    with np.errstate(invalid="ignore"):
+        columns = {
+            "nis_per_component": of.squared / np.where(of.degrees > 0, of.degrees, np.nan),
+            "gated_share": 1.0 - of.accepted / of.messages,
+            "log_likelihood": of.log_likelihood,
+        }
+    return pd.DataFrame({"estimator": estimator, "case": case, "run": run, **columns})
 
 
 def run_table(quantities: Quantities) -> pd.DataFrame:

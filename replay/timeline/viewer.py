@@ -71,10 +71,10 @@ def screenshot(
             for _ in range(_PICTURES):
                 client.save_screenshot(rerun_path(picture))
             views = client.get_state().views
-        said = PngInfo()
-        said.add_text("Software", SOFTWARE)
+        info = PngInfo()
+        info.add_text("Software", SOFTWARE)
         with Image.open(picture) as image:
-            image.save(new, pnginfo=said)
+            image.save(new, pnginfo=info)
     return [f"{view.name}: {report}" for view in views for report in view.reports]
 
 
@@ -145,13 +145,13 @@ def _running(
     folder: Path, options: Sequence[str], environment: Mapping[str, str]
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run `rerun OPTIONS`, which says what it has to say in a file of the folder."""
-    with (folder / _SAID).open("wb") as said:
+    with (folder / _SAID).open("wb") as output:
         process = subprocess.Popen(
             [*RERUN, *options],
             env=environment,
             stdin=subprocess.PIPE,
-            stdout=said,
-            stderr=said,
+            stdout=output,
+            stderr=output,
             start_new_session=True,  # an interrupt from the terminal is ours to handle
         )
     assert process.stdin is not None

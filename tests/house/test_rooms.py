@@ -21,7 +21,6 @@ OF_LEAVES = {"recorders/models", "recorders/simulators", "replay/timeline/famili
 
 # Files of more lines; the schemas are data.
 LARGER = {
-    "pipeline/diagnosing/hypotheses.py",
     "recorders/log/schemas.py",
 }
 
@@ -46,7 +45,6 @@ WIDER = {
     "pipeline/tuning/tuning.py": {"tune"},
     "recorders/arrivals.py": {"difference_stream"},
     "replay/engine/api/functions.py": {"batch", "recursive"},
-    "replay/engine/streams/results.py": {"innovation_stream"},
 }
 
 

@@ -40,14 +40,14 @@ def nis(log: fl.MemorySource, **settings: Any) -> tuple[float, float, float]:
 
 def drifting(stream: fl.Stream, rate: float) -> fl.Stream:
     first_ns = int(stream.publish_time_ns[0])
-    return put.drifted(first_ns, 2**62)(stream, rate)
+    return put.drifted(first_ns)(stream, rate)
 
 
 @pytest.mark.parametrize(
     ("topic", "fault", "by", "undone"),
     [
         (SEEN, put.shifted("range_m"), 0.2, "bias_range_m"),
-        (SEEN, put.delayed(0, 2**62), 0.3, f"{SEEN}.delay_s"),
+        (SEEN, put.delayed, 0.3, f"{SEEN}.delay_s"),
         (SEEN, drifting, 2e-3, f"{SEEN}.clock_gain"),
         ("/landmarks", put.renumbered("landmark_id", 3, 9), 0.0, "/landmarks.exchanged"),
         (PRIOR, put.shifted("mean", 2), 2.0, f"{PRIOR}.heading_bias"),
@@ -73,7 +73,7 @@ def test_what_a_diagnosis_says_to_set_makes_the_filter_consistent(
         (ODOMETRY, put.scaled("turn_radps"), 180.0 / np.pi, "turn_radps_scale", "0.0174532925"),
         (ODOMETRY, put.scaled("forward_mps"), 3.6, "forward_scale", 0.27777778),
         (SEEN, put.shifted("bearing_rad"), np.pi / 40, "bearing_bias", "4.5 deg"),
-        (SEEN, put.delayed(0, 2**62), 18.0, "delay_s", "18000 ms"),
+        (SEEN, put.delayed, 18.0, "delay_s", "18000 ms"),
         ("/landmarks", put.turned("position_m"), np.pi / 2, "position_turn", "90 deg"),
         ("/landmarks", put.shifted("position_m", 0), 7.0, "position_x_bias", "700 cm"),
         ("/landmarks", put.shifted("position_m", 1), 7.0, "origin", "0, -7"),
@@ -172,7 +172,7 @@ def test_every_command_alters_alike_and_says_so(
 
 def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySource) -> None:
     """No command knows its name; and what is set already is counted in."""
-    faulty = put.altered(run, SEEN, put.delayed(0, 2**62), 0.3)
+    faulty = put.altered(run, SEEN, put.delayed, 0.3)
     mine = {"mine": fl.modelled(robot(), "ekf")}
     before = {f"{SEEN}.delay_s": 0.1}
     told = fl.diagnose(faulty, mine, set={**OPEN, **before}).sentences[0]

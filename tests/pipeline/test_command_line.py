@@ -192,6 +192,23 @@ def test_info_says_that_no_model_fits(
     )
 
 
+def test_info_names_the_tracker_of_detections(
+    tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sensor = {"sigma_m": "2", "detection_probability": "0.9", "clutter_per_m2": "1e-4"}
+    scans = {"metadata": sensor, "scan_id": [0], "detections": [1]}
+    seen = {"scan_id": [0], "position_m": [[1.0, 2.0]]}
+    streams = [
+        fl.make_stream("/radar/scan", fl.schemas.SCAN, [10**9], **scans),
+        fl.make_stream("/radar/detection", fl.schemas.DETECTION, [10**9], **seen),
+    ]
+    fl.write("seen.mcap", streams)
+    said = fuselog("info", "seen.mcap").out
+    assert "fuselog replay seen.mcap -e NAME, of\n  tracker" in said
+    assert "No registered model" not in said
+
+
 def test_info_says_what_a_person_asks(world: Path, fuselog: Fuselog) -> None:
     said = fuselog("info", str(world / "two-robots.mcap")).out
     for words in ("landmarks, seed 0, run 0", "duration_s = 2.0", "robots = 2", "2 s from 2026-01-01"):

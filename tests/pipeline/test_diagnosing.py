@@ -17,8 +17,10 @@ from pipeline.altering import alterations as alter
 from pipeline.diagnosing import study
 from pipeline.diagnosing.causes import find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
-from pipeline.diagnosing.hypotheses import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Peak, Trial, interval, peak
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from pipeline.diagnosing.hypotheses.listing import hypotheses
+from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.diagnosing.search import Gains, Peak, interval, peak
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
 
@@ -31,20 +33,32 @@ def gains_of(source: fl.MemorySource, settings: dict[str, float]) -> dict[str, P
     """What scaling each noise alone gains, and by how much (logarithms)."""
     given = {"kind": "ekf", **settings, **OPEN}
     base, likelihood = Trial(source, given), Likelihood("ekf")
-    tried = hypotheses(bind("ekf", [source], given), base, likelihood.begin(base))
+    seen = likelihood.begin(base)
+    tried = hypotheses(bind("ekf", [source], given), base, seen, likelihood.readings)
     [before] = likelihood([base])
-    return {
-        each.topic: peak(
-            lambda values, each=each: [
-                found - before for found in likelihood([each.without(base, value) for value in values])
-            ],
-            each.tried,
-            each.limit,
-            0.0,
-        )
-        for each in tried
-        if each.topic in FREE
-    }
+
+    def gains(each: Hypothesis) -> Gains:
+        return lambda values: [
+            found - before for found in likelihood([each.without(base, value) for value in values])
+        ]
+
+    return {each.topic: found_by(each, gains(each)) for each in tried if each.topic in FREE}
+
+
+def found_by(of: Hypothesis, gains: Gains, floor: float = 0.0) -> Peak:
+    """The peak of a single search."""
+    search = peak(of, floor)
+    asked = next(search)
+    while True:
+        try:
+            asked = search.send(gains(asked))
+        except StopIteration as end:
+            return end.value
+
+
+def parabola(*tried: float, limit: float = np.inf) -> Hypothesis:
+    """A fault of one number, that no log has."""
+    return Hypothesis("delay", "/fix", "", tried, limit, lambda _, at: at, *[str, str])  # type: ignore[arg-type,return-value]
 
 
 def test_the_largest_gain_of_the_sheet_names_the_sensor_not_the_largest_scale() -> None:
@@ -66,11 +80,11 @@ def test_a_peak_far_from_where_the_search_begins_has_its_interval() -> None:
     def little(values: Sequence[float]) -> list[float]:
         return [0.1 * value - value**2 for value in values]
 
-    found = peak(gain, (-1.0, 1.0), np.inf, 5.0)
-    assert found == pytest.approx((30.0, 45000.0), rel=1e-6)
+    found = found_by(parabola(-1.0, 1.0), gain, 5.0)
+    assert found[:2] == pytest.approx((30.0, 45000.0), rel=1e-6)
     assert interval(gain, found, 1.0) == pytest.approx((29.804, 30.196), abs=2e-3)
-    assert peak(gain, (-1.0, 1.0), 10.0, 5.0).value == pytest.approx(10.0, abs=0.02)
-    assert peak(little, (-1.0, 1.0), np.inf, 5.0) == (0.0, 0.0)
+    assert found_by(parabola(-1.0, 1.0, limit=10.0), gain, 5.0).value == pytest.approx(10.0, abs=0.02)
+    assert found_by(parabola(-1.0, 1.0), little, 5.0)[:2] == (0.0, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +162,7 @@ def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     )
     assert first(wild).kind == "outliers"
     clean = fl.record("landmarks", seed=5, **scenario, range_bearing=exact)
-    clock = alter.drifted(*clean.extent("publish_time"))
+    clock = alter.drifted(clean.extent("publish_time")[0])
     told = first(alter.altered(clean, SEEN, clock, 2e-3))
     assert (told.kind, told.topic) == ("clock drift", SEEN)
 
@@ -168,11 +182,15 @@ def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
     faulty = alter.altered(source, "/robot1/prior", alter.shifted("mean", 0), 2.0)
     given = {"kind": "ekf", **OPEN}
     base, likelihood = Trial(faulty, given), Likelihood("ekf")
-    tried = hypotheses(bind("ekf", [faulty], given), base, likelihood.begin(base))
-    alike = [each for each in tried if each.part == "x_m"] * 2
-    causes = find_causes(likelihood, base, alike, 5)
-    assert [each.is_rival for each in causes] == [False, True]
-    assert causes[1].words.startswith("Or instead, nearly as likely: /robot1/prior: x_m at the start")
+    seen = likelihood.begin(base)
+    tried = hypotheses(bind("ekf", [faulty], given), base, seen, likelihood.readings)
+    alike = [each for each in tried if each.part == "x_m"]
+    [cause], listed = find_causes(likelihood, base, [*alike, replace(alike[0])], 5)
+    assert len(cause.others) == 1
+    assert (
+        "; or else, which this log does not tell from it, /robot1/prior: x_m at the start" in cause.words
+    )
+    assert [each.at.gain for each in listed] == pytest.approx([cause.gain] * 2)
 
 
 def innovations(nis: np.ndarray, accepted: np.ndarray) -> dict[str, fl.Stream]:
@@ -316,6 +334,15 @@ def test_without_truth_errors_are_left_out_and_that_is_said(run: fl.MemorySource
     found = fl.diagnose(replace(run, streams=streams), "ekf")
     assert any(note.startswith("no truth: errors and NEES are left out") for note in found.notes)
     assert any(note.startswith("one run:") for note in fl.diagnose(run, "ekf").notes)
+
+
+def test_a_prior_that_states_no_kinds_is_diagnosed() -> None:
+    """Angles are those in rad, as for a filter."""
+    run = fl.record("landmarks", seed=3, duration_s=5.0)
+    prior = run.streams["/robot1/prior"]
+    bare = replace(prior, metadata={"components": prior.metadata["components"]})
+    found = fl.diagnose(replace(run, streams={**run.streams, bare.topic: bare}), "ekf")
+    assert found.sentences == fl.diagnose(run, "ekf").sentences
 
 
 def test_a_log_without_a_prior_is_diagnosed() -> None:

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.diagnosing import causes as seeking
+from pipeline.diagnosing.battery.car import car
 from pipeline.diagnosing.causes import find_causes
-from pipeline.diagnosing.hypotheses import Hypothesis, hypotheses
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from replay.engine.replaying.estimator import bind
-from tests.pipeline.car_d import car
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
@@ -63,8 +65,14 @@ class Kept(fl.ModelParameters):
     kept: float = 0.9
 
 
-def test_what_is_inconsistent_and_has_no_name_is_said_to_be() -> None:
-    """Innovations of half their size are no consistent filter's; there is nothing to blame for it."""
+def test_what_is_inconsistent_and_has_no_name_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Innovations of half their size are no consistent filter's; but for the value's factor that is."""
+    known = seeking.hypotheses
+    monkeypatch.setattr(
+        seeking,
+        "hypotheses",
+        lambda *about: [each for each in known(*about) if each.kind != "factor or sign"],
+    )
     measured = replace(VALUE, noise=lambda _: (0.49,))
     motion = replace(SCALAR.motion, noise=lambda *_: (0.25,))
     model = replace(SCALAR, parameters=Kept, sensors=(measured,), motion=motion)
@@ -84,7 +92,7 @@ def test_a_number_at_the_end_of_its_search_is_no_cause() -> None:
 
     def causes(limit: float) -> list[float]:
         tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), limit, lambda _, at: at, *[str, str])  # type: ignore[arg-type,return-value]
-        found = find_causes(
+        found, _ = find_causes(
             lambda at: [1000.0 - 10.0 * (each - 5.0) ** 2 for each in at], 0.0, [tried], 1
         )  # type: ignore[arg-type,union-attr]
         return [each.value for each in found]
@@ -97,7 +105,7 @@ def test_a_gate_that_is_set_is_no_advice() -> None:
     for probability, setting in ((1.0, "gate_probability=0.999"), (0.999, None)):
         given = {"kind": "ekf", "gate_probability": probability}
         base = Trial(car(2000), given)
-        tried = hypotheses(bind("ekf", [base.source], given), base, {})
+        tried = hypotheses(bind("ekf", [base.source], given), base, {}, {})
         [outliers] = [each for each in tried if each.kind == "outliers"]
         mend = outliers.mend(1.0)
         assert (mend.setting if mend else None) == setting

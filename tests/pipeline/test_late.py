@@ -56,6 +56,21 @@ def test_going_back_ends_where_the_replay_in_order_does(fuselog: Fuselog) -> Non
     assert (issued.log_time_ns > issued.publish_time_ns).all()
 
 
+@pytest.mark.usefixtures("log")
+def test_waiting_is_not_free(fuselog: Fuselog) -> None:
+    """The table has how old estimates are: by the wait, where that is longer than all delays."""
+    ages = {}
+    for late in ("drop", "wait:0.2", "wait:0.9", "rewind:3"):
+        options = ("-e", "ekf", "-o", "aged.mcap", "--arrival-order", "--late", late)
+        metrics = fuselog("replay", "run.mcap", *options, "--json").json["metrics"]
+        ages[late] = metrics["ekf.estimate_age_s.robot1"]
+    assert ages["wait:0.9"] == pytest.approx(0.9, abs=0.02)
+    assert ages["drop"] < ages["wait:0.2"] < ages["wait:0.9"]
+    assert ages["rewind:3"] < ages["wait:0.2"]
+    stamped = fuselog("replay", "run.mcap", "-e", "ekf", "-o", "aged.mcap", "--json").json["metrics"]
+    assert "ekf.estimate_age_s.robot1" not in stamped
+
+
 def test_every_door_gives_the_same_and_says_what_is_left_out(log: Path, fuselog: Fuselog) -> None:
     found, said = replayed(fuselog, "dropped.mcap", "--arrival-order", "--late", "drop")
     reason = "topic /robot1/range_bearing: it is older than what was used before"

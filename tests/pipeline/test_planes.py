@@ -31,9 +31,9 @@ def driven() -> tuple[Floats, Floats]:
     return np.column_stack([places.T, heading]), np.stack([speed, turn], axis=1)
 
 
-def car(truth_states: dict[str, str], fix_states: dict[str, str]) -> list[fl.Stream]:
+def car(truth_states: dict[str, str], fix_states: dict[str, str], seed: int = 3) -> list[fl.Stream]:
     """Odometry, latitudes and longitudes once a second, and the truth in the plane HERE."""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(seed)
     poses, velocity = driven()
     density = {"forward_noise_density": "0.01", "turn_noise_density": "0.005"}
     noise = rng.normal(size=(STEPS, 2)) * [0.01, 0.005] / np.sqrt(STEP_S)

@@ -1,4 +1,4 @@
-"""The public door: `import fuselog`, and its functions in place of the commands."""
+"""The public interface: `import fuselog`, and its functions in place of the commands."""
 
 import ast
 import gc
@@ -241,6 +241,22 @@ def test_an_estimator_needs_no_registration(recordings: list[fl.MemorySource]) -
     stated = json.loads(done.estimates[0].run.notes["estimators"])  # type: ignore[union-attr]
     assert stated["wide"] == {"kind": str(mine), **wide}
     assert "reckoned" in repr(done)
+
+
+def test_a_run_has_its_likelihood_nis_and_gated_share(recordings: list[fl.MemorySource]) -> None:
+    """In the order of the estimators; what has no innovations has none of it."""
+    done = fl.replay(recordings, ["ekf", "dead-reckoning"])
+    whole = done.metrics.set_index(["estimator", "quantity"])["value"]
+    runs = done.runs.set_index("estimator")
+    assert list(dict.fromkeys(runs.index)) == ["ekf", "dead-reckoning"]
+    own = runs.loc["ekf"]
+    assert own["log_likelihood"].mean() == pytest.approx(whole["ekf", "log_likelihood"])
+    measured = done.innovations.groupby("run")
+    counted = measured["nis"].sum() / measured["degrees"].sum()
+    assert own["nis_per_component"].tolist() == pytest.approx(counted.tolist())
+    gated = 1.0 - measured["accepted"].mean()
+    assert own["gated_share"].tolist() == pytest.approx(gated.tolist())
+    assert runs.loc["dead-reckoning", "log_likelihood"].isna().all()
 
 
 def test_an_estimator_needs_no_label(recordings: list[fl.MemorySource]) -> None:

@@ -197,6 +197,13 @@ def test_a_guess_of_a_vehicles_tables_says_what_is_still_to_be_said(tmp_path: Pa
     assert 'deviations.covariance_m2 = ["hdop", "hdop", "hdop"]' in text
     assert text.count("# 1 row a second; 1 gap over 5 s, the longest 19 s.") == 3
     folder, mapping = tmp_path / "one", tmp_path / "guessed.toml"
+    mapping.write_text(text)
+    truth = fl.import_("table", tmp_path, mapping=str(mapping))["/truth/truth"]
+    assert truth.metadata["frame_id"] == "truth.csv"  # it is not in the plane of the first fix
+    placed = fl.import_("table", tmp_path, mapping=str(mapping), origin=[48.137, 11.575])
+    assert {placed[topic].metadata["origin_latitude_deg"] for topic in ("/truth/truth", "/gps/fix")} == {
+        "48.137"
+    }
     folder.mkdir()
     (tmp_path / "gps.csv").rename(folder / "gps.csv")
     mapping.write_text(guess([folder]))

@@ -14,6 +14,7 @@ from recorders.plausibility.motion import Motion
 from recorders.plausibility.speeds import scatter
 from recorders.recording import record_run
 from tests.pipeline.car_d import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
+from tests.pipeline.test_planes import HERE, car
 
 FOUND = {  # of car D with its compass: cause, topic and setting that are named first
     "nothing": None,
@@ -65,6 +66,14 @@ SHEET = {
 def motion_of(streams: Mapping[str, Stream]) -> Motion:
     [body] = bodies(streams)
     return Motion(body)
+
+
+def test_a_winding_road_is_no_wrong_sign() -> None:
+    """Bends of one length: half a period late, the turn rate would be the other way round."""
+    for seed in (4, 7):
+        odometry, fix, _ = car(HERE.metadata, HERE.metadata, seed)
+        told = findings({each.topic: each for each in (odometry, fix)})
+        assert "sign" not in [each.cause for each in told]
 
 
 @pytest.mark.parametrize("name", SHEET)

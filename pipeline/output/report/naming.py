@@ -29,12 +29,12 @@ def _name(result: Result, alike: Sequence[Result]) -> str:
     keys = dict.fromkeys(key for each in settings for key in each if key != ("title",))
     differing = [key for key in keys if any(each.get(key) != own.get(key) for each in settings)]
     lasts = [key[-1] for key in differing]
-    said = [
+    differences = [
         f"{key[-1] if lasts.count(key[-1]) == 1 else '.'.join(key)} "
         + (format_value(own[key]) if key in own else "default")
         for key in differing
     ]
-    return ": ".join(filter(None, [result.experiment, ", ".join(said)]))
+    return ": ".join(filter(None, [result.experiment, ", ".join(differences)]))
 
 
 def _flat(

@@ -50,18 +50,18 @@ def _what_was_run(result: Result, tables: list[MetricTable]) -> str:
 def _of_claims(result: Result) -> str:
     """How many claims hold and how many do not, and the first of these."""
     counts = Counter(claim.verdict for claim in result.claims)
-    said = [f"{counts['confirmed']} of {len(result.claims)} claims confirmed"]
+    sentences = [f"{counts['confirmed']} of {len(result.claims)} claims confirmed"]
     refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
     if refuted:
         named = [f"“{shorten(each, LONGEST_CLAIM, placeholder=' …')}”" for each in refuted[:MOST_CLAIMS]]
         more = f" and {len(refuted) - MOST_CLAIMS} more" if len(refuted) > MOST_CLAIMS else ""
-        said.append(f"{len(refuted)} refuted: {', '.join(named)}{more}")
+        sentences.append(f"{len(refuted)} refuted: {', '.join(named)}{more}")
     for other in ("not shown", "not reproducible"):
         if counts[other]:
-            said.append(f"{counts[other]} {other}")
+            sentences.append(f"{counts[other]} {other}")
     if counts[NO_VERDICT]:
-        said.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
-    return "; ".join(said) + "."
+        sentences.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
+    return "; ".join(sentences) + "."
 
 
 def _best(tables: list[MetricTable], runs: int) -> str:
@@ -102,7 +102,7 @@ def _doubts(tables: list[MetricTable], estimator: str, runs: int) -> list[str]:
     The interval of a single run's NEES is that of one step. Errors of other steps hang together with it,
     so that a run within it is not shown to be inconsistent, and no more; innovations say more.
     """
-    said = []
+    sentences = []
     judged = [
         measured
         for table in tables
@@ -114,19 +114,19 @@ def _doubts(tables: list[MetricTable], estimator: str, runs: int) -> list[str]:
         where = f"lies {measured.place} the 95 % interval {low} to {high}"
         alone = runs == 1 and measured.place == "within"
         meaning = "one run does not show it to be inconsistent" if alone else MEANING[measured.place]
-        said.append(f"its NEES of {format_value(measured.value)} {where}: {meaning}")
-        said += _innovations(tables, estimator) if alone else []
+        sentences.append(f"its NEES of {format_value(measured.value)} {where}: {meaning}")
+        sentences += _innovations(tables, estimator) if alone else []
     elif judged:
         consistent = sum(measured.place == "within" for measured in judged)
         is_so = "one run does not show it to be inconsistent" if runs == 1 else "it is consistent"
-        said.append(f"by NEES {is_so} in {consistent} of {len(judged)} cases")
+        sentences.append(f"by NEES {is_so} in {consistent} of {len(judged)} cases")
     failed = sum(_values(tables, estimator, "failed_runs") or [])
     if failed:
-        said.append(f"{failed:g} of its runs failed")
+        sentences.append(f"{failed:g} of its runs failed")
     share = min(_values(tables, estimator, "estimated_share") or [1.0])
     if share < LEAST_SHARE:
-        said.append(f"it estimated {100 * share:.1f} % of the span")
-    return said
+        sentences.append(f"it estimated {100 * share:.1f} % of the span")
+    return sentences
 
 
 def _innovations(tables: list[MetricTable], estimator: str) -> list[str]:

@@ -271,9 +271,9 @@ def labelled(
     """
     probe, gallery = drawn.impostors(count, rng)
     probe = np.where(rng.random(count) < 0.5, gallery, probe)
-    told = label[probe, gallery]
-    clear = np.abs(told) >= least
-    return Labelled(drawn.ratios[probe, gallery][clear], told[clear] > 0.0)
+    labels = label[probe, gallery]
+    clear = np.abs(labels) >= least
+    return Labelled(drawn.ratios[probe, gallery][clear], labels[clear] > 0.0)
 
 
 def _intervals(table: pd.DataFrame, by: list[str]) -> pd.DataFrame:

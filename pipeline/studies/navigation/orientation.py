@@ -237,14 +237,16 @@ def _measure_disturbances(
     quiet = [name for name in sources if "undisturbed" in name.split("_")]
     if not quiet:
         return
-    told = own[(own["case"] == AS_RECORDED) & own["trial"].isin(quiet)]
+    false_alarms = own[(own["case"] == AS_RECORDED) & own["trial"].isin(quiet)]
     stamps = [sources[name].streams[f"/{name}/inertial"].publish_time_ns for name in quiet]
     added = own[own["case"] == WITH_MAGNET]
     late_s = [
         _noticed_late(added[added["trial"] == name], span) for name in quiet for span in options.magnet_s
     ]
     outcome.metrics |= {
-        f"{options.estimator}.falsely_disturbed_s": float((told["end_s"] - told["begin_s"]).sum()),
+        f"{options.estimator}.falsely_disturbed_s": float(
+            (false_alarms["end_s"] - false_alarms["begin_s"]).sum()
+        ),
         f"{options.estimator}.undisturbed_s": sum(float(each[-1] - each[0]) * 1e-9 for each in stamps),
         f"{options.estimator}.magnet_noticed_late_s": late_s,
     }

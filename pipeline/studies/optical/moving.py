@@ -61,14 +61,14 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
         runner = Runner(experiment.model_copy(update={"estimators": settings}), setting)
         replayed = runner.replay(recorded)
         runner.keep(recorded, replayed.outputs, case, drawn=case if tables else "")
-        told = weakest_directions(recorded[: options.observed_runs], shared)
+        weakest_of = weakest_directions(recorded[: options.observed_runs], shared)
         table = pd.concat([seconds_of(errors) for errors in replayed.errors]).assign(case=case)
         table = table[table["second"] < int(scenario.duration_s)]  # later only by clocks that are ahead
-        outcome.tables[f"observability-{case}"] = told
+        outcome.tables[f"observability-{case}"] = weakest_of
         sigmas = prior_sigmas(scenario)
-        direction = weakest({name: float(told[name].iloc[0]) for name in sigmas}, sigmas)
+        direction = weakest({name: float(weakest_of[name].iloc[0]) for name in sigmas}, sigmas)
         directions.append({"case": case, "weakest_direction": direction})
-        _measure(case, table, told, sigmas, outcome)
+        _measure(case, table, weakest_of, sigmas, outcome)
         tables.append(table)
         sources += recorded
     every = pd.concat(tables, ignore_index=True)
@@ -144,11 +144,15 @@ def _last(table: pd.DataFrame, label: str, quantity: str) -> Floats:
 
 
 def _measure(
-    case: str, table: pd.DataFrame, told: pd.DataFrame, sigmas: Mapping[str, float], outcome: Outcome
+    case: str,
+    table: pd.DataFrame,
+    weakest_of: pd.DataFrame,
+    sigmas: Mapping[str, float],
+    outcome: Outcome,
 ) -> None:
     """Errors at the end, and by intervals over the runs what they are worth."""
     found, labels = outcome.metrics, set(table["estimator"])
-    logs = np.log10(told["least_eigenvalue"])
+    logs = np.log10(weakest_of["least_eigenvalue"])
     found[f"observability.least_eigenvalue.{case}"] = float(10.0 ** logs.mean())
     least = mean_interval(logs.tolist())
     outcome.measure(f"observability.log10_least_eigenvalue.{case}", *least)

@@ -37,22 +37,23 @@ class Place(Parameters):
     """Where a window begins or ends: a part of the plane.
 
     Attributes:
-        x_above_m: least x.
-        x_below_m: greatest x.
-        y_above_m: least y.
-        y_below_m: greatest y.
+        x_above_m: least x; None for any.
+        x_below_m: greatest x; None for any.
+        y_above_m: least y; None for any.
+        y_below_m: greatest y; None for any.
     """
 
-    x_above_m: float = -np.inf
-    x_below_m: float = np.inf
-    y_above_m: float = -np.inf
-    y_below_m: float = np.inf
+    x_above_m: float | None = None
+    x_below_m: float | None = None
+    y_above_m: float | None = None
+    y_below_m: float | None = None
 
     def holds(self, position: Floats) -> Booleans:
         """Which positions (n, 2) lie there."""
-        x, y = position.T
-        inside = (x > self.x_above_m) & (x <= self.x_below_m)
-        return inside & (y > self.y_above_m) & (y <= self.y_below_m)
+        above = np.array([self.x_above_m, self.y_above_m], float)
+        below = np.array([self.x_below_m, self.y_below_m], float)
+        outside = (position <= above) | (position > below)  # nothing is outside a limit that is none
+        return np.asarray((np.isfinite(position) & ~outside).all(axis=1))
 
 
 class Window(Parameters):

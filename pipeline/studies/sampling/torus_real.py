@@ -165,15 +165,17 @@ def _judge_predictions(
     options: Options,
     outcome: Outcome,
 ) -> None:
-    said = {name: predict(wind, run, found[name]) for name, run in FILTERS.items()}
-    said["grid"] = predict_on_grid(wind, found["torus"], options.grid_cells)
-    said |= persistence(wind, half)
+    predictions = {name: predict(wind, run, found[name]) for name, run in FILTERS.items()}
+    predictions["grid"] = predict_on_grid(wind, found["torus"], options.grid_cells)
+    predictions |= persistence(wind, half)
     rows = [
         pd.DataFrame({"hour": np.arange(1, len(wind)), "predictor": name, **each._asdict()})
-        for name, each in said.items()
+        for name, each in predictions.items()
     ]
     outcome.tables["wind"] = pd.concat(rows, ignore_index=True)
-    later = {name: Prediction(*(each[half - 1 :] for each in both)) for name, both in said.items()}
+    later = {
+        name: Prediction(*(each[half - 1 :] for each in both)) for name, both in predictions.items()
+    }
     for name, each in later.items():
         outcome.metrics[f"{name}.log_density.wind"] = float(each.log_density.mean())
         outcome.metrics[f"{name}.error_rad.wind"] = float(each.error_rad.mean())
@@ -264,17 +266,17 @@ def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -
     measured = _measured(wind)
     prior = wrapped_normal.density(WrappedNormal(np.array([wind[0], 0.0]), _PRIOR), torus_grid(cells))
     begin = (prior / prior.sum())[None]
-    said = run_torus_grid_filter(
+    filtered = run_torus_grid_filter(
         _model(parameters), begin, np.array([0, len(measured)]), measured, turn_on
     )
-    return Prediction(said.log_density, np.abs(wrap_angle(wind[1:] - said.predicted[:, 0])))
+    return Prediction(filtered.log_density, np.abs(wrap_angle(wind[1:] - filtered.predicted[:, 0])))
 
 
 def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
     """The next hour is like this one, up to a wrapped normal; or, now and then, any direction."""
     turn = np.diff(wind)
 
-    def said(x: Floats, share: float) -> Prediction:
+    def predicted(x: Floats, share: float) -> Prediction:
         normal = _of_normal(turn, np.exp(2.0 * x[0]))
         log_density = np.logaddexp(
             np.log1p(-share) + normal.log_density, np.log(max(share, 1e-300) / (2.0 * np.pi))
@@ -283,13 +285,13 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
     def cost(x: Floats) -> float:
         share = 0.0 if len(x) == 1 else float(expit(x[1]))
-        return -float(said(x, share).log_density[: half - 1].sum())
+        return -float(predicted(x, share).log_density[: half - 1].sum())
 
     plain = minimize(cost, [np.log(0.5)], method="Nelder-Mead").x
     with_jumps = minimize(cost, [np.log(0.3), -2.0], method="Nelder-Mead").x
     return {
-        "persistence": said(plain, 0.0),
-        "persistence-with-jumps": said(with_jumps, float(expit(with_jumps[1]))),
+        "persistence": predicted(plain, 0.0),
+        "persistence-with-jumps": predicted(with_jumps, float(expit(with_jumps[1]))),
     }
 
 

@@ -82,7 +82,7 @@ def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
     place = errors.position
     error, covariance = errors.error[:, place], errors.covariance[:, place][:, :, place]
     squared = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    said = pd.DataFrame(
+    estimated = pd.DataFrame(
         {
             "run": errors.run,
             "time_ns": errors.time_ns,
@@ -96,7 +96,7 @@ def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
         if each.case == errors.case
     ]
     wanted = pd.concat(stamps).drop_duplicates().sort_values("time_ns")
-    rows = pd.merge_asof(wanted, said.sort_values("time_ns"), on="time_ns", by="run").dropna()
+    rows = pd.merge_asof(wanted, estimated.sort_values("time_ns"), on="time_ns", by="run").dropna()
     return rows.assign(estimator=errors.estimator, case=errors.case, inside=rows["inside"].astype(bool))
 
 

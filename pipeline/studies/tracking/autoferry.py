@@ -1,8 +1,8 @@
 """The study of Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
 
 Quays, marks and other craft have no reference: GOSPA leaves out what is farther than 50 m from both
-vessels (in the sheet's words, G50). Trackers are replayed in the order of the stamps, and some of them
-again in the order of arrival, with each way to take late scans.
+vessels. Trackers are replayed in the order of the stamps, and some of them again in the order of
+arrival, with each way to take late scans.
 """
 
 from collections.abc import Mapping, Sequence

@@ -51,19 +51,19 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
     return sizes, tracks
 
 
-def figures_of(told: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
-    """What the tracks of a run are worth, told at the instants of the truths (targets, k, 2).
+def figures_of(tracked: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
+    """What the tracks of a run are worth, tracked at the instants of the truths (targets, k, 2).
 
     Figures of whole tracks leave out those that are never within the cutoff of a target: a track's
     length is the time from its first to its last instant, and trajectory GOSPA is divided by the root
     of the number of instants, so that it is as large as GOSPA.
     """
-    tracks = as_trajectories(told)
+    tracks = as_trajectories(tracked)
     away = np.linalg.norm(tracks[:, None] - truths[None], axis=3)
     near = tracks[np.nanmin(away, axis=(1, 2), initial=np.inf) < CUTOFF_M]
     lengths_s = [np.ptp(np.flatnonzero(there)) * PERIOD_S for there in np.isfinite(near[..., 0])]
     whole = trajectory_gospa(near, truths, CUTOFF_M, SWITCH_PENALTY_M)
-    return track_figures(track_errors(told, truths)) | {
+    return track_figures(track_errors(tracked, truths)) | {
         "tracks": float(len(near)),
         "track_length_s": float(np.mean(lengths_s)) if lengths_s else float("nan"),
         "trajectory_gospa_m": whole.total / np.sqrt(truths.shape[1]),
@@ -82,8 +82,8 @@ def table_of(
     rows = []
     for label in labels:
         for run, (name, at) in enumerate(runs.items()):
-            told = tracks_at(*sets_of(outputs, label, run), at.time_ns, round(delay_s * 1e9))
-            rows.append({"estimator": label, "run": name, **figures_of(told, at.truths)})
+            tracked = tracks_at(*sets_of(outputs, label, run), at.time_ns, round(delay_s * 1e9))
+            rows.append({"estimator": label, "run": name, **figures_of(tracked, at.truths)})
     return pd.DataFrame(rows)
 
 

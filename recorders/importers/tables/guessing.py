@@ -85,12 +85,12 @@ def _warnings(text: str) -> Iterator[str]:
     namespaces = dict.fromkeys(re.findall(r'^topic = "(/.+)/', text, re.MULTILINE))
     if len(namespaces) > 1:
         yield f"# The topics lie in {len(namespaces)} namespaces, {', '.join(namespaces)}."
-        yield "# An estimator takes those of one: give all topics of one vehicle the same, such as"
-        yield "# /car/odometry, /car/fix and /car/truth."
+        yield "# They are taken for one vehicle's while none of a kind is there twice; better give all"
+        yield "# of one vehicle the same, such as /car/odometry, /car/fix and /car/truth."
     becomes = re.findall(r'^becomes = "(\w+)"', text, re.MULTILINE)
     if {"GeodeticFix", "TruthState"} <= {*becomes}:
-        yield "# The truth is in a plane, fixes are latitudes and longitudes. Where the plane touches"
-        yield "# (by default at the first fix, from which the truth may be shifted):"
+        yield "# The truth is in a plane, fixes are latitudes and longitudes. Without where the plane"
+        yield "# touches, here or as --origin LATITUDE,LONGITUDE,HEIGHT, the truth judges nothing:"
         yield "# [origin]"
         yield "# latitude_deg = "
         yield "# longitude_deg = "

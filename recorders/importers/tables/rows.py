@@ -17,7 +17,7 @@ from recorders.importers.tables.plane import Plane
 from recorders.importers.tables.times import NOT_A_TIME, Stamps, TimeMapping, read_counter, stamps_ns
 from recorders.importers.units import conversion
 from recorders.log import Stream, make_stream
-from recorders.log.planes import is_planar
+from recorders.log.planes import FRAME, is_planar
 
 PLACE = ("east_m", "north_m", "up_m")
 QUATERNION = tuple(f"quaternion_{part}" for part in "wxyz")
@@ -283,7 +283,8 @@ class Rows:
             metadata["delay_s"] = repr(own.delay_s)
         if plane is not None and is_planar(schema_of(own, where).full_name, metadata):
             is_geodetic = self.mapping.geodetic is not None or own.becomes == "GeodeticFix"
-            metadata |= plane.metadata if plane.is_stated or is_geodetic else {}
+            own_frame = {FRAME: self.path.name}  # nobody says where on earth that is
+            metadata |= plane.metadata if plane.is_stated or is_geodetic else own_frame
         columns = {name: checked(where, name, column[rows]) for name, column in found.columns.items()}
         for name, sigma in own.noise.items():
             columns[name] = columns[name] + sigma * self._generator.normal(size=columns[name].shape)

@@ -13,7 +13,13 @@ from recorders.log import Schema, Stream, make_stream, schemas
 from replay.engine.api.inputs import Floats, Integers, Messages, Skipped
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import Failure, reason_stream
-from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream, states_in
+from replay.engine.streams.results import (
+    InnovationColumns,
+    failures_by_run,
+    innovation_stream,
+    state_stream,
+    states_in,
+)
 from replay.engine.vectors.components import Components
 from replay.engine.vectors.tangent import tangent_components
 
@@ -171,17 +177,16 @@ class Outputs:
 
     def _innovations_of_block(self, messages: Messages, results: Results) -> Ragged:
         rows = np.flatnonzero(np.isfinite(results.squared))
-        stream = innovation_stream(
-            f"{self.topic}/innovation",
+        columns = InnovationColumns(
             messages.time_ns[rows],
-            self.measured,
-            self.truth,
-            target_id=results.target[rows],
-            accepted=results.accepted[rows],
-            innovation=results.innovation[rows],
-            covariance=results.innovation_covariance[rows],
-            squared=results.squared[rows],
+            results.target[rows],
+            results.accepted[rows],
+            results.innovation[rows],
+            results.innovation_covariance[rows],
+            results.squared[rows],
         )
+        topic = f"{self.topic}/innovation"
+        stream = innovation_stream(topic, self.measured, self.truth, columns)
         return Ragged(stream, np.searchsorted(rows, messages.offsets))
 
     def _further_of_block(self, messages: Messages, told: Floats) -> Iterator[Ragged]:
@@ -223,17 +228,10 @@ class Outputs:
         time_ns, innovation, covariance = self._checked("innovations.", told[:3], ((), (m,), (m, m)))
         count = len(time_ns)
         weighted = np.linalg.solve(covariance, innovation[..., None])[..., 0]
-        return innovation_stream(
-            f"{self.topic}/innovation",
-            time_ns,
-            self.measured,
-            self.truth,
-            target_id=np.zeros(count, np.int64) if told.target is None else told.target,
-            accepted=np.ones(count, np.int64),
-            innovation=innovation,
-            covariance=covariance,
-            squared=np.einsum("ni,ni->n", innovation, weighted),
-        )
+        target = np.zeros(count, np.int64) if told.target is None else told.target
+        squared, accepted = np.einsum("ni,ni->n", innovation, weighted), np.ones(count, np.int64)
+        columns = InnovationColumns(time_ns, target, accepted, innovation, covariance, squared)
+        return innovation_stream(f"{self.topic}/innovation", self.measured, self.truth, columns)
 
     def _checked(
         self, part: str, arrays: Sequence[Any], shapes: Sequence[tuple[int, ...]]

@@ -12,8 +12,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from recorders.errors import BadInput
-from recorders.log import Clock, Topic
+from recorders.log import Clock, Stream, Topic
 from recorders.parameters import Parameters, ParametersType, build
 from recorders.registry import foreign_code, load
 from replay.engine.compiling.kernel_source import DoesNotCompile
@@ -50,6 +53,34 @@ class Initialization:
     ) = None
 
 
+@dataclass(frozen=True)
+class Reading:
+    """Describes what an estimator reads of its topics and parameters, as its model's functions do.
+
+    Attributes:
+        controls: the topics that drive it.
+        kinds: by topic, the kinds of the numbers that it reads of a message: controls, or what is
+            measured.
+        numbers: stream of one of these topics -> these numbers (n, m); NaN where one is missing.
+        noises: parameters that are standard deviations of noise, with the topic of the sensor whose it
+            is; "" for that of the motion.
+        augmentable: parameters that may be estimated beside the state, each with its kind and the
+            topics of what reads it, "" for the motion.
+        biases, factors: by topic and the place of a number, the parameter that is added to it, or that
+            it is multiplied by: to a control, or to what is measured.
+        delays: by topic, the parameter that says how late its messages are.
+    """
+
+    controls: tuple[str, ...]
+    kinds: Mapping[str, tuple[str, ...]]
+    numbers: Callable[[Stream], NDArray[np.float64]]
+    noises: Mapping[str, str]
+    augmentable: Mapping[str, tuple[str, tuple[str, ...]]]
+    biases: Mapping[tuple[str, int], str]
+    factors: Mapping[tuple[str, int], str]
+    delays: Mapping[str, str]
+
+
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
 @dataclass(frozen=True, eq=False)
 class Recursive:
@@ -77,6 +108,7 @@ class Recursive:
         is_random: whether it draws random numbers, so that its likelihood is no smooth function of its
             parameters.
         offers: by topic that it does not take, the setting with which it would.
+        reading: what it reads; None where that is not known.
     """
 
     name: str
@@ -93,6 +125,7 @@ class Recursive:
     assumed: Mapping[str, float] = field(default_factory=dict)
     is_random: bool = False
     offers: Mapping[str, str] = field(default_factory=dict)
+    reading: Callable[[], Reading] | None = None
 
 
 @renamed(whole="static")

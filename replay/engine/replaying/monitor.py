@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Clock, make_stream, schemas
 from recorders.log.planes import Origin, in_plane
+from replay.engine.compiling.scratch import Scratch
 from replay.engine.replaying.coverage import Coverage
 from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
 from replay.engine.replaying.usage import Usage
@@ -128,7 +129,7 @@ class RunMonitor:
             if schema == FAILURE:
                 self._told.setdefault(topic, []).append(each)
                 continue
-            if schema == GAUSSIAN:
+            if schema == GAUSSIAN and self.plane is not None:
                 passed.append(replace(each, stream=in_plane(each.stream, self.plane)))
             else:
                 passed.append(each)
@@ -271,7 +272,7 @@ class RunMonitor:
             covariance,
             rows,
             found,
-            scratch=partial(np.empty, (size, size)),
+            scratch=_factor_of(size),
         )
         bad = np.flatnonzero(found >= 0)
         for run in bad:
@@ -319,6 +320,11 @@ class RunMonitor:
             silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
             reason = f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
             self._failed[run] = Failure(int(last_ns[run]), reason)
+
+
+@lru_cache(maxsize=64)
+def _factor_of(size: int) -> Scratch:
+    return Scratch(partial(np.empty, (size, size)))
 
 
 @lru_cache(maxsize=64)

@@ -1,7 +1,7 @@
 """Makes streams of what estimators return: states, innovations, skipped messages, failures."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,33 +92,42 @@ def states_in(
     return Ragged(stream, np.searchsorted(rows, offsets))
 
 
+class InnovationColumns(NamedTuple):
+    """Holds innovations as their stream has them.
+
+    Attributes:
+        time_ns: (n,) stamps.
+        target_id, accepted: (n,) what each was about, and whether a gate let it in.
+        innovation, covariance: (n, m), (n, m, m).
+        squared: (n,), the NIS.
+        log_likelihood: (n,); None where it is not known.
+    """
+
+    time_ns: Integers
+    target_id: NDArray
+    accepted: NDArray
+    innovation: Floats
+    covariance: Floats
+    squared: Floats
+    log_likelihood: Floats | None = None
+
+
 def innovation_stream(
-    topic: str,
-    time_ns: Integers,
-    components: Mapping[str, str],
-    truth: str,
-    *,
-    target_id: Any,
-    accepted: Any,
-    innovation: Floats,
-    covariance: Floats,
-    squared: Floats,
-    log_likelihood: Floats | None = None,
+    topic: str, components: Mapping[str, str], truth: str, columns: InnovationColumns
 ) -> Stream:
-    """Make the stream of innovations (n, m), covariances (n, m, m), NIS (n,) and log-likelihood."""
-    if log_likelihood is None:
-        log_likelihood = np.full(len(time_ns), np.nan)
+    """Make the stream of innovations, of the components that are measured together."""
+    unknown, likelihood = np.full(len(columns.time_ns), np.nan), columns.log_likelihood
     return make_stream(
         topic,
         schemas.INNOVATION,
-        time_ns,
+        columns.time_ns,
         metadata={**named(components), "truth": truth},
-        target_id=target_id,
-        accepted=accepted,
-        innovation=innovation,
-        covariance=rows_of(covariance),
-        normalised_innovation_squared=squared,
-        log_likelihood=log_likelihood,
+        target_id=columns.target_id,
+        accepted=columns.accepted,
+        innovation=columns.innovation,
+        covariance=rows_of(columns.covariance),
+        normalised_innovation_squared=columns.squared,
+        log_likelihood=unknown if likelihood is None else likelihood,
     )
 
 

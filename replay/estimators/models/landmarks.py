@@ -18,7 +18,7 @@ from replay.engine.arrays import Floats
 from replay.engine.streams.measurements import PLANE
 from replay.engine.vectors.tangent import Kind
 from replay.inference.all_methods import modelled
-from replay.inference.model.model import Control, Map, Model, Motion, Sensor
+from replay.inference.model.model import FIX, POSITION, Control, Map, Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.start import Start
 
@@ -56,6 +56,8 @@ class LocalizationParameters(DeadReckoningParameters):
         sigma_bearing_rad: standard deviation of a bearing.
         bias_range_m: ranges are too long by so much.
         bias_bearing_rad: bearings are too large by so much.
+        lever_x_m, lever_y_m: where the antenna whose position fixes say is on the robot, ahead of and to
+            the left of the point that it turns about.
     """
 
     sigma_heading_rad: PositiveFloat | None = None
@@ -63,6 +65,8 @@ class LocalizationParameters(DeadReckoningParameters):
     sigma_bearing_rad: PositiveFloat | None = None
     bias_range_m: float = 0.0
     bias_bearing_rad: float = 0.0
+    lever_x_m: float = 0.0
+    lever_y_m: float = 0.0
     gate_probability: Annotated[float, Field(gt=0, le=1)] = 0.999
 
 
@@ -118,6 +122,18 @@ def range_noise(parameters: Any) -> Components:
 def bearing_noise(parameters: Any) -> Components:
     """Variance of the bearing."""
     return (parameters.sigma_bearing_rad**2,)
+
+
+def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
+    """Where the antenna is."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    forward, left = parameters.lever_x_m, parameters.lever_y_m
+    return pose[0] + cosine * forward - sine * left, pose[1] + sine * forward + cosine * left
+
+
+def fix_noise(parameters: Any) -> Components:
+    """Variances of a fix that does not state them."""
+    return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
 def pose_itself(pose: Components, reference: Any, parameters: Any) -> Components:
@@ -204,6 +220,7 @@ RANGE: Mapping[str, Kind] = {"range_m": "linear"}
 BEARING: Mapping[str, Kind] = {"bearing_rad": "angle"}
 DRIVE_ERRORS: Mapping[str, Kind] = {"forward_scale": "linear", "turn_bias_radps": "linear"}
 SIGHT_ERRORS: Mapping[str, Kind] = {"bias_range_m": "linear", "bias_bearing_rad": "angle"}
+LEVER: Mapping[str, Kind] = {"lever_x_m": "linear", "lever_y_m": "linear"}
 MOTION = Motion(move, control_noise=velocity_noise)
 TURN_RATE = Control("turn_rate", schemas.INERTIAL_SAMPLE, ("turn_radps",), read_turn_rate)
 ODOMETRY = Control(
@@ -254,11 +271,20 @@ ROBOT = Model(
             covariance=read_heading_covariance,
             linear=True,
         ),
+        Sensor(
+            FIX,
+            schemas.POSITION_FIX,
+            {name: POSE[name] for name in POSITION[:2]},
+            antenna,
+            fix_noise,
+            vector="position_m",
+            covariance="covariance_m2",
+        ),
     ),
     MOTION,
     control=ODOMETRY,
     output="pose",
-    augmentable={**SIGHT_ERRORS, **DRIVE_ERRORS},
+    augmentable={**SIGHT_ERRORS, **DRIVE_ERRORS, **LEVER},
     start=START,
 )
 RECKONING = Model(

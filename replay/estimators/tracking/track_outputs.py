@@ -9,7 +9,7 @@ from recorders.log import make_stream, schemas
 from replay.engine.arrays import Integers
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.results import innovation_stream, named
+from replay.engine.streams.results import InnovationColumns, innovation_stream, named
 from replay.estimators.tracking.scan_sensors import KINDS
 from replay.estimators.tracking.scans import SensorTopics
 from replay.inference.association.outputs import TrackOutputs
@@ -159,15 +159,14 @@ def _innovations(
         measured = KINDS[kind].measured
         size = len(measured)
         root, whitened = np.tril(factor[rows, :size, :size]), white[rows, :size]
-        stream = innovation_stream(
-            f"{topic}{scan_topic.removesuffix('/scan')}/innovation",
+        columns = InnovationColumns(
             scans.time_ns[pair[rows, 1]],
-            measured,
-            "",
-            target_id=pair[rows, 0],
-            accepted=np.ones(len(rows), np.int64),
-            innovation=np.einsum("nij,nj->ni", root, whitened),
-            covariance=root @ root.transpose(0, 2, 1),
-            squared=(whitened**2).sum(axis=1),
+            pair[rows, 0],
+            np.ones(len(rows), np.int64),
+            np.einsum("nij,nj->ni", root, whitened),
+            root @ root.transpose(0, 2, 1),
+            (whitened**2).sum(axis=1),
         )
+        own = f"{topic}{scan_topic.removesuffix('/scan')}/innovation"
+        stream = innovation_stream(own, measured, "", columns)
         yield Ragged(stream, np.searchsorted(rows, _bounds(ends)))

@@ -24,7 +24,12 @@ from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import numbered, stated
 from replay.engine.streams.failures import Failure, reason_stream
 from replay.engine.streams.measurements import PLANE, read_fixes, read_vectors
-from replay.engine.streams.results import failures_by_run, innovation_stream, state_stream
+from replay.engine.streams.results import (
+    InnovationColumns,
+    failures_by_run,
+    innovation_stream,
+    state_stream,
+)
 from replay.engine.vectors.components import Components, components_of
 from replay.estimators.vehicles.association import MISSED, Scanning
 from replay.estimators.vehicles.updates import (
@@ -336,17 +341,16 @@ def outputs_of(
             np.linalg.inv(spread[is_associated]),
             innovation[is_associated],
         )
-        stream = innovation_stream(
-            f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation",
+        columns = InnovationColumns(
             frames.time_ns[is_associated],
-            PLANE,
-            "",
-            target_id=detection[is_associated] + 1,
-            accepted=np.ones(is_associated.sum(), np.int64),
-            innovation=innovation[is_associated],
-            covariance=spread[is_associated],
-            squared=squared,
+            detection[is_associated] + 1,
+            np.ones(is_associated.sum(), np.int64),
+            innovation[is_associated],
+            spread[is_associated],
+            squared,
         )
+        topic = f"/estimates/{setup.name}/vehicle{setup.numbers[vehicle]}/innovation"
+        stream = innovation_stream(topic, PLANE, "", columns)
         return Ragged(stream, np.concatenate([[0], np.cumsum(is_associated.sum(axis=1))]))
 
     vehicles = setup.motion.vehicles

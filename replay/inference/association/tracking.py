@@ -8,12 +8,13 @@ and a management says which tracks are those of targets, and which end (`track_m
 
 from collections.abc import Callable
 from functools import lru_cache, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from replay.engine.arrays import Floats, Function
 from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.results import ALL_WELL
 from replay.inference.association.association import ASSOCIATIONS
 from replay.inference.association.births import beginning, births_of, ending
 from replay.inference.association.outputs import (
@@ -43,9 +44,18 @@ from replay.inference.association.tracker import (
     moving,
 )
 from replay.inference.association.tracks import NEVER, Tracks
-from replay.inference.kalman.steps import Interval
+from replay.inference.kalman.steps import UNKNOWN, Interval
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.settings import reading_settings
+from replay.inference.run.loops import over_events
+
+
+class ScanInputs(NamedTuple):
+    """Holds what a tracker goes by: scans, parameters (sensors, names), and a new target."""
+
+    events: Scans
+    settings: Floats
+    newborn: Newborn
 
 
 def tracking(tracker: Tracker, read: Function) -> Function:
@@ -58,38 +68,46 @@ def tracking(tracker: Tracker, read: Function) -> Function:
     end_tracks, begin_tracks = ending(tracker), beginning(tracker)
     write_pairs, write_tracks = writing_pairs(tracker.sizes[0]), writing_tracks(stage)
 
-    def follow(
+    def take_scan(
         run: int,
-        scans: Scans,
-        settings: Floats,
-        newborn: Newborn,
+        scan: int,
+        inputs: ScanInputs,
         tracks: Tracks,
         outputs: TrackOutputs,
         memory: ScanMemory,
-    ) -> None:
-        """Take one run through its scans."""
-        for scan in range(scans.offsets[run], scans.offsets[run + 1]):
-            p = read(settings, scans.sensor[scan])
-            if scans.time_ns[scan] < tracks.time_ns[run]:
-                continue
-            advance(run, scans.time_ns[scan], tracks, p, memory)
-            count = join_near(scans.first[scan], scans.end[scan], scans, p.joined_within_m, memory)
-            weigh(run, scan, count, scans, tracks, p, memory)
-            used = tracks.used[run]
-            outputs.approximated[scan] = associate(
-                memory.weights, used, count, memory.probability, memory.association
-            )
-            for detection in range(count):
-                memory.left[detection] = 1.0
-                for place in range(used):
-                    memory.left[detection] -= memory.probability[place, 1 + detection]
-            write_pairs(run, scan, count, tracks, outputs, memory)
-            process(run, scan, count, scans, tracks, p, memory)
-            end_tracks(run, tracks, p)
-            outputs.turned_away[scan] = begin_tracks(run, scan, count, scans, tracks, newborn, p, memory)
-            write_tracks(run, scan, tracks, outputs, memory)
+    ) -> int:
+        """Take the tracks of a run through a scan; one from before their time says nothing."""
+        scans = inputs.events
+        p = read(inputs.settings, scans.sensor[scan])
+        if scans.time_ns[scan] < tracks.time_ns[run]:
+            return UNKNOWN
+        advance(run, scans.time_ns[scan], tracks, p, memory)
+        count = join_near(scans.first[scan], scans.end[scan], scans, p.joined_within_m, memory)
+        weigh(run, scan, count, scans, tracks, p, memory)
+        used = tracks.used[run]
+        outputs.approximated[scan] = associate(
+            memory.weights, used, count, memory.probability, memory.association
+        )
+        for detection in range(count):
+            memory.left[detection] = 1.0
+            for place in range(used):
+                memory.left[detection] -= memory.probability[place, 1 + detection]
+        write_pairs(run, scan, count, tracks, outputs, memory)
+        process(run, scan, count, scans, tracks, p, memory)
+        end_tracks(run, tracks, p)
+        outputs.turned_away[scan] = begin_tracks(
+            run, scan, count, scans, tracks, inputs.newborn, p, memory
+        )
+        return ALL_WELL
 
-    return follow
+    def record(
+        run: int, scan: int, _: ScanInputs, tracks: Tracks, outputs: TrackOutputs, memory: ScanMemory
+    ) -> int:
+        """Fill in the tracks after a scan."""
+        write_tracks(run, scan, tracks, outputs, memory)
+        return ALL_WELL
+
+    return over_events(take_scan, record, fails=False)
 
 
 def advancing(tracker: Tracker) -> Function:
@@ -248,7 +266,8 @@ def track_scans(
         )
         outputs = blank_outputs(batch, runs, places, tracker.sizes)
         memory = partial(_memory, tracker, places, largest)
-        _compiled(tracker)(runs, batch, settings, newborn, tracks, outputs, scratch=memory)
+        inputs = ScanInputs(batch, settings, newborn)
+        _compiled(tracker)(runs, inputs, tracks, outputs, scratch=memory)
         said.append((batch, outputs))
     return tracks, said
 

@@ -149,18 +149,11 @@ def _checked(
         by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
         found = [f"derivatives by {by}", "angles, jumps and lengths"]
         found += ["linear"] if part.linear else []
-        written = part.jacobians if isinstance(part, Motion) else part.jacobian
-        found += ["derivatives by hand"] if written is not None else []
-        states_noise = isinstance(part, Motion) or not part.covariance
-        if part.noise is None:
-            found.append("no noise is declared")
-        else:
-            found.append("variances" if states_noise else "no variances, which messages state")
+        of_messages = isinstance(part, Sensor) and part.covariance
+        found += ["variances"] if part.noise is not None and not of_messages else []
         said.append(f"{call.what}: {'; '.join(found)}")
-    for name, has in (("moments", any(part.moments for part in parts)), ("start", model.start)):
-        if has:
-            said.append(f"{name}: not checked")
-    return Checked(said)
+    others = {"moments": any(part.moments for part in parts), "start": model.start is not None}
+    return Checked([*said, *(f"{name}: not checked" for name, has in others.items() if has)])
 
 
 def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:

@@ -123,16 +123,15 @@ def moving(stage: Stage, by_control: int) -> Function:
     scatter = add if is_additive else nothing
 
     def predict(run: int, cloud: Cloud, interval: Interval, memory: ParticleMemory) -> bool:
-        control, duration_s, parameters, _ = interval
         states, offsets, key = cloud.states[run], cloud.offsets[run], cloud.key[run]
         cloud.counter[run] = resample(states, cloud.weight[run], key, cloud.counter[run], memory)
         cloud.counter[run] = fill_normals(memory.numbers, memory.words, key, cloud.counter[run])
-        if not spread(states, offsets, duration_s, parameters, memory):
+        if not spread(states, offsets, interval, memory):
             return False
         for i in range(len(states)):
             drawn = memory.drawn[i]
-            driven = drive(control, drawn, duration_s, parameters, memory)
-            fill(states[i], move(read_state(states[i]), driven, drawn, duration_s, parameters, memory))
+            driven = drive(interval, drawn, memory)
+            fill(states[i], move(read_state(states[i]), driven, drawn, interval, memory))
             scatter(states[i], offsets[i])
         return True
 
@@ -171,56 +170,43 @@ def effective_number(weight: Floats) -> float:
 
 
 def _driving(stage: Stage) -> Function:
-    """Make `drive(control, drawn, duration_s, parameters, memory)`: a particle's control, as a tuple."""
+    """Make `drive(interval, drawn, memory)`: a particle's control, as a tuple."""
     controls, variances = stage.model.controls, stage.motion.control_noise
     read, fill = tuple_of(controls), filling(controls)
     if variances is None:
 
-        def as_stated(
-            control: Floats, drawn: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
-        ) -> Any:
-            return read(control)
+        def as_stated(interval: Interval, drawn: Floats, memory: ParticleMemory) -> Any:
+            return read(interval.control)
 
         return as_stated
 
-    def with_error(
-        control: Floats, drawn: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
-    ) -> Any:
-        fill(memory.control, variances(duration_s, parameters))
+    def with_error(interval: Interval, drawn: Floats, memory: ParticleMemory) -> Any:
+        fill(memory.control, variances(interval.duration_s, interval.parameters))
         for k in range(controls):
-            memory.control[k] = control[k] + np.sqrt(memory.control[k]) * drawn[k]
+            memory.control[k] = interval.control[k] + np.sqrt(memory.control[k]) * drawn[k]
         return read(memory.control)
 
     return with_error
 
 
 def _moved(stage: Stage, first: int) -> Function:
-    """Make `moved(state, driven, drawn, duration_s, parameters, memory)`: a state after the motion."""
+    """Make `moved(state, driven, drawn, interval, memory)`: a state after the motion."""
     move, variances, noises = stage.motion.move, stage.motion.noise, stage.motion.noises
     if not noises:
 
         def without(
-            state: Any,
-            driven: Any,
-            drawn: Floats,
-            duration_s: float,
-            parameters: Any,
-            memory: ParticleMemory,
+            state: Any, driven: Any, drawn: Floats, interval: Interval, memory: ParticleMemory
         ) -> Any:
-            return move(state, driven, duration_s, parameters)
+            return move(state, driven, interval.duration_s, interval.parameters)
 
         return without
     assert variances is not None
     read, fill = tuple_of(noises), filling(noises)
 
     def with_noise(
-        state: Any,
-        driven: Any,
-        drawn: Floats,
-        duration_s: float,
-        parameters: Any,
-        memory: ParticleMemory,
+        state: Any, driven: Any, drawn: Floats, interval: Interval, memory: ParticleMemory
     ) -> Any:
+        _, duration_s, parameters, _ = interval
         fill(memory.noise, variances(state, duration_s, parameters))
         for k in range(noises):
             memory.noise[k] = np.sqrt(memory.noise[k]) * drawn[first + k]
@@ -229,14 +215,12 @@ def _moved(stage: Stage, first: int) -> Function:
     return with_noise
 
 
-def _no_noise(
-    states: Floats, offsets: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
-) -> bool:
+def _no_noise(states: Floats, offsets: Floats, interval: Interval, memory: ParticleMemory) -> bool:
     return True
 
 
 def _additive_noise(stage: Stage, first: int) -> Function:
-    """Make `spread(states, offsets, duration_s, parameters, memory)`: draws of the additive noise.
+    """Make `spread(states, offsets, interval, memory)`: draws of the additive noise.
 
     They are tangent vectors, at the states before they move. Noise is factored anew only where it is
     not that of the particle before. False where a covariance is not positive semidefinite.
@@ -254,9 +238,8 @@ def _additive_noise(stage: Stage, first: int) -> Function:
         add_noise(lower, variances)
         return semidefinite_cholesky(lower, lower, t)
 
-    def spread(
-        states: Floats, offsets: Floats, duration_s: float, parameters: Any, memory: ParticleMemory
-    ) -> bool:
+    def spread(states: Floats, offsets: Floats, interval: Interval, memory: ParticleMemory) -> bool:
+        _, duration_s, parameters, _ = interval
         before, drawn = noise(read_state(states[0]), duration_s, parameters), memory.drawn[:, first:]
         if not factored(memory.lower, before):
             return False

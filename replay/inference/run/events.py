@@ -8,16 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.blocks import Block, Ragged, ragged_rows
+from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import GEODETIC, in_plane
 from replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
 from replay.inference.kalman.update import reading
 from replay.inference.model.binding import Found
 from replay.inference.model.model import Control, Map, Sensor
 from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
+from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 from replay.inference.run.timing import last_of_stamps, select_events, where_wanted
@@ -176,7 +177,7 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     """Read a control into the columns of its components; NaN where they come from elsewhere."""
     count, names = len(ragged), control.components
     data = np.full((count, width), np.nan)
-    read = _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
+    read = control_numbers(control, ragged)
     for name, numbers in zip(names, read.T, strict=True):
         if name in columns:
             data[:, columns[name]] = numbers
@@ -184,6 +185,12 @@ def _control_table(control: Control, ragged: Ragged, width: int, columns: Mappin
     if control.interpolated:  # one that is not finite is as if it had not come
         without_covariance |= ~np.isfinite(read).all(axis=1)
     return Table(data, np.full(count, CONTROL), np.zeros(count, np.int64), without_covariance)
+
+
+def control_numbers(control: Control, ragged: Ragged) -> Floats:
+    """Read what drives the motion (n, components)."""
+    names = control.components
+    return _computed(control.read, ragged, len(names)) if control.read else _fields(ragged.stream, names)
 
 
 def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, settings: Floats) -> Table:
@@ -209,9 +216,8 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     stream = ragged.stream
     source, target = np.full(len(stream), number), np.zeros(len(stream), np.int64)
     without_covariance = np.zeros(len(stream), bool)
-    parts = []
     if sensor.covariance:
-        value, spread, without_covariance = _with_covariance(sensor, ragged)
+        value, spread, without_covariance = with_covariance(sensor, ragged)
         variances = np.array(sensor.noise(parameters) if sensor.noise else np.nan, float)
         if np.isfinite(variances).all():
             spread[without_covariance], without_covariance = (
@@ -220,12 +226,8 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
             )
         without_covariance = without_covariance | np.isnan(value).all(axis=1)
         parts = [value, spread[:, *np.tril_indices(m)]]
-    elif sensor.read:
-        parts = [_computed(sensor.read, ragged, m)]
-    elif sensor.vector:
-        parts = [read_vectors(stream, sensor.vector, sensor.measured)]
     else:
-        parts = [_fields(stream, tuple(sensor.measured))]
+        parts = [without_covariance_of(sensor, ragged)]
     reference: list[Floats] = []
     if sensor.maps:
         target = stream[sensor.maps[0].of].astype(np.int64)
@@ -249,7 +251,16 @@ def sensor_table(stage: Stage, number: int, ragged: Ragged, context: Context, se
     return Table(np.ascontiguousarray(data), source, target, without_covariance)
 
 
-def _with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
+def without_covariance_of(sensor: Sensor, ragged: Ragged) -> Floats:
+    """Read measurements (n, m) of messages that state no covariance; NaN where one is missing."""
+    if sensor.read:
+        return _computed(sensor.read, ragged, len(sensor.measured))
+    if sensor.vector:
+        return read_vectors(ragged.stream, sensor.vector, sensor.measured)
+    return _fields(ragged.stream, tuple(sensor.measured))
+
+
+def with_covariance(sensor: Sensor, ragged: Ragged) -> Fixes:
     """Read measurements, their covariances and which of them lack one."""
     if isinstance(sensor.covariance, str):
         return read_fixes(ragged.stream, sensor.vector, sensor.covariance, sensor.measured, None)
@@ -287,3 +298,62 @@ def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) ->
             f"{len(ragged)} messages; ({len(ragged)}, {components}) is needed"
         )
     return numbers
+
+
+def not_driven(name: str, control: Control, found: Found, events: FilterEvents) -> Ragged:
+    """List measurements that were skipped in a gap of the control.
+
+    Args:
+        name: of the filter.
+        control: an interpolated one, which is NaN in its gaps.
+        found: its topics.
+        events: with the control.
+    """
+    in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
+    reasons = [
+        f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
+        f"{control.gap}"
+        for _, topic in found.sensors
+    ]
+    stream = reason_stream(
+        f"/estimates/{name}/skipped",
+        schemas.SKIPPED,
+        events.time_ns[in_gap],
+        events.source[in_gap],
+        reasons,
+    )
+    return Ragged(stream, ragged_rows(in_gap, events.offsets))
+
+
+def passed_over(
+    name: str, stage: Stage, found: Found, block: Block, without_covariance: Booleans
+) -> list[Ragged]:
+    """List messages that were skipped since they lack a covariance, if any topic may.
+
+    Args:
+        name: of the filter.
+        stage: the model with the sensors at hand.
+        found: its topics.
+        block: their messages.
+        without_covariance: which of these (n,) have none.
+    """
+    control = stage.model.control
+    drops_controls = control is not None and control.interpolated
+    if not drops_controls and not any(sensor.covariance for sensor in stage.sensors):
+        return []
+    sensors = {topic.name: sensor for sensor, topic in found.sensors}
+    reasons = [
+        complaint_of(stage.model, sensors[topic], topic)
+        if topic in sensors
+        else f"topic {topic}: it is not finite"
+        for topic in block.streams
+    ]
+    merged = block.events
+    stream = reason_stream(
+        f"/estimates/{name}/skipped",
+        schemas.SKIPPED,
+        merged.time_ns[without_covariance],
+        merged.topic[without_covariance],
+        reasons,
+    )
+    return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]

@@ -26,7 +26,14 @@ from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import placed_settings, reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import Context, data_columns, events_of, points_of
+from replay.inference.run.events import (
+    Context,
+    data_columns,
+    events_of,
+    not_driven,
+    passed_over,
+    points_of,
+)
 from replay.inference.run.out_of_sequence import issued
 from replay.inference.run.recursion import (
     Estimates,
@@ -37,10 +44,10 @@ from replay.inference.run.recursion import (
     RunResults,
     filled,
     no_results,
+    recorded_innovations,
     recursion,
 )
 from replay.inference.run.samples import sample_sets, seeded_generators
-from replay.inference.run.skipped import not_driven, passed_over
 from replay.inference.run.timing import (
     add_output_times,
     compensate_delays,
@@ -368,30 +375,14 @@ class Filter:
         return {**named(self.stage.model.state), "truth": self.truth, **frame}
 
     @cached_property
-    def innovation_metadata(self) -> Mapping[str, str]:
-        """Return what the channel of the innovations says."""
-        return {**named(self.measured), "truth": self.truth}
-
-    @cached_property
     def measured(self) -> Mapping[str, str]:
         """Return the components of all innovations."""
         return innovation_components(self.stage.sensors)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
         """Make the stream of innovations, which needs a sensor; see `states`."""
-        columns: dict[str, Any] = {
-            "sensor_time_ns": innovations.time_ns,
-            "target_id": innovations.target_id,
-            "accepted": innovations.numbers[:, 2].astype(np.uint32),
-            "innovation": innovations.difference,
-            "covariance": rows_of(innovations.covariance),
-            "normalised_innovation_squared": innovations.numbers[:, 0],
-            "log_likelihood": innovations.numbers[:, 1],
-        }
-        topic, metadata = f"/estimates/{self.name}/innovation", self.innovation_metadata
-        time_ns, schema = innovations.time_ns, schemas.INNOVATION
-        stream = computed_stream(topic, schema, time_ns, columns, metadata)
-        return Ragged(stream, offsets)
+        topic = f"/estimates/{self.name}"
+        return recorded_innovations(topic, self.measured, self.truth, innovations, offsets)
 
 
 @lru_cache(maxsize=64)

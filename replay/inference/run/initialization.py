@@ -17,7 +17,7 @@ from recorders.log import Clock, Stream, Topic, make_stream, schemas
 from recorders.parameters import meanings
 from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Initialization, Initialized
-from replay.engine.streams.blocks import Block, Ragged, merge_events
+from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
 from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.results import gaussian_stream, named
@@ -68,7 +68,10 @@ class Initializer:
         needs_messages = not self.found.has_prior or self._prior_check is not None
         wanted = [*needs_origin, *(self._starting if needs_messages else ())]
         topics = tuple(dict.fromkeys(topic.name for topic in wanted))
-        return Initialization(topics, self.find, self.find_broad) if topics else None
+        is_free = not self.found.has_prior and not self.stage.model.finds_start and self._measuring
+        return (
+            Initialization(topics, self.find, self.find_broad if is_free else None) if topics else None
+        )
 
     @property
     def _prior_check(self) -> Callable[[Mapping[str, Stream], Any], list[str]] | None:
@@ -134,29 +137,26 @@ class Initializer:
         return Initialized(found, [*told, *self._told(facts)])
 
     def find_broad(
-        self, first: Mapping[str, Ragged], static: Mapping[str, Ragged], clock: Clock, time_ns: int
+        self, first: Mapping[str, Ragged], _: Mapping[str, Ragged], clock: Clock, time_ns: int
     ) -> list[Initialized]:
-        """Find one run's equally likely starts at a stamp; see `broad_priors`, else `find`."""
-        found = self.find(first, static, clock)
-        if self.found.has_prior or self.stage.model.finds_start or not self._measuring:
-            return [found]
+        """Find one run's equally likely starts at a stamp; see `broad_priors`."""
         origins = None if self.found.origin is None else self.found.origin[None]
+        begun: dict[str, Ragged] = {}
         for topic in self.found.geodetic if origins is None else ():
-            origins = origins_of(found.static[topic.name])
+            begun[topic.name] = gather([first[topic.name].of_run(0).take(slice(0, 1))])
+            origins = origins_of(begun[topic.name])
         references = []
         for number, sensor, topic in self._measuring:
             ragged = first[topic.name]
             table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
-            _, [has_one], [row] = first_of_runs(ragged, clock, table.source >= 0)
-            if has_one:
+            [has_message], [row] = first_of_runs(ragged, clock, table.source >= 0)[1:]
+            if has_message:
                 references.append(
                     (sensor.measured, *state_by_message(self.stage, number, table.data[row]))
                 )
         priors = broad_priors(self.stage.model, self.found.prior.name, time_ns, references)
-        return [
-            found._replace(static={**found.static, prior.topic: of_runs(prior, np.ones(1, np.bool_))})
-            for prior in priors
-        ]
+        has_one = np.ones(1, np.bool_)
+        return [Initialized({**begun, prior.topic: of_runs(prior, has_one)}, []) for prior in priors]
 
     def _prior(
         self,

@@ -10,7 +10,7 @@ from replay.engine.arrays import Function
 from replay.engine.streams.results import ALL_WELL
 
 
-def over_events(process: Function, record: Function) -> Function:
+def over_events(process: Function, record: Function, *, fails: bool = True) -> Function:
     """Make the loop over the events of one run, one after the other.
 
     Args:
@@ -18,6 +18,7 @@ def over_events(process: Function, record: Function) -> Function:
             returns the number of what failed. What is negative ends no run, and only after ALL_WELL is
             something recorded.
         record: the same, after that: it fills in what is wanted of the state.
+        fails: whether a run may fail; else the state has no `failure`, and all events are processed.
 
     Returns `follow(run, inputs, state, results, memory)`, for `compile_over_runs`. The run ends where
     its `state.failure` is not ALL_WELL, or its events end.
@@ -26,12 +27,13 @@ def over_events(process: Function, record: Function) -> Function:
     def follow(run: int, inputs: Any, state: Any, results: Any, memory: Any) -> None:
         """Move the state, and fill the results, until the events end or the run fails."""
         for event in range(inputs.events.offsets[run], inputs.events.offsets[run + 1]):
-            if state.failure[run] != ALL_WELL:
+            has_failed = state.failure[run] != ALL_WELL if fails else False
+            if has_failed:
                 break
             failure = process(run, event, inputs, state, results, memory)
             if failure == ALL_WELL:
                 failure = record(run, event, inputs, state, results, memory)
-            if failure >= 0:
+            if fails and failure >= 0:
                 state.failure[run] = failure
 
     return follow

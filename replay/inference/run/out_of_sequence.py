@@ -25,7 +25,7 @@ from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import filter_events
+from replay.inference.run.events import filter_events, passed_over
 from replay.inference.run.history import (
     History,
     KeptMessages,
@@ -47,7 +47,6 @@ from replay.inference.run.recursion import (
     processing,
     writing_estimates,
 )
-from replay.inference.run.skipped import passed_over
 from replay.sampling.sets import sets_by_runs
 
 # The loop

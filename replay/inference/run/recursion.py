@@ -6,7 +6,7 @@ belief is no Gaussian any more.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
@@ -14,8 +14,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.engine.streams.blocks import filled_rows
-from replay.engine.streams.results import ALL_WELL
+from recorders.log import schemas
+from recorders.log.streams import computed_stream
+from replay.engine.streams.blocks import Ragged, filled_rows
+from replay.engine.streams.results import ALL_WELL, named, rows_of
 from replay.inference.kalman.steps import (
     NOT_DRIVEN,
     NOT_FINITE,
@@ -121,6 +123,25 @@ class RunResults(NamedTuple):
 
     estimates: Any
     innovations: Innovations
+
+
+def recorded_innovations(
+    topic: str, components: Mapping[str, str], truth: str, innovations: Innovations, offsets: Integers
+) -> Ragged:
+    """Make the stream of innovations that a recursion filled in; run r has offsets[r]:offsets[r + 1]."""
+    _, time_ns, target_id, difference, covariance, numbers = innovations
+    columns: dict[str, NDArray] = {
+        "sensor_time_ns": time_ns,
+        "target_id": target_id,
+        "accepted": numbers[:, 2].astype(np.uint32),
+        "innovation": difference,
+        "covariance": rows_of(covariance),
+        "normalised_innovation_squared": numbers[:, 0],
+        "log_likelihood": numbers[:, 1],
+    }
+    topic, metadata = f"{topic}/innovation", {**named(components), "truth": truth}
+    stream = computed_stream(topic, schemas.INNOVATION, time_ns, columns, metadata)
+    return Ragged(stream, offsets)
 
 
 ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])

@@ -36,6 +36,7 @@ TARGETS: dict[str, Target] = {
     "cost": "low",
     "failed_runs": "low",
     "skipped_measurements": "low",
+    "estimate_age_s": "low",
     "localisation_m2": "low",
     "missed_targets": "low",
     "false_targets": "low",

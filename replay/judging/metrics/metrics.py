@@ -137,14 +137,12 @@ def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Flo
     return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
 
 
-def innovation_sums(innovations: Innovations) -> Sums:
-    """Count messages, and those that a gate let in, with their numbers, and sum NIS."""
+def _nis(innovations: Innovations) -> Sums:
     return {
         "messages": len(innovations.squared),
         "squared": float(innovations.squared.sum()),
         "degrees": int(innovations.degrees.sum()),
         "accepted": int(innovations.accepted.sum()),
-        "accepted_degrees": int(innovations.degrees[innovations.accepted].sum()),
     }
 
 
@@ -188,8 +186,14 @@ def failures(sums: Sums) -> dict[str, float]:
 
 
 def covered(output: Output) -> Sums:
-    """Count the seconds that the runs span and that were estimated, and the measurements not used."""
-    schema = output.rows.stream.schema.full_name
+    """Count the seconds that the runs span and that were estimated, the measurements not used, and ages.
+
+    An estimate is as old as the time from its stamp to when it could be given.
+    """
+    schema, stream = output.rows.stream.schema.full_name, output.rows.stream
+    if schema == schemas.GAUSSIAN_ESTIMATE.full_name:
+        ages_ns = stream.log_time_ns - stream.publish_time_ns
+        return {"estimates": len(stream), "age_s": float(ages_ns.sum() * 1e-9)}
     if schema == schemas.SKIPPED.full_name:
         return {"skipped": len(output.rows)}
     if schema != schemas.COVERAGE.full_name:
@@ -202,7 +206,9 @@ def covered(output: Output) -> Sums:
 
 
 def coverage(sums: Sums) -> dict[str, float]:
-    """Return the share of the span that other figures are of, and the measurements not used."""
+    """Return the share of the span that was estimated, the measurements not used, the mean age."""
+    if "age_s" in sums:
+        return {"estimate_age_s": sums["age_s"] / sums["estimates"]} if sums["age_s"] > 0.0 else {}
     if "skipped" in sums:
         return {"skipped_measurements": float(sums["skipped"])}
     share = estimated_share(sums)
@@ -266,7 +272,7 @@ CONSISTENCY = Metric(
     "NEES against its chi-square bounds", Errors, _no_nees, _add_nees, _merge_nees, consistency
 )
 INNOVATION = metric_of_sums(
-    "NIS, and the share of measurements that a gate kept out", Innovations, innovation_sums, innovation
+    "NIS, and the share of measurements that a gate kept out", Innovations, _nis, innovation
 )
 LIKELIHOOD = metric_of_sums(
     "log-likelihood of the measurements, per run", Innovations, _log_likelihoods, likelihood
@@ -275,7 +281,10 @@ FAILURES = metric_of_sums(
     "how many runs an estimator could not follow to the end", Output, _failed, failures
 )
 COVERAGE = metric_of_sums(
-    "what share of the span was estimated, and what was not used", Output, covered, coverage
+    "what share of the span was estimated, what was not used, and how old late estimates are",
+    Output,
+    covered,
+    coverage,
 )
 SOLUTION = metric_of_sums("how many batch solutions converged, and how fast", Output, _solved, solution)
 PARTICLES = metric_of_sums(

@@ -1,12 +1,13 @@
-"""Keeps the sums of an estimate stream's errors by step and by time, which merge."""
+"""Keeps sums that merge: of an estimate stream's errors by step and time, of innovations by run."""
 
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from replay.judging.errors.constant import ConstantSums
-from replay.judging.errors.evaluation import Errors, Floats
-from replay.judging.metrics.sums import BinnedSums
+from replay.judging.errors.evaluation import Errors, Floats, Innovations
+from replay.judging.metrics.sums import BinnedSums, Integers
 
 
 @dataclass
@@ -46,3 +47,54 @@ def columns_of(errors: Errors) -> Floats:
             errors.nees,
         ]
     )
+
+
+class OfRuns(NamedTuple):
+    """Numbers of innovations, of each run (runs,) or of all.
+
+    Attributes:
+        messages, accepted: how many there are, and how many a gate let in.
+        degrees, accepted_degrees: the measured components of these.
+        squared: the sum of NIS.
+        log_likelihood: of those that were let in; NaN where it is not stated of all.
+    """
+
+    messages: Any
+    accepted: Any
+    degrees: Any
+    accepted_degrees: Any
+    squared: Any
+    log_likelihood: Any
+
+
+class InnovationSums:
+    """Sums of one innovation stream by run, from a first one on."""
+
+    def __init__(self, first_run: int) -> None:
+        self.first_run = first_run
+        self._sums = BinnedSums(len(OfRuns._fields) - 1, first=first_run)
+
+    def add(self, innovations: Innovations) -> None:
+        """Take in a block."""
+        stated, accepted = innovations.log_likelihood, innovations.accepted
+        let_in = np.where(accepted, np.nan if stated is None else stated, 0.0)
+        degrees = innovations.degrees
+        columns = np.column_stack(
+            [accepted, degrees, degrees * accepted, innovations.squared, let_in]
+        ).astype(float)
+        self._sums.add(np.zeros(len(columns), np.int64), columns, innovations.run)
+
+    def merge(self, other: "InnovationSums") -> None:
+        """Take in the sums of other runs."""
+        self._sums.merge(other._sums)
+
+    def by_run(self) -> tuple[Integers, OfRuns]:
+        """Return the runs (runs,) that have innovations, and their sums."""
+        cells, count, sums = self._sums.filled()
+        return cells[:, 0], OfRuns(count, *sums.T)
+
+    @property
+    def total(self) -> OfRuns:
+        """Return the sums over all runs."""
+        of_all = [float(column.sum()) for column in self.by_run()[1]]
+        return OfRuns(*(round(each) for each in of_all[:4]), *of_all[4:])

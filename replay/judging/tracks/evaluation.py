@@ -96,13 +96,13 @@ class Followed:
 
     Attributes:
         targets: the instants, and where the targets are then.
-        told: the tracks at the first of these.
+        sets: the tracks at the first of these.
         first: how many instants were over before the first set of tracks; they are not judged.
         last: the last set of tracks.
     """
 
     targets: Judged
-    told: list[TracksAt] = field(default_factory=list)
+    sets: list[TracksAt] = field(default_factory=list)
     first: int | None = None
     last: tuple[Stream, Stream] | None = None
 
@@ -113,13 +113,13 @@ class Followed:
         at_ns = self.targets.time_ns
         if self.first is None:
             self.first = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
-        begin = self.first + len(self.told)
+        begin = self.first + len(self.sets)
         # an instant before the block is told by the last set before it
         before = int(np.searchsorted(at_ns, sizes.publish_time_ns[0]))
         if self.last is not None:
-            self.told += tracks_at(*self.last, at_ns[begin:before])
+            self.sets += tracks_at(*self.last, at_ns[begin:before])
         end = int(np.searchsorted(at_ns, sizes.publish_time_ns[-1], side="right"))
-        self.told += tracks_at(sizes, tracks, at_ns[max(begin, before) : end])
+        self.sets += tracks_at(sizes, tracks, at_ns[max(begin, before) : end])
         count = int(sizes["elements"][-1])
         self.last = (
             sizes.take(slice(len(sizes) - 1, None)),
@@ -132,10 +132,10 @@ class Followed:
         from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
 
         begin = self.first or 0
-        truths = self.targets.truths[:, begin : begin + len(self.told)]
-        if not self.told or not np.isfinite(truths).any():
+        truths = self.targets.truths[:, begin : begin + len(self.sets)]
+        if not self.sets or not np.isfinite(truths).any():
             return {}
-        errors = track_errors(self.told, truths)
+        errors = track_errors(self.sets, truths)
         found = {
             name: value
             for name, value in track_figures(errors).items()
@@ -143,7 +143,7 @@ class Followed:
         }
         followed = errors.track != NONE
         squared = errors.distance[followed] ** 2
-        near = _near(self.told, truths)
+        near = _near(self.sets, truths)
         return found | {
             "followed_share": float(followed.sum() / errors.present.sum()),
             "followed_rmse_m": float(np.sqrt(squared.mean())) if len(squared) else np.nan,
@@ -152,14 +152,14 @@ class Followed:
         }
 
 
-def _near(told: Sequence[TracksAt], truths: Floats) -> Floats:
+def _near(sets: Sequence[TracksAt], truths: Floats) -> Floats:
     """The tracks (tracks, k, 2) that are ever within the cutoff of a target."""
     near: set[int] = set()
-    for at, true in zip(told, truths.transpose(1, 0, 2), strict=True):
+    for at, true in zip(sets, truths.transpose(1, 0, 2), strict=True):
         away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
         near.update(at.number[(away < CUTOFF_M).any(axis=1)].tolist())
     kept = []
-    for at in told:
+    for at in sets:
         is_near = np.isin(at.number, list(near))
         kept.append(TracksAt(at.number[is_near], at.place[is_near]))
     return as_trajectories(kept)

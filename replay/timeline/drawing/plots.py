@@ -168,18 +168,18 @@ def _draw_squares(
         canvas.send(f"{plot}/bounds", np.array(ends), band)
         canvas.fix(f"{plot}/bounds", look)
         end = _end_of(high, [each.values for each in alike])
-        told = []
+        counted = []
         for _, _, estimator, time_ns, values in alike:
             colour = scene.colour(estimator)
             draw_curve(canvas, plot, estimator, colour, time_ns, values, style)
             above = values > end
             if above.any():
                 _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
-                told.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
+                counted.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
         title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
         title += f"; 95 % are below {high:.3g}" if end > 2.5 * high else ""
-        title += f"; above {end:.3g}: {', '.join(told)}" if told else ""
-        views.append(plot_view(plot, title, (-0.1 * end, end), legend=legend, zoom_lock=not told))
+        title += f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
+        views.append(plot_view(plot, title, (-0.1 * end, end), legend=legend, zoom_lock=not counted))
     return views
 
 

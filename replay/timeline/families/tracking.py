@@ -76,9 +76,9 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
         _draw_counts(canvas, scene),
         _draw_existence(canvas, scene, trackers),
     ]
-    told = [each for name, tracks in trackers for each in _life(scene, name, tracks)]
-    told += [each for name in errors for each in _switches(name, at_ns, errors[name])]
-    board = above_events(rrb.Tabs(*boards), draw_events(canvas, scene, "", also=told), share=4.0)
+    events = [each for name, tracks in trackers for each in _life(scene, name, tracks)]
+    events += [each for name in errors for each in _switches(name, at_ns, errors[name])]
+    board = above_events(rrb.Tabs(*boards), draw_events(canvas, scene, "", also=events), share=4.0)
     return rrb.Horizontal(board, rrb.Vertical(*plots), column_shares=[3, 1])
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from recorders.log import Stream, schemas
 from recorders.models.vehicles import out_of_frame
 from replay.engine.streams.blocks import gather
+from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
 from replay.judging.errors.evaluation import Floats
 from replay.judging.errors.label_errors import assigned_squared_error, fixed_squared_error
 from replay.judging.errors.truths import Truths
@@ -148,9 +149,10 @@ def _tracks(scene: Scene, name: str, vehicles: Vehicles) -> Floats:
     """An estimator's places (steps, vehicles, 2) at the truth's stamps, NaN where there is none."""
     topics = [f"/estimates/{name}/vehicle{n + 1}/state" for n in range(vehicles.number)]
     found = [scene.outputs[topic] for topic in topics if topic in scene.outputs]
+    found = [stream for stream in found if set(PLANE) <= set(stream.components)]
     places = np.full((len(vehicles.time_ns), len(found), 2), np.nan)
     for n, stream in enumerate(found):
-        places[vehicles.rows(stream.publish_time_ns), n] = stream["mean"][:, 0::2]
+        places[vehicles.rows(stream.publish_time_ns), n] = read_vectors(stream, "mean", PLANE)
     return places
 
 
@@ -277,8 +279,9 @@ def _draw_ellipse(
     centre: Floats,
 ) -> None:
     """An estimate's 95 % ellipse about its vehicle's true place."""
-    apart = stream["mean"][:, 0::2] - vehicles.places[vehicles.rows(stream.publish_time_ns), n]
-    covariance = stream["covariance"].reshape(-1, 4, 4)[:, 0::2, 0::2]
+    place = read_vectors(stream, "mean", PLANE)
+    apart = place - vehicles.places[vehicles.rows(stream.publish_time_ns), n]
+    covariance = covariances_of(stream, PLANE)
     shown = np.abs(apart).max(axis=1) < SHOWN_M
     draw_ellipses(
         canvas,

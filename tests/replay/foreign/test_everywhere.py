@@ -23,7 +23,7 @@ def here(compile_filter: Compile, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     library = compile_filter(EXAMPLES / "robot_ekf.c")
     monkeypatch.chdir(tmp_path)
     shutil.copy(library, tmp_path)
-    fl.write("run.mcap", fl.record("landmarks", seed=4, duration_s=8.0))
+    fl.write("run.mcap", fl.record("landmarks", seed=4, duration_s=4.0))
     return tmp_path
 
 
@@ -33,7 +33,8 @@ def test_commands(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["tune", "run.mcap", "-e", MINE, *free]) == 0
     assert main(["replay", "run.mcap", "-e", MINE, "--settings", "tuned/settings.toml"]) == 0
     capsys.readouterr()
-    assert main(["diagnose", "run.mcap", "-e", MINE, "--set", "bias_range_m=1.0", "--json"]) == 0
+    biased = ["--set", "bias_range_m=1.0", "--set", "in_process=true"]
+    assert main(["diagnose", "run.mcap", "-e", MINE, *biased, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["hypotheses"] > 2
     assert main(["compare", "run.mcap", "-e", MINE, "-e", "ekf", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["differences"]

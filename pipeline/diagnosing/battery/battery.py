@@ -1,0 +1,148 @@
+"""The battery: cars with one fault planted, and how often it is the first that a diagnosis names."""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.diagnosing.battery.car import FAULTS, faulty, recorded
+from pipeline.diagnosing.causes import Cause, seek
+from pipeline.diagnosing.findings import FIRST, of_messages
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
+from pipeline.runs.ensemble import Progress
+
+ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
+
+
+class Right(NamedTuple):
+    """What a diagnosis should name: kind, topic, component, and the number if it has one."""
+
+    kind: Kind
+    topic: str
+    part: str = ""
+    value: float | None = None
+
+
+_MIRROR = (
+    Right("factor or sign", ODOMETRY, "turn_radps", -1.0),
+    Right("exchanged axes", FIX, "position_m"),
+)
+RIGHT: dict[str, Sequence[Right]] = {
+    "nothing": (),
+    "fixes .3 s late": (Right("delay", FIX, "", 0.3),),
+    "turn rate's sign": _MIRROR[:1],
+    "speed x 3.6": (Right("factor or sign", ODOMETRY, "forward_mps", 3.6),),
+    "speed / 3.6": (Right("factor or sign", ODOMETRY, "forward_mps", 1.0 / 3.6),),
+    "speed x .3048": (Right("factor or sign", ODOMETRY, "forward_mps", 0.3048),),
+    "lever (2, .6) m": (Right("parameter", "lever_x_m", "lever_x_m", 2.0),),
+    "fix variance x 4": (Right("measurement noise", FIX, "", -np.log(2.0)),),
+    "fix variance / 16": (Right("measurement noise", FIX, "", np.log(4.0)),),
+    "sd written as variance": (Right("measurement noise", FIX, "", -0.5 * np.log(2.0)),),
+    "E, N exchanged": _MIRROR[1:],
+    "degrees as radians": (Right("factor or sign", ODOMETRY, "turn_radps", 180.0 / np.pi),),
+    "gyro bias .02": (Right("bias or turned frame", ODOMETRY, "turn_radps", 0.02),),
+    "gyro bias .0004 t": (Right("drifting bias", ODOMETRY, "turn_radps", 0.0004),),
+    "odometry clock 6 % fast": (Right("clock drift", ODOMETRY, "", 0.06),),
+    "fixes 18 s late": (Right("delay", FIX, "", 18.0),),
+    "half of the odometry lost": (Right("lost messages", ODOMETRY),),
+    "gyro density / 5": (Right("process noise", "turn_noise_density", "", np.log(5.0)),),
+    "compass + 4.5 deg": (Right("bias or turned frame", HEADING, "heading_rad", np.radians(4.5)),),
+    "compass clockwise from north": (Right("convention", HEADING, "heading_rad"),),
+}
+
+
+class Cell(NamedTuple):
+    """A fault, and what the log has beside wheels and fixes."""
+
+    fault: str
+    has_compass: bool
+    has_prior: bool
+
+    @property
+    def name(self) -> str:
+        """The fault with what the log has."""
+        more = [*["compass"] * self.has_compass, *["prior"] * self.has_prior]
+        return ", ".join([self.fault, *more])
+
+
+def cells(*, has_prior: bool = False) -> Iterator[Cell]:
+    """All faults, with a compass and, those that are not of it, without."""
+    for has_compass in (True, False):
+        for fault in FAULTS:
+            if has_compass or not fault.startswith("compass"):
+                yield Cell(fault, has_compass, has_prior)
+
+
+def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
+    """Plant a fault, and look for the likeliest causes, so many at most."""
+    log = recorded(faulty(seed, cell.fault), has_compass=cell.has_compass, has_prior=cell.has_prior)
+    lost = [each for each in of_messages(log.streams.values(), 0) if each.kind in FIRST]
+    found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, most)
+    named = [[Right(each.kind, each.topic)] for each in lost]
+    named += [list(_named(cause)) for cause in found.causes]
+    right = [each[:3] for each in RIGHT[cell.fault]]
+    places = [any(one[:3] in right for one in each) for each in named]
+    value, gain = np.nan, np.nan
+    for cause in found.causes[:1] if any(places) else ():
+        values = [one.value for one in _named(cause) if one[:3] in right]
+        value = values[0] if values and values[0] is not None else np.nan
+        gain = cause.gain
+    return {
+        **cell._asdict(),
+        "cell": cell.name,
+        "seed": seed,
+        "is_first": any(places[:1]) if right else not named,
+        "is_in_first_two": any(places[:2]) if right else not named,
+        "first": " ".join(filter(None, named[0][0][:3])) if named else "",
+        "value": value,
+        "gain": gain,
+    }
+
+
+def _named(cause: Cause) -> Iterator[Right]:
+    """What a cause names, and what the log does not tell from it."""
+    for each in (cause, *cause.others):
+        for told in each.numbers:
+            yield Right(each.hypothesis.kind, each.hypothesis.topic, told.part, told.value)
+
+
+def planted(seeds: Sequence[int], progress: Progress) -> pd.DataFrame:
+    """Try all cells, with and without a prior, with these seeds: a row for each run."""
+    rows = []
+    for cell in [*cells(), *cells(has_prior=True)]:
+        rows += [tried(cell, seed) for seed in progress(seeds, cell.name, len(seeds))]
+    return pd.DataFrame(rows)
+
+
+def summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """By cell: how many runs, how many of them right, the median gain and the value with its spread."""
+    by = rows.groupby("cell", sort=False)
+    return by.agg(
+        runs=("seed", "size"),
+        first=("is_first", "sum"),
+        gain=("gain", "median"),
+        value=("value", "mean"),
+        spread=("value", "std"),
+    ).reset_index()
+
+
+def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
+    """The shares of runs whose fault is named first: of each cell, and of all."""
+    found = {
+        f"diagnosis.battery_first.{_case(row['cell'])}": float(row["first"])
+        for row in summary(rows).to_dict("records")
+    }
+    clean = rows["fault"] == "nothing"
+    return {
+        **found,
+        "diagnosis.battery_runs": float(rows.groupby("cell")["seed"].size().max()),
+        "diagnosis.battery_first_share": float(rows[~clean]["is_first"].mean()),
+        "diagnosis.battery_nothing_share": float(rows[clean]["is_first"].mean()),
+    }
+
+
+def _case(cell: str) -> str:
+    """A cell's name as the case of a metric."""
+    return re.sub(r"[^a-z0-9]+", "-", cell.lower()).strip("-")

@@ -1,0 +1,296 @@
+"""A car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; with and without prior.
+
+Its faults by name, the inertial unit that may ride with it, with its own, and logs of both. Faults are
+put into the columns themselves, not by what a diagnosis undoes them with.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import RunMetadata, Stream, make_stream, schemas
+from replay.engine.streams.sources import MemorySource
+
+Floats = NDArray[np.floating]
+DURATION_S, REST_S, RAMP_S = 100.0, 10.0, 5.0
+FIX_SIGMA_M, COMPASS_SIGMA_RAD = 0.5, 0.03
+FORWARD_DENSITY, TURN_DENSITY = 0.05, 0.01
+GRAVITY_MPS2 = 9.81
+START_SIGMAS = np.array([1.0, 1.0, 0.1])  # of a prior, in m and rad
+
+
+class Truth(NamedTuple):
+    """How the car drives: speeds and turn rates (n,) that hold a step each, poses (n + 1, 3) between."""
+
+    step_s: float
+    speed_mps: Floats
+    turn_radps: Floats
+    pose: Floats
+
+    def at(self, times_s: Floats) -> Floats:
+        """Poses (m, 3) at any times, exact; before the begin the car rests."""
+        step = np.clip(times_s // self.step_s, 0, len(self.speed_mps) - 1).astype(int)
+        since_s = np.maximum(times_s - step * self.step_s, 0.0)
+        return self.pose[step] + arcs(
+            self.pose[step, 2], self.speed_mps[step], self.turn_radps[step], since_s
+        )
+
+
+class Car(NamedTuple):
+    """What a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
+
+    seed: int
+    truth: Truth
+    odometry_s: Floats
+    speed_mps: Floats
+    turn_radps: Floats
+    fix_s: Floats
+    fix_m: Floats
+    compass_s: Floats
+    compass_rad: Floats
+    fix_variance_m2: float = FIX_SIGMA_M**2
+    turn_density: float = TURN_DENSITY
+
+
+def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
+    """By how much poses (n, 3) change along exact arcs."""
+    turned = turn_radps * duration_s
+    chord = speed_mps * duration_s * np.sinc(0.5 * turned / np.pi)
+    about = heading_rad + 0.5 * turned
+    return np.stack([chord * np.cos(about), chord * np.sin(about), turned], axis=-1)
+
+
+def philox(key: int) -> np.random.Generator:
+    """The sheet's P(key)."""
+    return np.random.Generator(np.random.Philox(key=key))
+
+
+def drive(seed: int, step_s: float = 0.1) -> Car:
+    """The car without a fault."""
+    rng, n = philox(seed), round(DURATION_S / step_s)
+    start_rad = 2.0 * np.pi * rng.uniform()
+    odometry, fixes = rng.standard_normal((n, 2)), rng.standard_normal((201, 2))
+    compass = rng.standard_normal(501)
+    since_s = (np.arange(n) + 0.5) * step_s
+    ramp = np.clip((since_s - REST_S) / RAMP_S, 0.0, 1.0)
+    speed = ramp * (8.0 + 3.0 * np.sin(0.4 * (since_s - REST_S)))
+    turn = ramp * (0.25 * np.sin(0.21 * since_s) + 0.15 * np.sin(0.53 * since_s))
+    before_rad = start_rad + np.concatenate([[0.0], np.cumsum(turn * step_s)])
+    steps = arcs(before_rad[:-1], speed, turn, np.full(n, step_s))
+    start = np.array([[0.0, 0.0, start_rad]])
+    truth = Truth(step_s, speed, turn, start + np.concatenate([0.0 * start, np.cumsum(steps, axis=0)]))
+    noise = np.array([FORWARD_DENSITY, TURN_DENSITY]) / step_s**0.5 * odometry
+    fix_s, compass_s = np.arange(201) * 0.5, np.arange(501) * 0.2
+    return Car(
+        seed,
+        truth,
+        np.arange(n) * step_s,
+        speed + noise[:, 0],
+        turn + noise[:, 1],
+        fix_s,
+        truth.at(fix_s)[:, :2] + FIX_SIGMA_M * fixes,
+        compass_s,
+        truth.at(compass_s)[:, 2] + COMPASS_SIGMA_RAD * compass,
+    )
+
+
+# Faults.
+
+
+def late(by_s: float) -> Callable[[Car], Car]:
+    """Fixes are of where the car was so long before."""
+
+    def put(car: Car) -> Car:
+        moved = car.truth.at(car.fix_s - by_s) - car.truth.at(car.fix_s)
+        return car._replace(fix_m=car.fix_m + moved[:, :2])
+
+    return put
+
+
+def lever(forward_m: float, left_m: float) -> Callable[[Car], Car]:
+    """Fixes are of a point beside the car's own."""
+
+    def put(car: Car) -> Car:
+        heading = car.truth.at(car.fix_s)[:, 2]
+        cos, sin = np.cos(heading), np.sin(heading)
+        arm = np.stack([forward_m * cos - left_m * sin, forward_m * sin + left_m * cos], axis=1)
+        return car._replace(fix_m=car.fix_m + arm)
+
+    return put
+
+
+def half_lost(car: Car) -> Car:
+    """Half of the odometry is lost, but for its first."""
+    kept = philox(car.seed + 10**6).random(len(car.odometry_s)) < 0.5
+    kept[0] = True
+    return car._replace(
+        odometry_s=car.odometry_s[kept], speed_mps=car.speed_mps[kept], turn_radps=car.turn_radps[kept]
+    )
+
+
+FAULTS: dict[str, Callable[[Car], Car]] = {
+    "nothing": lambda car: car,
+    "fixes .3 s late": late(0.3),
+    "turn rate's sign": lambda car: car._replace(turn_radps=-car.turn_radps),
+    "speed x 3.6": lambda car: car._replace(speed_mps=3.6 * car.speed_mps),
+    "speed / 3.6": lambda car: car._replace(speed_mps=car.speed_mps / 3.6),
+    "speed x .3048": lambda car: car._replace(speed_mps=0.3048 * car.speed_mps),
+    "lever (2, .6) m": lever(2.0, 0.6),
+    "fix variance x 4": lambda car: car._replace(fix_variance_m2=4.0 * car.fix_variance_m2),
+    "fix variance / 16": lambda car: car._replace(fix_variance_m2=car.fix_variance_m2 / 16.0),
+    "sd written as variance": lambda car: car._replace(fix_variance_m2=car.fix_variance_m2**0.5),
+    "E, N exchanged": lambda car: car._replace(fix_m=car.fix_m[:, ::-1]),
+    "degrees as radians": lambda car: car._replace(turn_radps=np.degrees(car.turn_radps)),
+    "gyro bias .02": lambda car: car._replace(turn_radps=car.turn_radps + 0.02),
+    "gyro bias .0004 t": lambda car: car._replace(turn_radps=car.turn_radps + 0.0004 * car.odometry_s),
+    "odometry clock 6 % fast": lambda car: car._replace(odometry_s=1.06 * car.odometry_s),
+    "fixes 18 s late": late(18.0),
+    "half of the odometry lost": half_lost,
+    "gyro density / 5": lambda car: car._replace(turn_density=car.turn_density / 5.0),
+    "compass + 4.5 deg": lambda car: car._replace(compass_rad=car.compass_rad + np.radians(4.5)),
+    "compass clockwise from north": lambda car: car._replace(compass_rad=np.pi / 2 - car.compass_rad),
+}
+
+
+def faulty(seed: int, name: str) -> Car:
+    """The car with one of the `FAULTS`."""
+    return FAULTS[name](drive(seed))
+
+
+def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
+    """Stamps (n,) in ns."""
+    return np.rint(1e9 * times_s).astype(np.int64)
+
+
+def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
+    """The car as a log, which `fl.write` writes; a prior is about the true start."""
+    n, half = len(car.fix_s), 0.5 * car.compass_rad
+    zero = np.zeros_like(half)
+    wheels = make_stream(
+        "/car/odometry",
+        schemas.ODOMETRY,
+        stamps_ns(car.odometry_s),
+        metadata={
+            "forward_noise_density": repr(FORWARD_DENSITY),
+            "turn_noise_density": repr(car.turn_density),
+        },
+        forward_mps=car.speed_mps,
+        turn_radps=car.turn_radps,
+    )
+    fixes = make_stream(
+        "/car/fix",
+        schemas.POSITION_FIX,
+        stamps_ns(car.fix_s),
+        position_m=car.fix_m,
+        covariance_m2=np.tile(car.fix_variance_m2 * np.eye(2).ravel(), (n, 1)),
+    )
+    compass = make_stream(
+        "/car/heading",
+        schemas.ORIENTATION,
+        stamps_ns(car.compass_s),
+        metadata={"covariance_rad2": ",".join(3 * [repr(COMPASS_SIGMA_RAD**2)])},
+        quaternion=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
+    )
+    prior = make_stream(
+        "/car/prior",
+        schemas.GAUSSIAN_ESTIMATE,
+        np.zeros(1, np.int64),
+        metadata={"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"},
+        mean=car.truth.pose[:1],
+        covariance=np.diag(START_SIGMAS**2).ravel()[None],
+    )
+    return source([wheels, fixes, *[compass] * has_compass, *[prior] * has_prior])
+
+
+def source(streams: list[Stream]) -> MemorySource:
+    """Streams as a recording of a car."""
+    return MemorySource({each.topic: each for each in streams}, RunMetadata("car", epoch_ns=0), "car")
+
+
+def car(seed: int, stated: float = 1.0) -> MemorySource:
+    """The log without a compass; its fixes state so many times their variance."""
+    clean = drive(seed)
+    return recorded(clean._replace(fix_variance_m2=stated * clean.fix_variance_m2), has_compass=False)
+
+
+# The inertial unit.
+
+
+class Unit(NamedTuple):
+    """An inertial unit on the car, and velocities (m, 2) east and north of a receiver."""
+
+    sample_s: Floats
+    force_mps2: Floats
+    turn_radps: Floats
+    velocity_s: Floats
+    velocity_mps: Floats
+
+
+def ride(seed: int) -> Unit:
+    """The unit without a fault."""
+    truth, rng = drive(seed, 0.02).truth, philox(seed + 500_000)
+    n = len(truth.speed_mps)
+    force, turn = rng.standard_normal((n, 3)), rng.standard_normal(n)
+    velocity = rng.standard_normal((500, 2))
+    sample_s, velocity_s = (np.arange(n) + 0.5) * truth.step_s, np.arange(500) * 0.2
+    acceleration = [
+        np.gradient(truth.speed_mps, sample_s),
+        truth.speed_mps * truth.turn_radps,
+        np.full(n, GRAVITY_MPS2),
+    ]
+    heading = truth.at(velocity_s)[:, 2]
+    speed = np.interp(velocity_s, sample_s, truth.speed_mps)
+    along = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return Unit(
+        sample_s,
+        np.stack(acceleration, axis=1) + np.array([0.05, -0.05, 0.05]) + 0.05 * force,
+        truth.turn_radps + 0.003 + 0.005 * turn,
+        velocity_s,
+        along + 0.1 * velocity,
+    )
+
+
+def remapped(*axes: tuple[int, int]) -> Callable[[Unit], Unit]:
+    """Each axis of the force is another one with a sign."""
+
+    def put(unit: Unit) -> Unit:
+        return unit._replace(
+            force_mps2=np.stack([sign * unit.force_mps2[:, axis] for axis, sign in axes], axis=1)
+        )
+
+    return put
+
+
+UNIT_FAULTS: dict[str, Callable[[Unit], Unit]] = {
+    "nothing": lambda unit: unit,
+    "accelerometer in g": lambda unit: unit._replace(force_mps2=unit.force_mps2 / GRAVITY_MPS2),
+    "gravity's sign": remapped((0, 1), (1, 1), (2, -1)),
+    "turn rate's sign": lambda unit: unit._replace(turn_radps=-unit.turn_radps),
+    "degrees": lambda unit: unit._replace(turn_radps=np.degrees(unit.turn_radps)),
+    "mounted 90 deg": remapped((1, 1), (0, -1), (2, 1)),
+    "mounted 180 deg": remapped((0, -1), (1, -1), (2, 1)),
+    "unit late .3 s": lambda unit: unit._replace(sample_s=unit.sample_s + 0.3),
+    "E, N exchanged": lambda unit: unit._replace(velocity_mps=unit.velocity_mps[:, ::-1]),
+}
+
+
+def recorded_unit(unit: Unit) -> MemorySource:
+    """The log of the unit and of the receiver's velocities."""
+    zero = np.zeros_like(unit.turn_radps)
+    samples = make_stream(
+        "/car/inertial",
+        schemas.INERTIAL_SAMPLE,
+        stamps_ns(unit.sample_s),
+        specific_force_mps2=unit.force_mps2,
+        turn_rate_radps=np.stack([zero, zero, unit.turn_radps], axis=1),
+    )
+    velocities = make_stream(
+        "/car/velocity",
+        schemas.VELOCITY_FIX,
+        stamps_ns(unit.velocity_s),
+        velocity_mps=unit.velocity_mps,
+        covariance_m2ps2=np.tile(0.01 * np.eye(2).ravel(), (len(unit.velocity_s), 1)),
+    )
+    return source([samples, velocities])

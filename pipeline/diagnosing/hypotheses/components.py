@@ -1,0 +1,347 @@
+"""Faults of the numbers that are read of a topic: factors, signs, biases, axes, conventions."""
+
+from collections.abc import Iterator, Mapping
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.altering import alterations as alter
+from pipeline.altering.changes import AXES, bare, entry_of
+from pipeline.diagnosing.advice import Advice, precise, rounded
+from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, Kind, in_topic
+from pipeline.diagnosing.numbers import number
+from recorders.importers.units import unit_of
+from recorders.log import Stream
+from recorders.parameters import Parameters
+from replay.engine.replaying.estimator import Reading
+
+FACTORS = (-0.02, 0.02, -0.4, 0.4)  # logarithms
+ANGLES_RAD = (-0.03, 0.03, -0.3, 0.3, -1.5, 1.5)
+TURNS_RAD = {
+    0.5 * np.pi: "a quarter turn",
+    -0.5 * np.pi: "a quarter turn the other way",
+    np.pi: "half a turn",
+}
+SHARES = (-0.001, 0.001, -0.01, 0.01, -0.1, 0.1, -1.0, 1.0)  # of how much what is read varies
+LARGEST_FACTOR = 12.0  # its logarithm
+# By the unit of a field, what may be in it instead: how many of it make the field's own.
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "m/s": {"km/h": 3.6, "ft/s": 1.0 / 0.3048, "mph": 1.0 / 0.44704, "kn": 1.0 / 0.514444},
+    "m": {"ft": 1.0 / 0.3048},
+    "rad/s": {"deg/s": 180.0 / np.pi},
+    "rad": {"deg": 180.0 / np.pi},
+    "m/s^2": {"g": 1.0 / 9.80665},
+}
+PROBED = 64  # messages, by which is found what is read
+
+
+class Entry(NamedTuple):
+    """One number of a topic's messages that is read.
+
+    Attributes:
+        field, place: where it stands; a heading is of the field `quaternion`.
+        name: as a setting names it, with its unit.
+        is_angle: whether it is an angle that is measured.
+        number: which of the numbers that are read it is; None where it is several.
+        varies: its standard deviation over the log.
+    """
+
+    field: str
+    place: int | None
+    name: str
+    is_angle: bool
+    number: int | None
+    varies: float
+
+    @property
+    def is_heading(self) -> bool:
+        """Whether it is the heading of orientations."""
+        return self.field == "quaternion"
+
+
+def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
+    """The numbers of a topic that are read: those whose change changes what is read.
+
+    Where it is not known what is read, all numbers, and the entries of positions and velocities.
+    """
+    some = stream.take(slice(0, PROBED))
+    found = []
+    for field, place, name in _columns(stream):
+        column = stream[field] if place is None else stream[field][:, place]
+        known = column[np.isfinite(column)]
+        if not len(known):
+            continue
+        varies = float(np.std(known)) or 1.0
+        if reading is None:
+            if place is None or field in ("position_m", "velocity_mps"):
+                found.append(Entry(field, place, name, field == "bearing_rad", None, varies))
+            continue
+        moved = alter.shifted(field, place)(some, varies)
+        places = _changed(reading, some, moved)
+        if len(places):
+            kinds = reading.kinds[stream.topic]
+            is_angle = stream.topic not in reading.controls and kinds[places[0]] == "angle"
+            one = int(places[0]) if len(places) == 1 else None
+            found.append(Entry(field, place, name, is_angle, one, varies))
+    if reading is not None and "quaternion" in stream.columns:
+        places = _changed(reading, some, alter.heading_turned(some, 0.1))
+        places = [each for each in places if reading.kinds[stream.topic][each] == "angle"]
+        if places:
+            found.append(Entry("quaternion", None, "heading_rad", True, places[0], 1.0))
+    return found
+
+
+def _columns(stream: Stream) -> Iterator[tuple[str, int | None, str]]:
+    """The numbers of a topic, but for covariances and orientations."""
+    for entry in stream.schema:
+        column = stream.columns.get(entry.name)
+        if column is None or entry.name.startswith(("covariance", "quaternion")):
+            continue
+        if entry.kind == "real":
+            yield entry.name, None, entry.name
+        elif entry.kind == "vector" and column.shape[1] <= len(AXES):
+            for place in range(column.shape[1]):
+                yield entry.name, place, entry_of(entry.name, place)
+
+
+def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
+    """Which of the numbers that are read are others."""
+    same = np.isclose(
+        reading.numbers(before), reading.numbers(after), rtol=0.0, atol=0.0, equal_nan=True
+    )
+    return np.flatnonzero(~same.all(axis=0)).tolist()
+
+
+def of_components(
+    stream: Stream, reading: Reading | None, parameters: Parameters | None, first_ns: int
+) -> Iterator[Hypothesis]:
+    """All faults of the numbers of a topic; `first_ns` is where a bias begins to grow."""
+    is_control = reading is not None and stream.topic in reading.controls
+    entries = entries_of(stream, reading)
+    if "latitude_deg" in stream.columns:
+        return
+    span_s = 1e-9 * float(np.ptp(stream.publish_time_ns)) or 1.0
+    for each in entries:
+        own = _Own.of(stream.topic, each, reading, parameters)
+        if each.is_heading:
+            yield from _of_heading(stream.topic, first_ns, span_s)
+            continue
+        if reading is not None:
+            stretch = 0.0 if is_control else 1.0
+            yield _factor(stream.topic, each, stretch, own)
+            yield _sign(stream.topic, each)
+            yield _drift(stream.topic, each, first_ns, span_s)
+        yield _bias(stream.topic, each, own)
+    for field in dict.fromkeys(each.field for each in entries if each.place is not None):
+        places = [int(each.place or 0) for each in entries if each.field == field]
+        if field in ("position_m", "velocity_mps") and len(places) > 1:
+            yield _turn(stream.topic, field)
+        if reading is None or len(places) < 2:
+            continue
+        if not is_control:
+            yield _factor(stream.topic, Entry(field, None, field, False, None, 1.0), len(places), None)
+        for pair in combinations(places, 2):
+            yield _exchange(stream.topic, field, pair)
+
+
+class _Own(NamedTuple):
+    """The parameters that a number of a topic has: what is added to it, and what it is multiplied by.
+
+    `bias_sign` is by what a bias of the number is multiplied for the parameter's.
+    """
+
+    bias: str
+    bias_sign: float
+    factor: str
+    values: Mapping[str, float]
+
+    @staticmethod
+    def of(
+        topic: str, entry: Entry, reading: Reading | None, parameters: Parameters | None
+    ) -> "_Own | None":
+        if reading is None or entry.number is None:
+            return None
+        key = topic, entry.number
+        bias, factor = reading.biases.get(key, ""), reading.factors.get(key, "")
+        values = {name: float(getattr(parameters, name) or 0.0) for name in (bias, factor) if name}
+        return _Own(bias, -1.0 if topic in reading.controls else 1.0, factor, values)
+
+
+def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:
+    units = UNITS.get(unit_of(entry.name), {})
+    specials = {float(np.log(size)): f"{name} are" for name, size in units.items()}
+    specials |= {-at: f"{said} that are converted twice" for at, said in specials.items()}
+
+    def words(at: float, low: float, high: float) -> str:
+        more = f", as {specials[at]}" if at in specials else ""
+        ends = sorted((abs(low), abs(high))) if low * high > 0.0 else [0.0, max(abs(low), abs(high))]
+        size = "large" if at > 0.0 else "small"
+        factor, least, most = (number(np.exp(each), 4) for each in (abs(at), *ends))
+        return f"{topic}: {entry.name} is {factor} times ({least} to {most}) too {size}{more}"
+
+    def mend(at: float) -> Advice:
+        if own and own.factor:
+            return Advice(own.factor, precise(own.values[own.factor] * np.exp(-at)), free=own.factor)
+        return Advice(f"{topic}.{bare(entry.name)}_scale", precise(np.exp(-at)))
+
+    without = in_topic(topic, alter.multiplied(entry.field, entry.place), stretch)
+    return Hypothesis(
+        "factor or sign",
+        topic,
+        entry.name,
+        FACTORS,
+        LARGEST_FACTOR,
+        without,
+        words,
+        mend,
+        specials,
+        told=lambda at: float(np.exp(at)),
+    )
+
+
+def _sign(topic: str, entry: Entry) -> Hypothesis:
+    turned = alter.scaled(entry.field, entry.place)
+    return Hypothesis(
+        "factor or sign",
+        topic,
+        entry.name,
+        (),
+        1.0,
+        in_topic(topic, lambda stream, _: turned(stream, -1.0)),
+        lambda *_: f"{topic}: {entry.name} has the wrong sign",
+        lambda _: Advice(f"{topic}.{bare(entry.name)}_scale", -1),
+        IS_SO,
+        told=lambda _: -1.0,
+    )
+
+
+def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
+    def words(at: float, low: float, high: float) -> str:
+        size = f"{topic}: {entry.name} is too large by {number(at)} ({number(low)} to {number(high)})"
+        if not entry.is_angle:
+            return size
+        return f"{size}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
+
+    def mend(at: float) -> Advice:
+        if own and own.bias:
+            return Advice(own.bias, rounded(own.values[own.bias] + own.bias_sign * at), free=own.bias)
+        return Advice(f"{topic}.{bare(entry.name)}_bias", precise(at))
+
+    return Hypothesis(
+        "bias or turned frame",
+        topic,
+        entry.name,
+        tuple(entry.varies * share for share in SHARES[: 6 if entry.is_angle else None]),
+        np.pi if entry.is_angle else np.inf,
+        in_topic(topic, alter.shifted(entry.field, entry.place)),
+        words,
+        mend,
+    )
+
+
+def _drift(topic: str, entry: Entry, first_ns: int, span_s: float) -> Hypothesis:
+    return _growing(
+        topic,
+        entry.name,
+        tuple(entry.varies * share / span_s for share in SHARES),
+        alter.ramped(first_ns, entry.field, entry.place),
+    )
+
+
+def _growing(
+    topic: str, name: str, tried: tuple[float, ...], alteration: alter.Alteration
+) -> Hypothesis:
+    def words(at: float, low: float, high: float) -> str:
+        return (
+            f"{topic}: {name} is too large by {number(at)} ({number(low)} to {number(high)}) more each "
+            "second"
+        )
+
+    def mend(at: float) -> Advice:
+        return Advice(f"{topic}.{bare(name)}_drift", precise(at))
+
+    kind: Kind = "drifting bias"
+    return Hypothesis(kind, topic, name, tried, np.inf, in_topic(topic, alteration), words, mend)
+
+
+def _turn(topic: str, field: str) -> Hypothesis:
+    def words(at: float, low: float, high: float) -> str:
+        at, low, high = (float(np.degrees(each)) for each in (at, low, high))
+        size = f"{at:.3g} ({low:.3g} to {high:.3g}) deg"
+        return f"{topic}: {field} is turned about the vertical by {size}"
+
+    def mend(at: float) -> Advice:
+        return Advice(f"{topic}.{bare(field)}_turn", precise(at))
+
+    without = in_topic(topic, alter.turned(field))
+    kind: Kind = "bias or turned frame"
+    return Hypothesis(kind, topic, field, ANGLES_RAD, np.pi, without, words, mend, TURNS_RAD)
+
+
+def _exchange(topic: str, field: str, pair: tuple[int, int]) -> Hypothesis:
+    first, second = pair
+    order = list(range(max(pair) + 1))
+    order[first], order[second] = second, first
+    axes = "".join(AXES[each] for each in order)
+    names = f"{AXES[first]} and {AXES[second]}"
+    return Hypothesis(
+        "exchanged axes",
+        topic,
+        field,
+        (),
+        1.0,
+        in_topic(topic, alter.permuted(field, order)),
+        lambda *_: f"{topic}: {names} of {field} are exchanged",
+        lambda _: Advice(f"{topic}.{bare(field)}_axes", axes),
+        IS_SO,
+    )
+
+
+def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis]:
+    """The headings of orientations."""
+
+    def words(at: float, low: float, high: float) -> str:
+        at, low, high = (float(np.degrees(each)) for each in (at, low, high))
+        return (
+            f"{topic}: the heading is too large by {at:.3g} ({low:.3g} to {high:.3g}) deg: an offset, "
+            "the magnetic declination or how the sensor is mounted, which are the same"
+        )
+
+    kind: Kind = "bias or turned frame"
+    yield Hypothesis(
+        kind,
+        topic,
+        "heading_rad",
+        ANGLES_RAD,
+        np.pi,
+        in_topic(topic, alter.heading_turned),
+        words,
+        lambda at: Advice(f"{topic}.heading_bias", precise(at)),
+        TURNS_RAD,
+    )
+    rates = tuple(share / span_s for share in SHARES)
+    yield _growing(topic, "heading_rad", rates, alter.heading_ramped(first_ns))
+    yield Hypothesis(
+        "factor or sign",
+        topic,
+        "heading_rad",
+        (),
+        1.0,
+        in_topic(topic, lambda stream, _: alter.heading_multiplied(stream, -1.0)),
+        lambda *_: f"{topic}: the heading has the wrong sign",
+        lambda _: Advice(f"{topic}.heading_scale", -1),
+        IS_SO,
+        told=lambda _: -1.0,
+    )
+    yield Hypothesis(
+        "convention",
+        topic,
+        "heading_rad",
+        (),
+        1.0,
+        in_topic(topic, alter.heading_from_north),
+        lambda *_: f"{topic}: the heading is clockwise from north, not anticlockwise from east",
+        lambda _: Advice(f"{topic}.heading_convention", "north"),
+        IS_SO,
+    )

@@ -1,0 +1,86 @@
+"""Faults of numbers: two of a map, or two topics, stand for each other."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from pipeline.altering import alterations as alter
+from pipeline.diagnosing.advice import Advice
+from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, in_topic
+from pipeline.diagnosing.likelihood import Trial
+from recorders.log import Stream
+from replay.engine.replaying.estimator import Bound
+from replay.engine.streams.sources import MemorySource
+from replay.judging.errors.evaluation import split_topic
+
+SUSPECT = 2.0  # a mean NIS per component, above which numbers may be exchanged
+SUSPECTS = 12  # of which all pairs are tried
+
+
+def of_numbers(
+    bound: Sequence[Bound], source: MemorySource, innovations: Mapping[str, Stream]
+) -> Iterator[Hypothesis]:
+    """Two numbers of a map, or two topics, stand for each other."""
+    maps = {
+        topic: field.name
+        for each in bound
+        for topic in each.static
+        if topic in source.streams
+        for field in source.streams[topic].schema
+        if field.kind == "identifier" and topic not in each.priors
+    }
+    targets = _suspects(
+        (int(target), stream.take(stream["target_id"] == target))
+        for stream in innovations.values()
+        for target in np.unique(stream["target_id"])
+    )
+    for topic, field in maps.items():
+        known = set(source.streams[topic][field].tolist())
+        for first, second in combinations(sorted(each for each in targets if each in known), 2):
+            without = in_topic(topic, alter.renumbered(field, first, second))
+            words = f"{topic}: {field} {first} and {second} are exchanged"
+            advice = Advice(f"{topic}.exchanged", f"{first},{second}")
+            yield _exchange(topic, f"{first} {second}", words, advice, without)
+    of_case = {split_topic(each.name + "/_")[1]: each.streams for each in bound}
+    cases = _suspects((split_topic(topic)[1], stream) for topic, stream in innovations.items())
+    for one, other in combinations(sorted(each for each in cases if each in of_case), 2):
+        for here, there in zip(of_case[one], of_case[other], strict=False):
+            if source.topics[here].schema_name == source.topics[there].schema_name:
+                words = f"{here} and {there} are exchanged"
+                advice = Advice(f"{here}.exchanged", there)
+                yield _exchange(here, there, words, advice, _back(here, there))
+
+
+def _back(first: str, second: str) -> Callable[[Trial, float], Trial]:
+    """The trial with the messages of two topics exchanged."""
+    return lambda trial, _: trial._replace(source=alter.exchanged(trial.source, first, second))
+
+
+def _suspects(parts: Iterable[tuple[Any, Stream]]) -> list[Any]:
+    """Those with the largest mean NIS, if that is too large at all."""
+    means: dict[Any, float] = {}
+    for name, stream in parts:
+        degrees = np.isfinite(stream["innovation"]).sum()
+        if degrees:
+            nis = np.nansum(stream["normalised_innovation_squared"]) / degrees
+            means[name] = max(means.get(name, 0.0), float(nis))
+    worst = sorted(means, key=lambda name: -means[name])[:SUSPECTS]
+    return worst if worst and means[worst[0]] > SUSPECT else []
+
+
+def _exchange(
+    topic: str, part: str, words: str, advice: Advice, without: Callable[[Trial, float], Trial]
+) -> Hypothesis:
+    return Hypothesis(
+        "exchanged numbers",
+        topic,
+        part,
+        (),
+        1.0,
+        without,
+        lambda *_: words,
+        lambda _: advice,
+        IS_SO,
+    )

@@ -1,0 +1,125 @@
+"""One thing that may be wrong, and how it is undone."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from pipeline.altering import alterations as alter
+from pipeline.diagnosing.advice import Advice
+from pipeline.diagnosing.likelihood import Trial
+from pipeline.diagnosing.numbers import number
+from recorders.parameters import Parameters
+
+Kind = Literal[
+    "measurement noise",
+    "process noise",
+    "factor or sign",
+    "bias or turned frame",
+    "drifting bias",
+    "parameter",
+    "exchanged axes",
+    "convention",
+    "delay",
+    "clock drift",
+    "exchanged numbers",
+    "start",
+    "outliers",
+    "lost messages",
+    "stamps",
+    "values",
+    "gate",
+    "covariance floor",
+    "divergence",
+    "unseen error",
+    "unnamed",
+]
+Number = Any  # a float; of a fault of several numbers a tuple of floats
+SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way in which a log or its settings may be wrong.
+
+    Attributes:
+        kind: what those that cannot be told apart have in common.
+        topic: the topic that it is of, or the parameter.
+        part: the component of the topic, if it is of one.
+        tried: numbers to begin the search with, the first two of them nearest to zero; none where it is
+            so, or is not. Of a fault of several numbers the step of each.
+        limit: of the number's magnitude.
+        without: the trial without the fault of this number.
+        words: what is wrong, from the number and the ends of its 95 % interval.
+        mend: what to try against this number; None where it is done already.
+        specials: numbers that are tried as they are, with what they mean, such as a unit.
+        size: of how many numbers it is.
+        floor: of the magnitude: what is less is no fault.
+        told: the number as tables have it: a factor, where it is searched by its logarithm.
+    """
+
+    kind: Kind
+    topic: str
+    part: str
+    tried: tuple[Any, ...]
+    limit: float
+    without: Callable[[Trial, Any], Trial]
+    words: Callable[[Any, Any, Any], str]
+    mend: Callable[[Any], Advice | None]
+    specials: Mapping[float, str] = field(default_factory=dict)
+    size: int = 1
+    floor: float = 0.0
+    told: Callable[[float], float] = float
+
+    @property
+    def has_end(self) -> bool:
+        """Whether what lies beyond the limit is not searched; an angle is, where it comes round."""
+        return bool(self.tried) and self.size == 1 and self.limit not in (np.pi, np.inf)
+
+    @property
+    def name(self) -> str:
+        """What it is of, in a few words."""
+        return " ".join(filter(None, (self.kind, self.topic, self.part)))
+
+
+IS_SO: Mapping[float, str] = {1.0: ""}  # the numbers of what is so, or is not
+
+
+def in_topic(
+    topic: str, alteration: alter.Alteration, stretched: float = 0.0
+) -> Callable[[Trial, Any], Trial]:
+    """The trial with the opposite of an alteration of a topic.
+
+    `stretched` is by how much the number stretches what is measured, see `Trial`.
+    """
+
+    def without(trial: Trial, value: Any) -> Trial:
+        source = alter.altered(trial.source, topic, alteration, -value)
+        if not stretched:
+            return trial._replace(source=source)
+        before = trial.stretched.get(topic, 0.0)
+        return trial._replace(
+            source=source, stretched={**trial.stretched, topic: before - stretched * value}
+        )
+
+    return without
+
+
+def has(parameters: Parameters | None, name: str) -> bool:
+    """Whether there is a parameter of this name."""
+    return parameters is not None and name in type(parameters).model_fields
+
+
+def times(at: float, low: float, high: float) -> str:
+    """By what factor a standard deviation is wrong, from logarithms."""
+    least, most = (
+        number(np.exp(abs(end))) if at * end > 0 else "1" for end in sorted((low, high), key=abs)
+    )
+    factor = number(np.exp(abs(at)))
+    return f"the standard deviation is {factor} times ({least} to {most}) too {size_of(at)}"
+
+
+def size_of(at: float) -> str:
+    """Whether it is too small or too large by so much."""
+    return "small" if at > 0.0 else "large"

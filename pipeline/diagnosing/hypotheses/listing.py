@@ -1,0 +1,56 @@
+"""All that may be wrong of a run and the estimator that is bound to it."""
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.diagnosing.hypotheses.components import of_components
+from pipeline.diagnosing.hypotheses.exchanges import of_numbers
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from pipeline.diagnosing.hypotheses.parameters import (
+    of_augmentable,
+    of_covariances,
+    of_gate,
+    of_noises,
+)
+from pipeline.diagnosing.hypotheses.stamps import hold_of, lag_of, of_stamps
+from pipeline.diagnosing.hypotheses.starts import of_start
+from pipeline.diagnosing.likelihood import Trial
+from recorders.log import Stream
+from replay.engine.replaying.estimator import Bound, Reading
+
+FEWEST = 20  # messages of which a topic's errors can be told
+
+
+def hypotheses(
+    bound: Sequence[Bound],
+    base: Trial,
+    innovations: Mapping[str, Stream],
+    readings: Mapping[str, Reading],
+) -> list[Hypothesis]:
+    """All that may be wrong.
+
+    Args:
+        bound: what is estimated.
+        base: the run as it is, and the settings.
+        innovations: of the run as it is, without a gate.
+        readings: by what is estimated, what is read.
+    """
+    source, parameters = base.source, bound[0].parameters
+    streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
+    of_topic = {topic: readings.get(each.name) for each in bound for topic in each.streams}
+    first_ns = source.extent("publish_time")[0]
+    stated = (topic for each in bound for topic in each.priors if topic in source.streams)
+    found = [*of_noises(bound, source, readings), *of_gate(parameters)]
+    found += of_augmentable(bound, readings)
+    for topic in streamed:
+        stream, reading = source.streams[topic], of_topic[topic]
+        if len(stream) < FEWEST:
+            continue
+        found += of_covariances(stream)
+        found += of_components(stream, reading, parameters, first_ns)
+        if len(streamed) > 1:
+            controls = reading.controls if reading else ()
+            lags_s = lag_of(stream, [source.streams[each] for each in controls if each != topic])
+            found += of_stamps(stream, reading, first_ns, hold_of(source.streams, controls), lags_s)
+    for topic in dict.fromkeys(stated):
+        found += of_start(source.streams[topic])
+    return [*found, *of_numbers(bound, source, innovations)]

@@ -1,0 +1,193 @@
+"""Faults of parameters: noise, what may be estimated beside the state, and the gate."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from pipeline.altering import alterations as alter
+from pipeline.altering.changes import STATED
+from pipeline.diagnosing.advice import Advice, precise, rounded
+from pipeline.diagnosing.hypotheses.hypothesis import (
+    IS_SO,
+    SCALES,
+    Hypothesis,
+    Kind,
+    has,
+    size_of,
+    times,
+)
+from pipeline.diagnosing.likelihood import Trial
+from pipeline.diagnosing.numbers import number
+from pipeline.tuning.objective import with_values
+from recorders.importers.units import unit_of
+from recorders.log import Stream, Topic
+from recorders.parameters import Parameters
+from replay.engine.replaying.estimator import Bound, Reading
+from replay.engine.streams.channels import stated
+from replay.engine.streams.sources import MemorySource
+
+GATE = 0.999
+LARGEST_SCALE = 12.0  # a logarithm
+# By unit the step from which a parameter is searched; without one a share.
+STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0.1, "": 0.02}
+
+
+def of_noises(
+    bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
+) -> Iterator[Hypothesis]:
+    """The noise that the estimator's parameters state, or channels for them."""
+    parameters = bound[0].parameters
+    if parameters is None:
+        return
+    read = [
+        source.topics[topic]
+        for each in bound
+        for topic in (*each.streams, *each.static)
+        if topic in source.topics
+    ]
+    noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
+    for name, topic in noises.items():
+        value = _noise_of(parameters, name, read)
+        if value is None:
+            continue
+        kind: Kind = "measurement noise" if topic else "process noise"
+        yield _noise(name, value, kind)
+
+
+def _noise(name: str, value: float, kind: Kind) -> Hypothesis:
+    letter = "R" if kind == "measurement noise" else "Q"
+
+    def without(trial: Trial, logarithm: float) -> Trial:
+        settings = with_values(trial.settings, [name], np.array([value * np.exp(logarithm)]))
+        return trial._replace(settings=settings)
+
+    def words(at: float, low: float, high: float) -> str:
+        return f"{name}: {times(at, low, high)}, so that {letter} is too {size_of(at)}"
+
+    def mend(at: float) -> Advice:
+        return Advice(name, rounded(value * np.exp(at)), free=name)
+
+    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend)
+
+
+def _noise_of(parameters: Parameters, name: str, read: Sequence[Topic]) -> float | None:
+    """The value of a parameter that is a noise: given, or as a channel states it."""
+    value = getattr(parameters, name)
+    if value is None:
+        value = stated(read, name, type(parameters), needed=False)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if is_number and 0.0 < value < np.inf else None
+
+
+def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
+    """The covariances that messages state, or their channel for them."""
+    fields = [
+        (field, alter.spread(field))
+        for field in ("covariance_m2", "covariance_m2ps2", "covariance")
+        if field in stream.columns and np.isfinite(stream[field]).any()
+    ]
+    if not fields and STATED in stream.metadata and "quaternion" in stream.columns:
+        fields = [(STATED, alter.spread_stated(STATED))]
+    for field, spread in fields:
+
+        def words(at: float, low: float, high: float, field: str = field) -> str:
+            said = times(at, low, high)
+            return f"{stream.topic}: of {field} {said}, so that R is too {size_of(at)}"
+
+        def mend(at: float) -> Advice:
+            return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
+
+        # undone by a covariance that is larger, where it is stated too small
+        without = partial(_spread, stream.topic, spread)
+        kind: Kind = "measurement noise"
+        yield Hypothesis(kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend)
+
+
+def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float) -> Trial:
+    return trial._replace(source=alter.altered(trial.source, topic, spread, logarithm))
+
+
+def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> Iterator[Hypothesis]:
+    """The parameters that may be estimated: those of one unit that the same functions read are a vector.
+
+    Those that are the bias or factor of a number of a topic are left out: that is tried by itself.
+    """
+    parameters = bound[0].parameters
+    groups: dict[tuple[Any, ...], list[str]] = {}
+    for reading in readings.values():
+        own = {*reading.biases.values(), *reading.factors.values()}
+        for name, (kind, topics) in reading.augmentable.items():
+            value = getattr(parameters, name, None)
+            if name in own or not isinstance(value, int | float):
+                continue
+            group = groups.setdefault((unit_of(name), kind, topics), [])
+            if name not in group:
+                group.append(name)
+    for (unit, _, topics), names in groups.items():
+        values = tuple(float(getattr(parameters, name)) for name in names)
+        yield _parameters(names, values, STEPS.get(unit, STEPS[""]), topics)
+
+
+def _parameters(
+    names: Sequence[str], values: tuple[float, ...], step: float, topics: Sequence[str]
+) -> Hypothesis:
+    """Some parameters have other values; the numbers are by how much."""
+    size = len(names)
+
+    def numbers(by: Any) -> tuple[float, ...]:
+        return tuple(by) if size > 1 else (by,)
+
+    def without(trial: Trial, by: Any) -> Trial:
+        added = np.add(values, numbers(by))
+        return trial._replace(settings=with_values(trial.settings, list(names), added))
+
+    def words(at: Any, low: Any, high: Any) -> str:
+        said = [
+            f"{name} is {number(value + by)} ({number(value + least)} to {number(value + most)})"
+            for name, value, by, least, most in zip(
+                names, values, numbers(at), numbers(low), numbers(high), strict=True
+            )
+        ]
+        where = " and ".join(topic or "the motion" for topic in topics)
+        given = ", ".join(number(value) for value in values)
+        return f"{where}: {', '.join(said)}, not {given}"
+
+    def mend(at: Any) -> Advice:
+        (name, value), *more = zip(
+            names, (rounded(each) for each in np.add(values, numbers(at))), strict=True
+        )
+        return Advice(name, value, free=" ".join(names) if size == 1 else "", more=tuple(more))
+
+    tried: tuple[Any, ...] = ((step,) * size,) if size > 1 else (-step, step, -10.0 * step, 10.0 * step)
+    return Hypothesis(
+        "parameter", names[0], ", ".join(names[1:]), tried, np.inf, without, words, mend, size=size
+    )
+
+
+def of_gate(parameters: Parameters | None) -> Iterator[Hypothesis]:
+    """Some measurements are of something else; a gate keeps these out."""
+    if not has(parameters, "gate_probability"):
+        return
+
+    def without(trial: Trial, _: float) -> Trial:
+        settings = {**trial.settings, "gate_probability": GATE, **_reopens(parameters)}
+        return trial._replace(settings=settings)
+
+    is_closed = (getattr(parameters, "gate_probability", None) or 1.0) <= GATE
+    yield Hypothesis(
+        "outliers",
+        "gate_probability",
+        "",
+        (),
+        1.0,
+        without,
+        lambda *_: "some measurements are outliers: of something else, or false",
+        lambda _: None if is_closed else Advice("gate_probability", GATE),
+        IS_SO,
+    )
+
+
+def _reopens(parameters: Parameters | None) -> dict[str, Any]:
+    return {"gate_reopens_s": 1.0} if has(parameters, "gate_reopens_s") else {}

@@ -1,0 +1,107 @@
+"""Faults of stamps: messages are late, or a clock gains."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from pipeline.altering import alterations as alter
+from pipeline.diagnosing.advice import Advice, precise
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic
+from pipeline.diagnosing.numbers import number
+from recorders.log import Stream
+from replay.engine.replaying.estimator import Reading
+
+DELAYS_S = (-0.02, 0.02, -0.1, 0.1, -0.4, 0.4, -2.0, 2.0, -8.0, 8.0)
+SPECIAL_S = {18.0: "the leap seconds between GPS and UTC", -18.0: "the leap seconds from UTC to GPS"}
+RATES = (-1e-4, 1e-4, -1e-3, 1e-3, -0.01, 0.01, -0.03, 0.03, -0.1, 0.1)
+LONGEST_DELAY_S, LARGEST_RATE = 30.0, 0.2
+LAGS_S = np.arange(-30.0, 30.05, 0.1)
+
+
+def of_stamps(
+    stream: Stream, reading: Reading | None, first_ns: int, hold_s: float, lags_s: tuple[float, ...]
+) -> Iterator[Hypothesis]:
+    """A topic's delay and its clock.
+
+    Args:
+        stream: the topic's messages.
+        reading: of what is estimated.
+        first_ns: where the run begins.
+        hold_s: half of how long a control holds: a smaller delay is how it is held, and no fault.
+        lags_s: what else may be its delay.
+    """
+    topic = stream.topic
+    own = reading.delays.get(topic, "") if reading else ""
+
+    def late(at: float, low: float, high: float) -> str:
+        about = f", {SPECIAL_S[at]}" if at in SPECIAL_S else ""
+        size, least, most = (f"{number(1e3 * each)} ms" for each in (at, low, high))
+        if abs(at) >= 1.0:
+            size, least, most = (f"{number(each)} s" for each in (at, low, high))
+        if at < 0.0:
+            return f"{topic}: its stamps are {size[1:]} early ({least} to {most}){about}"
+        return f"{topic}: comes {size} late ({least} to {most}) by its stamps{about}"
+
+    def mend_late(at: float) -> Advice:
+        return Advice(own or f"{topic}.delay_s", precise(at))
+
+    def gaining(at: float, low: float, high: float) -> str:
+        return f"{topic}: its clock gains {at:.3g} s a second ({low:.3g} to {high:.3g})"
+
+    def mend_gaining(at: float) -> Advice:
+        return Advice(f"{topic}.clock_gain", precise(at))
+
+    yield Hypothesis(
+        "delay",
+        topic,
+        "",
+        tuple(dict.fromkeys((*DELAYS_S, *lags_s))),
+        LONGEST_DELAY_S,
+        in_topic(topic, alter.delayed),
+        late,
+        mend_late,
+        SPECIAL_S,
+        floor=hold_s,
+    )
+    clock = in_topic(topic, alter.drifted(first_ns))
+    yield Hypothesis("clock drift", topic, "", RATES, LARGEST_RATE, clock, gaining, mend_gaining)
+
+
+def hold_of(streams: Mapping[str, Stream], controls: tuple[str, ...]) -> float:
+    """Half of the longest usual step of what drives, in s."""
+    steps = [
+        np.median(np.diff(streams[topic].publish_time_ns))
+        for topic in controls
+        if len(streams[topic]) > 1
+    ]
+    return 0.5e-9 * float(max(steps, default=0.0))
+
+
+def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
+    """By how much the speeds of positions lag behind a control that goes with them, in s, if it is told.
+
+    By the best correlation over a grid; a tenth of a second is near enough to begin a search at.
+    """
+    if "position_m" not in stream.columns or len(stream) < 20:
+        return ()
+    times_s = 1e-9 * stream.publish_time_ns
+    steps = np.diff(times_s)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed = np.linalg.norm(np.diff(stream["position_m"], axis=0), axis=1) / steps
+    middle = 0.5 * (times_s[1:] + times_s[:-1])
+    known = np.isfinite(speed)
+    best = 0.0, 0.0
+    for control in controls:
+        for name, column in control.columns.items():
+            if column.ndim != 1 or column.dtype.kind != "f" or name == "sensor_time_ns":
+                continue
+            driven_s = 1e-9 * control.publish_time_ns
+            for lag_s in LAGS_S:
+                at = middle - lag_s
+                both = known & (at >= driven_s[0]) & (at <= driven_s[-1])
+                if both.sum() < 20:
+                    continue
+                driven = np.abs(np.interp(at[both], driven_s, column))
+                if driven.std() > 0.0 and speed[both].std() > 0.0:
+                    best = max(best, (float(np.corrcoef(driven, speed[both])[0, 1]), float(lag_s)))
+    return (round(best[1], 1),) if best[0] > 0.5 and best[1] else ()

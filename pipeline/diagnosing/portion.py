@@ -1,0 +1,96 @@
+"""Long logs: causes are sought in their first part, and tried on the rest."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.altering.sources import alter, split_settings
+from pipeline.api.replays import replay
+from pipeline.diagnosing.numbers import number
+from pipeline.diagnosing.outputs import Outputs
+from recorders.log import RunMetadata, Stream, schemas
+from recorders.log.streams import concatenate
+from recorders.parameters import merge
+from replay.engine.replaying.estimator import Bound
+from replay.engine.streams.sources import LogSource, MemorySource
+
+MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
+
+
+class Portion(NamedTuple):
+    """What the estimator reads of a log, in memory; `end_ns` is where it ends, None for all of it."""
+
+    source: MemorySource
+    end_ns: int | None
+    note: str
+
+
+def first_part(
+    source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
+) -> Portion:
+    """What the estimator reads of a log; of a long one its first MOST_MESSAGES."""
+    whole = dict.fromkeys(topic for each in bound for topic in each.static)
+    streams = source.read([topic for topic in whole if topic in source.topics])
+    parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
+    stamps_ns = np.empty(0, np.int64)
+    for block in source.blocks(streamed, "publish_time", MOST_MESSAGES):
+        for topic, stream in block.items():
+            parts[topic].append(stream)
+        stamps_ns = np.concatenate([stamps_ns, *(stream.publish_time_ns for stream in block.values())])
+        if len(stamps_ns) > MOST_MESSAGES:
+            break
+    for topic, found in parts.items():
+        streams[topic] = concatenate(found) if found else source.empty(topic)
+    end_ns, note = None, ""
+    if len(stamps_ns) > MOST_MESSAGES:
+        end_ns = int(np.partition(stamps_ns, MOST_MESSAGES)[MOST_MESSAGES])
+        for topic in streamed:
+            streams[topic] = streams[topic].take(streams[topic].publish_time_ns < end_ns)
+        count = sum(source.topics[topic].messages for topic in streamed)
+        note = (
+            f"causes were sought in the first {(end_ns - source.epoch_ns) * 1e-9:.4g} s, "
+            f"{MOST_MESSAGES} of {count} messages, and tried on the rest; for another part: fuselog cut"
+        )
+    run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    return Portion(MemorySource(streams, run, source.name), end_ns, note)
+
+
+def on_the_rest(
+    source: LogSource | MemorySource,
+    label: str,
+    settings: Mapping[str, Any],
+    advised: Mapping[str, Any],
+    end_ns: int,
+) -> str:
+    """What following an advice gains after a part of the log, as a sentence goes on.
+
+    Args:
+        source: the whole log.
+        label: the estimator's.
+        settings: its parameters, with an open gate.
+        advised: settings of topics and parameters.
+        end_ns: where the part ends in which the cause was found.
+    """
+    of_topics, own = split_settings(advised)
+    before, after = (
+        _likelihood(alter(source, altering), label, given, end_ns)
+        for altering, given in (({}, settings), (of_topics, merge(settings, own)))
+    )
+    gain = after - before
+    if not np.isfinite(gain):
+        return ""
+    if gain > 0.0:
+        return f", and {number(gain, 4)} over the rest of the log"
+    return f"; but over the rest of the log it loses {number(-gain, 4)}: there it is not so"
+
+
+def _likelihood(
+    source: LogSource | MemorySource, label: str, settings: Mapping[str, Any], end_ns: int
+) -> float:
+    """The log-likelihood of all innovations from a stamp on."""
+    done = replay(source, {label: settings})
+    total = 0.0
+    for stream in Outputs(done, schemas.INNOVATION).values():
+        total += float(np.nansum(stream["log_likelihood"][stream.publish_time_ns >= end_ns]))
+    return total

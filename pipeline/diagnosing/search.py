@@ -1,0 +1,210 @@
+"""Searches for the numbers by which faults gain most: all faults in turn, each by a few values a round.
+
+A search is a generator: it yields values, is sent what they gain, and returns its `Peak`. So one replay
+has the next values of all faults.
+"""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq
+
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+
+Gains = Callable[[Sequence[Number]], Sequence[float]]  # of the values of one number
+Search = Generator[Sequence[Number], Sequence[float], "Peak"]
+DROP_95 = 1.92  # of the log-likelihood, from its greatest to where 95 % of a parameter end
+ROUNDS = 14  # of a refinement at most
+DOUBLINGS = 12  # of the way to an end
+LARGEST = 1e12  # a loss, of what cannot be used
+NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
+CLEAR = 0.05  # of the same, where a peak is of several numbers
+FAR = 0.02  # of what a peak lacks to the greatest: one that is far from it need not be known better
+NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
+
+
+class Peak(NamedTuple):
+    """The value at which the gain of a fault is greatest, and that gain.
+
+    `is_special` says that the value was not searched: it is one of the fault's special ones.
+    """
+
+    value: Number
+    gain: float
+    is_special: bool = False
+
+    def score(self, of: Hypothesis) -> float:
+        """The gain less what each number costs that is found."""
+        is_free = of.tried and not self.is_special
+        return self.gain - (NUMBER_COST * of.size if is_free else 0.0)
+
+
+def peak(of: Hypothesis, floor: float, greatest: Callable[[], float] = lambda: 0.0) -> Search:
+    """Search for the greatest gain of a fault.
+
+    Args:
+        of: the fault; it gains zero where its number is zero.
+        floor: a gain that is less than this is not worth a search.
+        greatest: the greatest gain that is known of any fault. Where none gains anything nearby, or by a
+            special value, nothing is looked for far away.
+    """
+    if of.size > 1:
+        return (yield from _of_several(of, floor, greatest))
+    near, far = of.tried[:2], [value for value in of.tried[2:] if value not in of.specials]
+    asked = [*of.specials, *near]
+    known: dict[float, float] = dict(zip(asked, (yield asked), strict=True))
+    special = max(of.specials, key=lambda value: known[value], default=None)
+    best = Peak(special, known[special], is_special=True) if special is not None else Peak(0.0, 0.0)
+    if not of.tried:
+        return best
+    known[0.0] = 0.0
+    is_flat = max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor
+    if is_flat and greatest() < floor:  # and nothing else is wrong
+        return Peak(0.0, 0.0)
+    known.update(zip(far, (yield far), strict=True))
+    if max(known.values()) < 0.5 * floor and _by_parabola(known, near) < 0.5 * floor:
+        return Peak(0.0, 0.0)  # a smooth function that is about greatest here
+    before = -np.inf
+    for _ in range(ROUNDS):
+        now = max(known.values())
+        enough = NEAR + FAR * max(greatest() - now, 0.0)
+        values = _next(known, of.limit)
+        if not values or (now - before < enough and _promised(known) < enough):
+            break
+        before = now
+        known.update(zip(values, (yield values), strict=True))
+    value = max(known, key=lambda each: known[each])
+    free = Peak(value, known[value])
+    return max(best, free, key=lambda each: each.score(of))
+
+
+def _around(known: Mapping[float, float]) -> tuple[float, float, float] | None:
+    """The neighbours of the value of the greatest gain, with it between them; None where it has none."""
+    values = sorted(known)
+    place = max(range(len(values)), key=lambda place: known[values[place]])
+    if place in (0, len(values) - 1):
+        return None
+    return values[place - 1], values[place], values[place + 1]
+
+
+def _vertex(known: Mapping[float, float], low: float, best: float, high: float) -> float | None:
+    """Where the parabola through three values is greatest; None where a gain is infinite."""
+    left, right = known[best] - known[low], known[best] - known[high]
+    if not np.isfinite(left + right) or left + right <= 0.0:
+        return None
+    a, b = best - low, high - best
+    bend, slope = left / a + right / b, left * b / a - right * a / b
+    return best + 0.5 * slope / bend if bend > 0.0 else None
+
+
+def _promised(known: Mapping[float, float]) -> float:
+    """By how much a parabola about the greatest gain is above it."""
+    around = _around(known)
+    if around is None:
+        return np.inf
+    low, best, high = around
+    at = _vertex(known, low, best, high)
+    if at is None:
+        return np.inf
+    side = low if at < best else high
+    # the parabola with this vertex, through the best and the neighbour on the vertex's side
+    share = (at - best) / (side - best)
+    drop = known[best] - known[side]
+    return float(drop * share**2 / (1.0 - 2.0 * share)) if 2.0 * share < 1.0 else np.inf
+
+
+def _next(known: Mapping[float, float], limit: float) -> list[float]:
+    """The next values to look at: about the greatest gain, or beyond where that is the last one."""
+    around = _around(known)
+    if around is None:
+        best = max(known, key=lambda value: known[value])
+        values = [float(np.clip(step * best, -limit, limit)) for step in (1.5, 3.0)]
+    else:
+        low, best, high = around
+        middles = [0.5 * (low + best), 0.5 * (best + high)]
+        at = _vertex(known, low, best, high)
+        if at is None:
+            values = middles
+        else:
+            apart = 0.25 * min(best - low, high - best) + 0.5 * abs(at - best)
+            near = [at, at - apart, at + apart]
+            values = [*near, *middles] if _is_lopsided(low, best, high) else near
+        values = [value for value in values if low < value < high]
+    return [value for value in dict.fromkeys(values) if value not in known]
+
+
+def _is_lopsided(low: float, best: float, high: float) -> bool:
+    """Whether a bracket is so uneven that a parabola says little."""
+    return max(best - low, high - best) > 8.0 * min(best - low, high - best)
+
+
+def _by_parabola(known: Mapping[float, float], sides: Sequence[float]) -> float:
+    """The greatest gain of the parabola through zero and both sides of it; infinite if it has none."""
+    if len(sides) < 2 or sides[0] * sides[1] >= 0.0:
+        return np.inf
+    low, high = sorted(sides)
+    gains = np.array([known[low], known[high]])
+    if not gains.any():  # nothing depends on the number
+        return 0.0
+    if not np.isfinite(gains).all():
+        return np.inf
+    (bend, slope) = np.linalg.solve([[low**2, low], [high**2, high]], gains)
+    return float(-(slope**2) / (4.0 * bend)) if bend < 0.0 else np.inf
+
+
+def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> Search:
+    """Search for several numbers: by the paraboloid about the best, again and again."""
+    size, steps = of.size, np.array(of.tried[0])
+    at, gain = np.zeros(size), 0.0
+    for number in range(ROUNDS):
+        pairs = [(row, column) for row in range(size) for column in range(row)]
+        units = np.diag(steps)
+        asked = [*(at + each for each in units), *(at - each for each in units)]
+        asked += [at + units[row] + units[column] for row, column in pairs]
+        gains = np.array((yield [tuple(map(float, each)) for each in asked])) - gain
+        if not np.isfinite(gains).all():
+            break
+        ahead, behind, both = np.split(gains, [size, 2 * size])
+        slope, bend = 0.5 * (ahead - behind), np.diag(ahead + behind)
+        for (row, column), value in zip(pairs, both, strict=True):
+            bend[row, column] = bend[column, row] = value - ahead[row] - ahead[column]
+        values, vectors = np.linalg.eigh(bend)
+        along = vectors.T @ slope
+        share = np.where(values < 0.0, along / np.maximum(-values, 1e-12), np.sign(along) * 4.0)
+        move = vectors @ np.clip(share, -100.0, 100.0) * steps
+        [found] = yield [tuple(map(float, at + move))]
+        if found <= gain:
+            break
+        improved, at, gain = found - gain, at + move, found
+        if gain < 0.5 * floor or improved < max(CLEAR, FAR * (greatest() - gain)):
+            break
+        if number == 0:
+            with np.errstate(divide="ignore"):
+                wide = np.sqrt(2.0 / np.maximum(-np.diag(bend), 1e-12)) * steps
+            steps = np.minimum(steps, np.where(np.isfinite(wide), wide, steps))
+    return Peak(tuple(map(float, at)), gain) if gain > 0.0 else Peak((0.0,) * size, 0.0)
+
+
+def interval(gains: Gains, at: Peak, scale: float) -> tuple[float, float]:
+    """The 95 % interval of a number: where the gain is less than its greatest by DROP_95.
+
+    `scale` is a length that is not too long; an end that is not found is infinite.
+    """
+    assert isinstance(at.value, float)
+    middle = at.value
+
+    def rest(value: float) -> float:
+        [gain] = gains([value])
+        return max(gain, -LARGEST) - (at.gain - DROP_95)
+
+    def end(sign: float) -> float:
+        inner, step = middle, sign * scale
+        for _ in range(DOUBLINGS):
+            outer = middle + step
+            if rest(outer) < 0.0:
+                return float(brentq(rest, inner, outer, xtol=1e-3 * abs(outer - middle)))
+            inner, step = outer, 2.0 * step
+        return sign * np.inf
+
+    return end(-1.0), end(1.0)

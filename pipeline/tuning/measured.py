@@ -1,0 +1,37 @@
+"""The part of a log over which something is measured, for diagnoses and tuning."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from replay.engine.replaying.estimator import Bound, Recursive
+from replay.engine.streams.sources import LogSource, MemorySource
+
+BEYOND_NS = 1_000_000_000  # that what drives goes on, so that the last measurement is between two of it
+
+
+def until_last_measured(
+    source: LogSource | MemorySource, bound: Sequence[Bound]
+) -> LogSource | MemorySource:
+    """A log up to a second after its last measurement: what drives the motion may go on for longer.
+
+    There are no estimates that anything could be compared with then, and that is no failure.
+    """
+    readings = [
+        (each, each.reading())
+        for each in bound
+        if isinstance(each, Recursive) and each.reading is not None
+    ]
+    controls = {topic for _, reading in readings for topic in reading.controls}
+    measured = {topic for each, _ in readings for topic in each.streams} - controls
+    if len(readings) < len(bound) or not controls or not measured:
+        return source
+    ends_ns = [
+        int(stream.publish_time_ns.max())
+        for topic in sorted(measured)
+        for stream in source.read([topic]).values()
+        if len(stream)
+    ]
+    if not ends_ns or max(ends_ns) + BEYOND_NS >= source.extent("publish_time")[1]:
+        return source
+    end_ns = max(ends_ns) + BEYOND_NS
+    return replace(source, end_ns=end_ns if source.end_ns is None else min(end_ns, source.end_ns))

@@ -1,0 +1,197 @@
+"""Says what an estimator of a model reads: which numbers of which topics, which parameters for what."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from recorders.log import Stream
+from replay.engine.arrays import Floats, Function
+from replay.engine.replaying.estimator import Reading
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.geodetic import GEODETIC, in_plane, origins_of
+from replay.inference.model.binding import Found
+from replay.inference.model.model import Control, Sensor
+from replay.inference.model.parameters import number_fields, settings_type
+from replay.inference.model.settings import TracedParameters
+from replay.inference.model.stage import Stage
+from replay.inference.model.validation import trial_state
+from replay.inference.run.events import control_numbers, with_covariance, without_covariance_of
+
+STEP = 1e-3  # of parameters and controls, by which their effects are compared
+
+
+def reading_of(stage: Stage, found: Found) -> Reading:
+    """Describe what an estimator reads.
+
+    Args:
+        stage: the model with the sensors at hand, its functions as they were written.
+        found: its topics.
+    """
+    model = stage.model
+    drives: dict[str, Control] = {}
+    if model.control is not None and found.control is not None:
+        drives[found.control.name] = model.control
+        drives |= {topic.name: each for each, topic in found.fallbacks}
+    sensors: dict[str, list[Sensor]] = {}
+    for sensor, topic in found.sensors:
+        sensors.setdefault(topic.name, []).append(sensor)
+    kinds = {topic: ("linear",) * len(each.components) for topic, each in drives.items()}
+    kinds |= {
+        topic: tuple(kind for each in own for kind in each.measured.values())
+        for topic, own in sensors.items()
+    }
+
+    def numbers(stream: Stream) -> Floats:
+        if stream.topic in sensors:
+            return np.concatenate([_measured(each, stream) for each in sensors[stream.topic]], axis=1)
+        control = drives[stream.topic]
+        read = control_numbers(control, gather([stream]))
+        if found.control is not None and stream.topic == found.control.name:
+            replaced = {name for each, _ in found.fallbacks for name in each.components}
+            read = np.where([name in replaced for name in control.components], 0.0, read)
+        return read
+
+    return Reading(
+        tuple(drives),
+        kinds,
+        numbers,
+        _noises(stage, found),
+        _augmentable(stage, found),
+        *_own_errors(stage, found),
+        {topic.name: sensor.delay for sensor, topic in found.sensors if sensor.delay},
+    )
+
+
+def _measured(sensor: Sensor, stream: Stream) -> Floats:
+    """Read what a sensor measures (n, m); of geodetic fixes in the plane about the first one."""
+    ragged = gather([stream])
+    if stream.schema.full_name == GEODETIC:
+        ragged = in_plane(ragged, origins_of(gather([stream.take(slice(0, 1))])))
+    return (
+        with_covariance(sensor, ragged).value
+        if sensor.covariance
+        else without_covariance_of(sensor, ragged)
+    )
+
+
+def _noises(stage: Stage, found: Found) -> dict[str, str]:
+    """List the parameters that are standard deviations: a variance grows with their squares."""
+    model = stage.model
+    names = number_fields(model.parameters)
+    state = trial_state(model.kinds)
+    of_motion: list[Callable[[Any], Any]] = []
+    for motion in stage.modes or (stage.motion,):
+        given = (noise for noise in (motion.noise, motion.gap_noise) if noise is not None)
+        of_motion += [partial(noise, state, 1.0) for noise in given]
+        if motion.control_noise is not None:
+            of_motion.append(partial(motion.control_noise, 1.0))
+    noises = {topic.name: sensor.noise for sensor, topic in reversed(found.sensors) if sensor.noise}
+    found_noises = {name: topic for topic, noise in noises.items() for name in _squared(noise, names)}
+    return found_noises | {name: "" for each in of_motion for name in _squared(each, names)}
+
+
+def _squared(variances: Callable[[Any], Any], names: tuple[str, ...]) -> list[str]:
+    """List the parameters by which one of the variances grows as by a standard deviation."""
+    traced, ones = TracedParameters(dict.fromkeys(names)), dict.fromkeys(names, 1.0)
+    kind = settings_type(names)
+    with np.errstate(all="ignore"):
+        variances(traced)
+        found = []
+        for name in sorted(traced.read, key=names.index):
+            none, one, two = (
+                np.array(variances(kind(**{**ones, name: value})), float) for value in (0.0, 1.0, 2.0)
+            )
+            once, twice = one - none, two - none
+            if np.any((once > 0.0) & (np.abs(twice - 4.0 * once) < 1e-6 * np.abs(once))):
+                found.append(name)
+    return found
+
+
+def _augmentable(stage: Stage, found: Found) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """List the parameters that may be estimated, with what reads them."""
+    model = stage.model
+    names = number_fields(model.parameters)
+    state, control = trial_state(model.kinds), (0.0,) * model.controls
+    readers: list[tuple[str, set[str]]] = []
+
+    def note(topic: str, function: Function, *arguments: Any) -> None:
+        traced = TracedParameters(dict.fromkeys(names))
+        with np.errstate(all="ignore"):
+            function(*arguments, traced)
+        readers.append((topic, traced.read))
+
+    for motion in stage.modes or (stage.motion,):
+        entering = ((0.0,) * motion.noises,) if motion.noises else ()
+        note("", motion.move, state, control, *entering, 1.0)
+    for sensor, topic in found.sensors:
+        entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
+        note(topic.name, sensor.measure, state, *entering, (1.0,) * sensor.reference_size)
+    by_name = {
+        name: (kind, tuple(dict.fromkeys(topic for topic, read in readers if name in read)))
+        for name, kind in model.augmentable.items()
+    }
+    return {name: (kind, topics) for name, (kind, topics) in by_name.items() if topics}
+
+
+def _own_errors(
+    stage: Stage, found: Found
+) -> tuple[dict[tuple[str, int], str], dict[tuple[str, int], str]]:
+    """Find the parameters that are biases or factors of controls, or biases of what is measured."""
+    model = stage.model
+    kind = settings_type(number_fields(model.parameters))
+    ones = kind(*(1.0,) * len(kind._fields))
+    state = trial_state(model.kinds)
+    biases: dict[tuple[str, int], str] = {}
+    factors: dict[tuple[str, int], str] = {}
+    control = 1.7 + np.arange(model.controls)
+    entering = ((0.0,) * stage.motion.noises,) if stage.motion.noises else ()
+
+    def moved(driven: Any, parameters: Any) -> Floats:
+        return np.array(stage.motion.move(state, tuple(driven), *entering, 0.5, parameters), float)
+
+    with np.errstate(all="ignore"):
+        for name in model.augmentable:
+            more = ones._replace(**{name: 1.0 + STEP})
+            for place, of_topic in enumerate(_driving(stage, found)):
+                unit = STEP * np.eye(model.controls)[place]
+                by_parameter = moved(control, more)
+                if np.array_equal(by_parameter, moved(control, ones)):
+                    continue
+                if np.allclose(by_parameter, moved(control + unit, ones), rtol=0.0, atol=1e-9):
+                    biases[of_topic] = name
+                elif np.allclose(by_parameter, moved(control * (1.0 + unit), ones), rtol=0.0, atol=1e-9):
+                    factors[of_topic] = name
+            for number, (sensor, topic) in enumerate(found.sensors):
+                before = sum(
+                    len(each.measured) for each, of in found.sensors[:number] if of.name == topic.name
+                )
+                without = ((0.0,) * sensor.noises,) if sensor.noises else ()
+                reference = (1.0,) * sensor.reference_size
+                added = [
+                    np.subtract(
+                        sensor.measure(at, *without, reference, more),
+                        sensor.measure(at, *without, reference, ones),
+                    )
+                    / STEP
+                    for at in (state, trial_state(model.kinds[::-1])[::-1])
+                ]
+                places = np.flatnonzero(np.abs(added[0]) > 1e-9)
+                if len(places) == 1 and np.allclose([each[places[0]] for each in added], 1.0, atol=1e-6):
+                    biases[topic.name, before + int(places[0])] = name
+    return biases, factors
+
+
+def _driving(stage: Stage, found: Found) -> list[tuple[str, int]]:
+    """List from which topic, and which of its numbers, the components of the control come."""
+    control = stage.model.control
+    if control is None or found.control is None:
+        return []
+    replacing = {
+        name: (topic.name, place)
+        for each, topic in found.fallbacks
+        for place, name in enumerate(each.components)
+    }
+    own = found.control.name
+    return [replacing.get(name, (own, place)) for place, name in enumerate(control.components)]
