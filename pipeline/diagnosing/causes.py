@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.numbers import number
 from pipeline.diagnosing.search import DROP_95, Gains, Peak, interval, peak
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import bind

@@ -5,11 +5,11 @@ noise is stated too small makes the range's innovations too large as well.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,16 +22,16 @@ from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause, Told, Tried, least_gain, seek, tried_table
 from pipeline.diagnosing.consistency import judged_by_itself, unnamed, unseen_errors
 from pipeline.diagnosing.findings import (
-    FIRST,
     Finding,
     component_table,
     of_estimates,
     of_innovations,
-    of_messages,
+    of_plausibility,
+    without_filter,
 )
-from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.diagnosing.outputs import Outputs
 from pipeline.diagnosing.portion import first_part, on_the_rest
+from pipeline.diagnosing.sentences import Sentence, ranked
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
@@ -49,25 +49,9 @@ from replay.foreign.naming import allowed, of_file, refuse_programs
 from replay.judging.errors.evaluation import split_topic
 
 MOST_SENTENCES = 5
-CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
 PROFILE_BINS = 60
-
-
-class Sentence(NamedTuple):
-    """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
-
-    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
-    and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.
-    """
-
-    kind: Kind
-    topic: str
-    words: str
-    time_ns: int | None = None
-    cause: Cause | None = None
-    setting: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -278,7 +262,8 @@ def diagnose(
     source = until_last_measured(source, bound)
     done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
     if done.failures:
-        raise BadInput(f"{done.failures[0]}; solve that first")
+        why = next((f": {each.words}" for each in of_plausibility(source, source.topics)), "")
+        raise BadInput(f"{done.failures[0]}; solve that first{why}")
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
         raise BadInput(
@@ -305,16 +290,12 @@ def diagnose(
             "measurements alone"
         )
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
-    of_log = list(of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns))
-    of_stamps = [each for each in of_log if each.kind in FIRST]
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
-    sentences = [Sentence(*each) for each in of_stamps]
-    sentences += [_sentence(each, trying, of_stamps, rest) for each in causes]
+    sentences = ranked(causes, without_filter(source, streamed), trying, rest)
     no_judges = judged_by_itself(source, streamed)
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
         *of_innovations(innovations, gate, source.epoch_ns, has_outliers=has_outliers),
-        *(each for each in of_log if each.kind not in FIRST),
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(
             each
@@ -322,9 +303,9 @@ def diagnose(
             if each.topic not in no_judges
         ),
     ]
-    if not causes and not findings:
+    if not sentences and not findings:
         findings += unnamed(done, innovations, len(tried), no_judges)
-    sentences += [Sentence(*each) for each in findings]
+    sentences += [Sentence.of(each) for each in findings]
     return Diagnosis(
         label,
         done,
@@ -359,29 +340,6 @@ def _asked(
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is diagnosed at a time; give one")
     return source, chosen
-
-
-def _sentence(
-    cause: Cause,
-    trying: Trying,
-    before: Sequence[Finding],
-    rest: Callable[[Mapping[str, Any]], str] | None,
-) -> Sentence:
-    """A cause, what to try against it, and whether that is good for the rest of a long log.
-
-    `before` is what was found in the stamps, of which a cause may be a consequence.
-    """
-    of, words = cause.hypothesis, cause.words
-    mend = of.mend(cause.value)
-    if mend is None:
-        words += "; the gate that is set keeps these out"
-        return Sentence(of.kind, of.topic, words, None, cause)
-    advice = trying.over(mend)
-    words += rest(mend.settings) if rest is not None else ""
-    if before and of.kind in CONSEQUENCES:
-        words += f"; this may be a consequence of what is wrong with the stamps of {before[0].topic}"
-    words += f"; try {trying.words(advice)}"
-    return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
 
 
 def _notes(done: Replay, sentences: Sequence[Sentence]) -> list[str]:

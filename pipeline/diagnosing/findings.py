@@ -3,7 +3,7 @@
 Thresholds are far from what chance does to a log that is as its model says; each is beside its name.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,10 @@ from scipy.stats import kurtosis
 
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
+from recorders.plausibility.checks import BLOCK, findings_in
+from recorders.plausibility.finding import Cause
 from replay.distributions import chi2
+from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
 
@@ -36,12 +39,46 @@ FLOOR_STEP = 1e-4  # relative, from the least variance to the next
 
 
 class Finding(NamedTuple):
-    """Something unusual: its kind, a topic, a sentence with its evidence, and when it began."""
+    """Something unusual: its kind, a topic, a sentence with its evidence, when it began, its mend."""
 
     kind: Kind
     topic: str
     words: str
     time_ns: int | None = None
+    setting: str = ""
+
+
+# Of what is told without a filter, the kind that it is here.
+KINDS: Mapping[Cause, Kind] = {
+    "stamps": "stamps",
+    "lost messages": "lost messages",
+    "clock": "clock drift",
+    "delay": "delay",
+    "unit": "values",
+    "scale": "values",
+    "sign": "values",
+    "gravity": "values",
+    "quaternion": "values",
+    "mounting": "bias or turned frame",
+    "covariance": "measurement noise",
+}
+
+
+def without_filter(source: LogSource | MemorySource, streamed: Collection[str]) -> list[Finding]:
+    """All that the topics of an estimator say by themselves, each once: the worst of the log first."""
+    implausible = list(of_plausibility(source, streamed))
+    known = [(each.kind, each.topic) for each in implausible]
+    of_topics = of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns)
+    return [*implausible, *(each for each in of_topics if (each.kind, each.topic) not in known)]
+
+
+def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str]) -> Iterator[Finding]:
+    """What a log says of its own faults before any filter, of the topics that an estimator reads."""
+    topics = [topic for topic in source.topics if is_sensed(source, topic)]
+    for each in findings_in(source.blocks(topics, "publish_time", BLOCK)):
+        if each.topic in streamed:
+            setting = f"{each.key}={each.setting}" if each.key else ""
+            yield Finding(KINDS[each.cause], each.topic, each.mended, None, setting)
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:

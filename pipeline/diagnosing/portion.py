@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.altering.sources import alter, split_settings
 from pipeline.api.replays import replay
-from pipeline.diagnosing.numbers import number
+from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.outputs import Outputs
 from recorders.log import RunMetadata, Stream, schemas
 from recorders.log.streams import concatenate

@@ -329,7 +329,7 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
 def _said(fault: Fault, found: Diagnosis) -> dict[str, Any]:
     """What the diagnosis said, and whether it is right."""
     is_right = [
-        each.kind == fault.kind and (not fault.topic or each.topic == fault.topic)
+        any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in each.names)
         for each in found.sentences
     ]
     first = found.sentences[0] if found.sentences else None

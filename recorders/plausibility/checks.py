@@ -3,7 +3,7 @@
 A check of motion takes a body's topics compared in pairs, one of stamps a topic and all others.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 
 from recorders.errors import BadInput
 from recorders.log import Log, Stream, read_blocks, read_empty
@@ -14,6 +14,7 @@ from recorders.plausibility.finding import Finding
 from recorders.plausibility.motion import Motion
 
 MOST = 1 << 19  # messages that are looked at: the first of a log, however long it is
+BLOCK = 1 << 16
 
 OF_STAMPS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] = (
     stamps.losses,
@@ -50,18 +51,23 @@ def findings(streams: Mapping[str, Stream]) -> list[Finding]:
     return found + list(stamps.drifts(sensed))
 
 
-def findings_of(log: Log) -> list[Finding]:
-    """The findings of a log file, by its first `MOST` messages; raises BadInput where it is damaged."""
-    topics = [topic for topic in log.topics if _is_sensed(log, topic)]
+def findings_in(blocks: Iterable[Mapping[str, Stream]]) -> list[Finding]:
+    """The findings of blocks that follow one another in time, by the first `MOST` messages."""
     parts: dict[str, list[Stream]] = {}
     count = 0
-    for block in read_blocks(log, topics, block_messages=MOST >> 3) if topics else ():
+    for block in blocks:
         for topic, stream in block.items():
             parts.setdefault(topic, []).append(stream)
             count += len(stream)
         if count > MOST:
             break
     return findings({topic: concatenate(found) for topic, found in parts.items()})
+
+
+def findings_of(log: Log) -> list[Finding]:
+    """The findings of a log file, by its first `MOST` messages; raises BadInput where it is damaged."""
+    topics = [topic for topic in log.topics if _is_sensed(log, topic)]
+    return findings_in(read_blocks(log, topics, block_messages=BLOCK) if topics else ())
 
 
 def _is_sensed(log: Log, topic: str) -> bool:

@@ -129,9 +129,12 @@ class Motion:
             if each.source in late_s:
                 continue  # its speeds tell more
             late_s.setdefault(each.against, 0.0)
-            lag_s = _sure_lag_s(each.timing)
-            if abs(lag_s) > LONG_S or self._goes_where_it_points(each):
-                late_s[each.source] = late_s[each.against] - lag_s
+            own_s = late_s[each.against] - _sure_lag_s(each.timing)
+            nearest_s = min(late_s.values(), key=lambda other_s: abs(own_s - other_s))
+            if self._goes_where_it_points(each):
+                late_s[each.source] = own_s
+            elif _sure_lag_s(each.timing):
+                late_s[each.source] = nearest_s if abs(own_s - nearest_s) < LONG_S else own_s
         if not late_s:
             return {}
         sorted_s = sorted(late_s.values())

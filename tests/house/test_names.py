@@ -135,7 +135,7 @@ def test_every_attribute_that_is_described_is_one() -> None:
     "text",
     [
         "see `replay.inference.steps.reading`",
-        "see `steps.reading`",
+        "see `steps.taking_in`",
         "see `Stream.colums`",
         "see replay/inference/steps.py",
     ],

@@ -1,13 +1,25 @@
 """The battery of the sheet of sensors, section 3: cars with one fault each, as new users log them."""
 
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pandas as pd
 import pytest
 
 import fuselog as fl
+from pipeline.altering.sources import alter
+from pipeline.diagnosing import portion
 from pipeline.diagnosing.battery import battery
-from pipeline.diagnosing.battery.car import FAULTS, drive, faulty, recorded
+from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
+from pipeline.diagnosing.battery.car import FAULTS, drive, faulty, recorded, stamps_ns
+from pipeline.diagnosing.consistency import judged_by_itself
 from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.tuning.measured import until_last_measured
+from recorders.models.orientation import heading
+from replay.engine.replaying.estimator import bind
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 SEED = 2000
@@ -78,3 +90,94 @@ def test_the_battery_is_counted_by_cell() -> None:
     assert counted["diagnosis.battery_first.fixes-3-s-late-compass-prior"] == 1.0
     assert counted["diagnosis.battery_first_share"] == counted["diagnosis.battery_nothing_share"] == 0.5
     assert np.isclose(counted["diagnosis.battery_runs"], 2.0)
+
+
+def test_what_is_altered_is_what_a_diagnosis_supposes() -> None:
+    """The new settings undo what is planted into columns, to the last digits."""
+    clean, log = drive(SEED), recorded(drive(SEED))
+    faults = {
+        f"{ODOMETRY}.turn_drift=0.0004": recorded(faulty(SEED, "gyro bias .0004 t")),
+        f"{FIX}.position_axes=yx": recorded(faulty(SEED, "E, N exchanged")),
+        f"{HEADING}.heading_convention=north": recorded(faulty(SEED, "compass clockwise from north")),
+        f"{HEADING}.heading_bias=4.5 deg": recorded(faulty(SEED, "compass + 4.5 deg")),
+        f"{HEADING}.heading_scale=-1": recorded(clean._replace(compass_rad=-clean.compass_rad)),
+        f"{ODOMETRY}.clock_gain=0.06": recorded(faulty(SEED, "odometry clock 6 % fast")),
+    }
+    for setting, planted in faults.items():
+        mended = alter(planted, dict([setting.split("=")]))
+        for topic, name in ((ODOMETRY, "forward_mps"), (ODOMETRY, "turn_radps"), (FIX, "position_m")):
+            column = log.streams[topic][name]
+            assert np.allclose(mended.streams[topic][name], column, atol=1e-9), (setting, name)
+        apart = heading(mended.streams[HEADING]["quaternion"]) - clean.compass_rad
+        assert np.allclose(np.cos(apart), 1.0), setting
+        assert np.abs(mended.streams[ODOMETRY].publish_time_ns - stamps_ns(clean.odometry_s)).max() < 2
+    wider = alter(log, {f"{HEADING}.covariance_scale": 4}).streams[HEADING].metadata["covariance_rad2"]
+    assert [float(each) for each in wider.split(",")] == pytest.approx([4 * 0.03**2] * 3)
+
+
+def test_a_unit_that_outlasts_the_last_fix_is_no_failure() -> None:
+    log = fl.record("navigation", seed=1, duration_s=20.0, unit={"rate_hz": 25.0})
+    until_ns = log.epoch_ns + 12_000_000_000
+    cut = {
+        topic: stream.take(stream.publish_time_ns < until_ns)
+        for topic, stream in log.streams.items()
+        if topic in ("/body/fix", "/body/velocity")
+    }
+    shorter = replace(log, streams={**log.streams, **cut})
+    bound = bind("ekf", [shorter], {"kind": "ekf"})
+    span = until_last_measured(shorter, bound)
+    assert span.end_ns is not None
+    assert until_ns < span.end_ns < until_ns + 1_500_000_000
+    assert fl.replay(span, "ekf").failures == []
+    assert until_last_measured(log, bound) is log
+
+
+def test_a_truth_that_is_the_very_fixes_is_no_judge() -> None:
+    log = recorded(drive(SEED), has_compass=False)
+    fixes = log.streams[FIX]
+    truth = fl.make_stream(
+        "/car/truth",
+        fl.schemas.TRUTH_STATE,
+        fixes.publish_time_ns,
+        metadata={"components": "x_m,y_m", "kinds": "linear,linear"},
+        state=fixes["position_m"],
+    )
+    judged = replace(log, streams={**log.streams, "/car/truth": truth})
+    said = judged_by_itself(judged, [ODOMETRY, FIX])
+    assert list(said) == ["/car/truth"]
+    assert "/car/truth is what /car/fix says, which the filter used" in said["/car/truth"]
+    other = replace(truth, columns={"state": truth["state"] + 0.1, **_but(truth, "state")})
+    assert judged_by_itself(replace(judged, streams={**log.streams, "/car/truth": other}), [FIX]) == {}
+
+
+def _but(stream: fl.Stream, name: str) -> dict[str, np.ndarray]:
+    return {each: column for each, column in stream.columns.items() if each != name}
+
+
+def test_a_tracker_is_diagnosed_and_tuned_in_a_sentence() -> None:
+    log = fl.record("crossing", seed=1, duration_s=10.0)
+    notes = fl.diagnose(log, "tracker").notes
+    assert any("states no likelihood of its innovations" in each for each in notes)
+    with pytest.raises(fl.BadInput, match="tracker gives no innovations with a likelihood there"):
+        fl.tune(log, "tracker", "acceleration_density")
+
+
+def test_causes_of_a_part_are_tried_on_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gyroscope whose bias is gone in the second half: what the first half says is not so there."""
+    car = drive(SEED)
+    turn = car.turn_radps + np.where(car.odometry_s < 50.0, 0.03, 0.0)
+    log = recorded(car._replace(turn_radps=turn), has_compass=False, has_prior=True)
+    monkeypatch.setattr(portion, "MOST_MESSAGES", 600)
+    found = fl.diagnose(log, "ekf", set={"gate_probability": 1.0})
+    words = found.sentences[0].words
+    assert "turn_radps is too large by 0.0" in words
+    assert "over the rest of the log it loses" in words
+    assert found.notes[0].startswith("causes were sought in the first 50 s")
+
+
+def test_what_was_tried_is_listed(tmp_path: Path, fuselog: Callable[..., Any]) -> None:
+    fl.write(tmp_path / "car.mcap", recorded(drive(SEED), has_compass=False, has_prior=True))
+    said = fuselog("diagnose", tmp_path / "car.mcap", "-e", "ekf", "--tried").out
+    assert "nothing found" in said
+    for fault in ("factor or sign /car/odometry forward_mps", "parameter lever_x_m", "delay /car/fix"):
+        assert fault in " ".join(said.split())

@@ -5,11 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose
 
 import fuselog as fl
 from recorders.models.geodesy import out_of_tangent_plane
-from tests.pipeline.car_d import Car, drive
+from tests.pipeline.car_d import FAULTS, Car, drive
 
 BERLIN = (52.5, 13.4, 40.0)
 FOOT_M = 0.3048
@@ -68,3 +69,28 @@ def test_a_german_dump_is_imported_by_one_command(fuselog: Callable[..., Any], t
     assert_allclose(np.abs(turned), 1.0, atol=1e-9)
     said = fuselog("info", tmp_path / "drive.mcap", "--json")
     assert said.json["findings"] == []
+
+
+# What is named first, of each fault; and of two, among the first three.
+NAMED = {
+    "speed x 3.6": {"/odometry.forward_scale": 1 / 3.6},
+    "turn rate's sign": {"/odometry.turn_scale": -1.0},
+    "degrees as radians": {"/odometry.turn_scale": np.pi / 180.0},
+    "fixes .3 s late": {"/fix.delay_s": 0.3},
+    "fix variance x 4": {"/fix.covariance_scale": 0.25},
+    "speed x 3.6, turn rate's sign": {"/odometry.forward_scale": 1 / 3.6, "/odometry.turn_scale": -1.0},
+}
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize("names", NAMED)
+def test_each_fault_of_the_dump_is_named_first(
+    fuselog: Callable[..., Any], tmp_path: Path, names: str
+) -> None:
+    car = drive(3)
+    for name in names.split(", "):
+        car = FAULTS[name](car)
+    found = fl.diagnose(imported(car, tmp_path, fuselog), "ekf").sentences
+    first = dict(each.setting.split("=") for each in found[: 1 if len(NAMED[names]) == 1 else 3])
+    for key, value in NAMED[names].items():
+        assert float(first[key]) == pytest.approx(value, rel=0.15)

@@ -8,6 +8,11 @@ from typing import Any
 
 import pytest
 
+import fuselog as fl
+from pipeline.altering.sources import alter
+from recorders.errors import BadInput
+from recorders.plausibility.checks import BLOCK, findings_in
+
 CORRECTIONS = 2
 
 
@@ -40,3 +45,28 @@ def test_each_message_leads_on_to_a_run_that_works(
     else:
         said = fuselog("replay", str(log), "-e", "ekf", "-o", str(tmp_path / "e.mcap"), *options)
     assert said.code == 0, said.err
+
+
+# What is planted into the walk, and the setting that is to undo it.
+PLANTED = {
+    "nothing": ({}, []),
+    "turn rate's sign": ({"/inertial.turn_rate_scale": -1}, ["/inertial.turn_rate_z_scale=-1"]),
+    "degrees": ({"/inertial.turn_rate_scale": 57.29578}, ["/inertial.turn_rate_scale=0.01745"]),
+    "velocity x 3.6": ({"/velocity.velocity_scale": 3.6}, ["/velocity.velocity_scale=0.2778"]),
+    "18 s, fixes": ({"/fix.delay_s": -18}, ["/fix.delay_s=18.0"]),
+    "18 s, velocities": ({"/velocity.delay_s": -18}, ["/velocity.delay_s=18.0"]),
+    "18 s, unit": ({"/inertial.delay_s": -18}, ["/inertial.delay_s=18.0"]),
+}
+
+
+def test_what_is_planted_into_a_walk_is_found_without_a_filter(navigation: Path) -> None:
+    """Where the course is not the heading, its lag of .58 s is no delay."""
+    walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
+    topics = ["/fix", "/velocity", "/inertial"]
+    for planted, wanted in PLANTED.values():
+        blocks = alter(walk, planted).blocks(topics, "publish_time", BLOCK)
+        assert [f"{each.key}={each.setting}" for each in findings_in(blocks)] == wanted
+    with pytest.raises(
+        BadInput, match=r"solve that first: /inertial: its stamps are 18 s late.*delay_s=18"
+    ):
+        fl.diagnose(walk, "ekf", set=PLANTED["18 s, unit"][0])

@@ -9,7 +9,7 @@ import pandas as pd
 
 from pipeline.diagnosing.battery.car import FAULTS, faulty, recorded
 from pipeline.diagnosing.causes import Cause, seek
-from pipeline.diagnosing.findings import FIRST, of_messages
+from pipeline.diagnosing.findings import FIRST, without_filter
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.runs.ensemble import Progress
 
@@ -78,10 +78,13 @@ def cells(*, has_prior: bool = False) -> Iterator[Cell]:
 def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
     """Plant a fault, and look for the likeliest causes, so many at most."""
     log = recorded(faulty(seed, cell.fault), has_compass=cell.has_compass, has_prior=cell.has_prior)
-    lost = [each for each in of_messages(log.streams.values(), 0) if each.kind in FIRST]
+    of_log = without_filter(log, list(log.streams))
     found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, most)
-    named = [[Right(each.kind, each.topic)] for each in lost]
-    named += [list(_named(cause)) for cause in found.causes]
+    causes = [list(_named(cause)) for cause in found.causes]
+    known = {one.topic for each in causes for one in each}
+    lost = [[Right(each.kind, each.topic)] for each in of_log if each.kind in FIRST]
+    others = [each for each in of_log if each.kind not in FIRST and each.topic not in known]
+    named = [*lost, *causes, *([Right(each.kind, each.topic)] for each in others)]
     right = [each[:3] for each in RIGHT[cell.fault]]
     places = [any(one[:3] in right for one in each) for each in named]
     value, gain = np.nan, np.nan

@@ -8,9 +8,8 @@ import numpy as np
 
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import AXES, bare, entry_of
-from pipeline.diagnosing.advice import Advice, precise, rounded
+from pipeline.diagnosing.advice import Advice, number, precise, rounded
 from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, Kind, in_topic
-from pipeline.diagnosing.numbers import number
 from recorders.importers.units import unit_of
 from recorders.log import Stream
 from recorders.parameters import Parameters

@@ -7,9 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice
+from pipeline.diagnosing.advice import Advice, number
 from pipeline.diagnosing.likelihood import Trial
-from pipeline.diagnosing.numbers import number
 from recorders.parameters import Parameters
 
 Kind = Literal[

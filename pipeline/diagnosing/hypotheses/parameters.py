@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import STATED
-from pipeline.diagnosing.advice import Advice, precise, rounded
+from pipeline.diagnosing.advice import Advice, number, precise, rounded
 from pipeline.diagnosing.hypotheses.hypothesis import (
     IS_SO,
     SCALES,
@@ -19,7 +19,6 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     times,
 )
 from pipeline.diagnosing.likelihood import Trial
-from pipeline.diagnosing.numbers import number
 from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
 from recorders.log import Stream, Topic

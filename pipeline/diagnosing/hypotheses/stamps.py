@@ -5,9 +5,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice, precise
+from pipeline.diagnosing.advice import Advice, number, precise
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic
-from pipeline.diagnosing.numbers import number
 from recorders.log import Stream
 from replay.engine.replaying.estimator import Reading
 

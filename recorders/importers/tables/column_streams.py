@@ -13,6 +13,7 @@ from recorders.importers.tables.columns import (
     length_of,
     name_of,
     names_of,
+    scatter_rad,
     stated_unit,
     stream_lines,
     take,
@@ -344,7 +345,8 @@ def _heading(table: GuessedTable) -> Iterator[str]:
         "Orientation",
         "the name is that of a heading or compass",
         f"fields.quaternion = {json.dumps(quaternion)}",
-        "states.covariance_rad2 = 0.003   # 3 deg; fill in the variance",
+        f"states.covariance_rad2 = {scatter_rad(found[0], direction.unit) ** 2:.2g}   # as it scatters "
+        "from one to the next; fill in the variance",
     )
 
 

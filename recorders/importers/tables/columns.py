@@ -177,6 +177,14 @@ def direction_of(heading: GuessedColumn, places: Sequence[GuessedColumn]) -> Dir
     return Direction(in_unit, bool(re.search("compass|course", heading.plain)), why)
 
 
+def scatter_rad(heading: GuessedColumn, in_unit: str) -> float:
+    """The standard deviation of a heading's white noise by its second differences, at least .5 deg."""
+    angle = unit(in_unit).size * heading.values[np.isfinite(heading.values)]
+    bend = np.angle(np.exp(1j * np.diff(angle, n=2)))
+    sigma = 1.4826 * float(np.median(np.abs(bend))) / np.sqrt(6.0) if len(bend) else 0.0
+    return max(sigma, float(np.radians(0.5)))
+
+
 def _course(places: Sequence[GuessedColumn]) -> tuple[NDArray, NDArray, NDArray] | None:
     """Rows from which places move, in which direction (rad) and how far; None where they do not."""
     east, north = (each.values for each in places[:2])

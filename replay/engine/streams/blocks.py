@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from itertools import compress
 from typing import Any, NamedTuple, TypeVar
 
@@ -209,7 +209,7 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
     events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
     heads = partial(np.empty, len(everything), np.int64)
-    _merge()(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
+    _merge(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
     return events
 
 
@@ -227,11 +227,6 @@ def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> N
         is_last[:-1] |= column[1:] != column[:-1]
     is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
     return is_last
-
-
-@lru_cache(maxsize=1)
-def _merge() -> Callable[..., None]:
-    return compile_over_runs(merge_run, allocates=False)
 
 
 def merge_run(
@@ -260,3 +255,6 @@ def merge_run(
         events.time_ns[event], events.is_last[event] = time_ns, True
         events.topic[event], events.source[event] = first, heads[first]
         heads[first] += 1
+
+
+_merge = compile_over_runs(merge_run, allocates=False)

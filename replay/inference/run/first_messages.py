@@ -5,9 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from recorders.log import Clock, Stream
+from recorders.log import Clock, Stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import reason_stream
 from replay.engine.vectors.tangent import manifold_blocks, named_now, tangent_components
 from replay.inference.model.stage import Stage
 from replay.inference.model.start import Start
@@ -99,3 +100,19 @@ def first_of_runs(
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
     """Lay out a stream of one message for each of some runs."""
     return Ragged(stream, np.append(0, np.cumsum(has_one)))
+
+
+def started(name: str, facts: list[Fact]) -> list[Ragged]:
+    """Make the stream `started` of an estimator: a message for each fact and run."""
+    if not facts:
+        return []
+    texts, times, which = zip(*facts, strict=True)
+    is_said = np.stack(which, axis=1)
+    stream = reason_stream(
+        f"/estimates/{name}/started",
+        schemas.STARTED,
+        np.stack(times, axis=1)[is_said],
+        np.nonzero(is_said)[1],
+        texts,
+    )
+    return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]

@@ -18,7 +18,6 @@ from recorders.parameters import meanings
 from replay.engine.arrays import Floats
 from replay.engine.replaying.estimator import Initialization, Initialized
 from replay.engine.streams.blocks import Block, Ragged, gather, merge_events
-from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import in_plane, origins_of
 from replay.engine.streams.results import gaussian_stream, named
 from replay.inference.model.binding import Found, measures_state
@@ -34,6 +33,7 @@ from replay.inference.run.first_messages import (
     first_of_runs,
     of_runs,
     run_count,
+    started,
     state_by_message,
     unknown,
 )
@@ -134,10 +134,10 @@ class Initializer:
             facts += begun
         elif self._prior_check is not None:
             facts += self._checked_prior(self._prior_check, first, static, origins)
-        return Initialized(found, [*told, *self._told(facts)])
+        return Initialized(found, [*told, *started(self.name, facts)])
 
     def find_broad(
-        self, first: Mapping[str, Ragged], _: Mapping[str, Ragged], clock: Clock, time_ns: int
+        self, first: Mapping[str, Ragged], _static: Mapping[str, Ragged], clock: Clock, time_ns: int
     ) -> list[Initialized]:
         """Find one run's equally likely starts at a stamp; see `broad_priors`."""
         origins = None if self.found.origin is None else self.found.origin[None]
@@ -149,7 +149,7 @@ class Initializer:
         for number, sensor, topic in self._measuring:
             ragged = first[topic.name]
             table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
-            [has_message], [row] = first_of_runs(ragged, clock, table.source >= 0)[1:]
+            _when, [has_message], [row] = first_of_runs(ragged, clock, table.source >= 0)
             if has_message:
                 references.append(
                     (sensor.measured, *state_by_message(self.stage, number, table.data[row]))
@@ -239,13 +239,13 @@ class Initializer:
         for run in range(len(how)):
             try:
                 streams = {name: ragged.of_run(run) for name, ragged in given.items()}
-                started = model.start.find(streams, parameters)
+                found = model.start.find(streams, parameters)
             except BadInput as error:
                 if run == len(how) - 1 and not any(how):
                     raise BadInput(f"estimator {self.name}: {error}") from error
                 continue
-            begun.time_ns[run], begun.mean[run] = started.time_ns, started.mean
-            begun.covariance[run], how[run] = started.covariance, started.how
+            begun.time_ns[run], begun.mean[run] = found.time_ns, found.mean
+            begun.covariance[run], how[run] = found.covariance, found.how
         return [
             Fact(f"{self._without} {words}", begun.time_ns, np.array(how) == words)
             for words in dict.fromkeys(filter(None, how))
@@ -383,18 +383,3 @@ class Initializer:
         topic = f"/estimates/{self.name}/origin"
         told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
         return Ragged(told, fixes.offsets)
-
-    def _told(self, facts: list["Fact"]) -> list[Ragged]:
-        """Make the stream `started` of what was assumed: a message for each sentence and run."""
-        if not facts:
-            return []
-        texts, times, which = zip(*facts, strict=True)
-        is_said = np.stack(which, axis=1)
-        stream = reason_stream(
-            f"/estimates/{self.name}/started",
-            schemas.STARTED,
-            np.stack(times, axis=1)[is_said],
-            np.nonzero(is_said)[1],
-            texts,
-        )
-        return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]

@@ -1,0 +1,88 @@
+"""What a diagnosis says: causes and what stands in the log by itself, as sentences in their order."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from pipeline.diagnosing.advice import Trying
+from pipeline.diagnosing.causes import Cause
+from pipeline.diagnosing.findings import FIRST, Finding
+from pipeline.diagnosing.hypotheses.hypothesis import Kind
+
+# What explains the numbers themselves, and no noise or bias that would have to be large.
+OF_FORM = ("factor or sign", "exchanged axes", "convention", "parameter", "delay", "clock drift")
+CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
+
+Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over the rest of a long log
+
+
+class Sentence(NamedTuple):
+    """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
+
+    `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
+    and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.
+    """
+
+    kind: Kind
+    topic: str
+    words: str
+    time_ns: int | None = None
+    cause: Cause | None = None
+    setting: str = ""
+
+    @property
+    def names(self) -> list[tuple[Kind, str]]:
+        """What it names: a kind and a topic, and those that the log does not tell from it."""
+        others = self.cause.others if self.cause else ()
+        return [
+            (self.kind, self.topic),
+            *((each.hypothesis.kind, each.hypothesis.topic) for each in others),
+        ]
+
+    @classmethod
+    def of(cls, found: Finding) -> "Sentence":
+        """A finding that no likelihood is needed for."""
+        return cls(found.kind, found.topic, found.words, found.time_ns, None, found.setting)
+
+
+def ranked(
+    causes: Sequence[Cause], of_log: Sequence[Finding], trying: Trying, rest: Rest | None
+) -> list[Sentence]:
+    """Sentences in their order: stamps, causes, and what else is seen without any filter.
+
+    What has a setting that undoes it stands before causes that are but its consequence, such as noise.
+    What the causes name of the same topic is not said twice.
+    """
+    of_stamps = [each for each in of_log if each.kind in FIRST]
+    named = {each.hypothesis.topic for cause in causes for each in (cause, *cause.others)}
+    others = [each for each in of_log if each.kind not in FIRST and each.topic not in named]
+    is_consequence = bool(causes) and causes[0].hypothesis.kind not in OF_FORM
+    before = [each for each in others if each.setting and is_consequence]
+    after = [each for each in others if each not in before]
+    return [
+        *map(Sentence.of, [*of_stamps, *before]),
+        *(_sentence(each, trying, of_stamps, rest) for each in causes),
+        *map(Sentence.of, after),
+    ]
+
+
+def _sentence(
+    cause: Cause,
+    trying: Trying,
+    before: Sequence[Finding],
+    rest: Rest | None,
+) -> Sentence:
+    """A cause, what to try against it, and whether that is good for the rest of a long log.
+
+    `before` is what was found in the stamps, of which a cause may be a consequence.
+    """
+    of, words = cause.hypothesis, cause.words
+    mend = of.mend(cause.value)
+    if mend is None:
+        words += "; the gate that is set keeps these out"
+        return Sentence(of.kind, of.topic, words, None, cause)
+    advice = trying.over(mend)
+    words += rest(mend.settings) if rest is not None else ""
+    if before and of.kind in CONSEQUENCES:
+        words += f"; this may be a consequence of what is wrong with the stamps of {before[0].topic}"
+    words += f"; try {trying.words(advice)}"
+    return Sentence(of.kind, of.topic, words, None, cause, advice.setting)
