@@ -261,11 +261,16 @@ def test_what_works_ahead_keeps_the_order():
 
 def test_nan_and_negative_stamps_are_found_wherever_they_are(tmp_path):
     """In the last message, of the last component: not the first number alone is looked at."""
-    covariance = np.zeros((3, 4))
-    position = np.zeros((3, 2))
-    position[2, 1] = np.nan
-    with pytest.raises(BadInput, match=r"position_m is NaN in message 2 \(1 in all\)"):
-        make_stream("/f", schemas.POSITION_FIX, [1, 2, 3], position_m=position, covariance_m2=covariance)
+    field = np.zeros((3, 3))
+    field[2, 2] = np.nan
+    with pytest.raises(BadInput, match=r"magnetic_field_ut is NaN in message 2 \(1 in all\)"):
+        make_stream(
+            "/m",
+            schemas.MAGNETIC_FIELD,
+            [1, 2, 3],
+            magnetic_field_ut=field,
+            covariance_ut2=np.zeros((3, 9)),
+        )
     with pytest.raises(BadInput, match="publish_time is before 1970"):
         scans([1, 2, 3], [1, 2, -3], [1, 2, 3])
     for name in ("/scan\0", "/scan\x1b[31m", "/\u202escan"):
