@@ -259,6 +259,19 @@ def test_a_run_has_its_likelihood_nis_and_gated_share(recordings: list[fl.Memory
     assert runs.loc["dead-reckoning", "log_likelihood"].isna().all()
 
 
+def test_a_ukf_is_a_regression_of_the_same_kappa(recordings: list[fl.MemorySource]) -> None:
+    """The two have other defaults, as their meanings say."""
+    kinds = {
+        "u": "ukf",
+        "l": "lrkf:ukf",
+        "u-half": {"kind": "ukf", "kappa": 0.5},
+        "l-zero": "lrkf:ukf:kappa=0",
+    }
+    own = {label: kind if isinstance(kind, dict) else {"kind": kind} for label, kind in kinds.items()}
+    nees = fl.replay(recordings, own).metrics.pivot_table("value", "quantity", "estimator").loc["nees"]
+    assert nees["u"] == nees["l-zero"] != nees["l"] == nees["u-half"]
+
+
 def test_an_estimator_needs_no_label(recordings: list[fl.MemorySource]) -> None:
     """In replay, tune and diagnose it has the name of its method."""
     bare = fl.modelled(robot(), "ekf")
