@@ -1,5 +1,6 @@
 """What a foreign filter says of itself: its topics, its state, its parameters; in JSON."""
 
+import re
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from typing import Annotated, Any
@@ -202,6 +203,11 @@ def read_description(text: str | bytes, where: str) -> Description:
         if not name.isidentifier() or name in ForeignParameters.model_fields or name in _TAKEN:
             raise BadInput(f"{where}: its parameter '{name}' cannot have this name; give it another")
     for components in (made.state, made.innovation):
+        for name in components:
+            if not re.fullmatch(r"\w+", name):
+                raise BadInput(
+                    f"{where}: '{name}' cannot be a component's name; use letters, digits and '_'"
+                )
         if not are_kinds(list(components.values())):
             raise BadInput(
                 f"{where}: the components {', '.join(components)} are none: an axis has two, "

@@ -279,19 +279,20 @@ class _OfLibraries(Estimator[Any]):
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
         """Return the estimator of the library."""
-        path = Path(what_runs(label, "lib", settings)).absolute()  # processes have folders of their own
+        # absolute, for processes have folders of their own
+        file = _file(Path(what_runs(label, "lib", settings)).absolute())
         in_process = settings.get("in_process", False) is True
-        description = _description(path, in_process)
+        description = _description(file, in_process)
 
         def bind(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:
             bound: list[Bound] = []
             for found in bind_all(label, description, topics, parameters):
                 if in_process:
-                    bound.append(bind_in_process(found, _loaded(path)))
+                    bound.append(bind_in_process(found, _loaded(file)))
                     continue
 
                 def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
-                    return follow_runs_apart(str(path), runs, description, limits)
+                    return follow_runs_apart(str(file.path), runs, description, limits)
 
                 bound.append(bind_apart(found, follow_runs))
             return bound
@@ -300,24 +301,31 @@ class _OfLibraries(Estimator[Any]):
         return Estimator(description.summary, description.requirements, parameters, bind)
 
 
-def _description(path: Path, in_process: bool) -> Description:
-    """Return what a library says of itself; it is asked again where the file has changed."""
+class _File(NamedTuple):
+    """Tells a library from one that was compiled again in its place."""
+
+    path: Path
+    changed_ns: int
+    size: int
+
+
+def _file(path: Path) -> _File:
     try:
         state = path.stat()
     except OSError:
         raise BadInput(f"{path}: no such file; give the path of a shared library") from None
-    return _described(path, state.st_mtime_ns, state.st_size, in_process)
+    return _File(path, state.st_mtime_ns, state.st_size)
 
 
 @lru_cache(maxsize=64)
-def _described(path: Path, changed_ns: int, size: int, in_process: bool) -> Description:  # noqa: ARG001
-    text = _loaded(path).description if in_process else describe_apart(str(path))
-    return read_description(text, str(path))
+def _description(file: _File, in_process: bool) -> Description:
+    text = _loaded(file).description if in_process else describe_apart(str(file.path))
+    return read_description(text, str(file.path))
 
 
 @lru_cache(maxsize=64)
-def _loaded(path: Path) -> Library:
-    return Library(path)
+def _loaded(file: _File) -> Library:
+    return Library(file.path)
 
 
 def unspecified(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:  # noqa: ARG001

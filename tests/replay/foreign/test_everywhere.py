@@ -26,6 +26,7 @@ def here(compile_filter: Compile, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     return tmp_path
 
 
+@pytest.mark.paper
 def test_what_ours_have(here: Path) -> None:
     """Tuned, diagnosed, compared, held back for late messages, and run by workers."""
     mine = {"kind": "lib", "path": "robot_ekf.so", "in_process": True}

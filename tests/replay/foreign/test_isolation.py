@@ -36,6 +36,7 @@ def run_with(command: float) -> MemorySource:
     return memory_source(Recording([seen]), RunMetadata("ranges", epoch_ns=0))
 
 
+@pytest.mark.paper
 @pytest.mark.unix
 @pytest.mark.usefixtures("nothing_left")
 def test_a_run_ends_with_its_filter_and_the_others_go_on(compile_filter: Compile) -> None:

@@ -35,6 +35,7 @@ def python(path: Path, *arguments: str) -> str:
     return " ".join([f"'{sys.executable}'", f"'{path}'", *arguments])
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("nothing_left")
 def test_programs_that_fail_end_their_own_runs() -> None:
     mine = program(python(PROGRAM), time_limit_s=3.0)
@@ -45,6 +46,7 @@ def test_programs_that_fail_end_their_own_runs() -> None:
         assert len(estimates["/estimates/mine/state"]) == (AT if reason else MESSAGES), command
 
 
+@pytest.mark.paper
 def test_filterpy_as_a_program() -> None:
     """Its own numbers, and those of our filter of the same model; so the verdicts are alike."""
     filterpy = pytest.importorskip("filterpy.kalman", reason="FilterPy is not installed")
