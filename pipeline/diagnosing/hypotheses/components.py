@@ -180,7 +180,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         return f"{topic}: {entry.name} is {factor} times ({least} to {most}) too {size}{more}"
 
     def mend(at: float) -> Advice:
-        if own and own.factor:
+        if own and own.factor and at not in specials:  # a unit is the log's
             return Advice(own.factor, precise(own.values[own.factor] * np.exp(-at)), free=own.factor)
         return Advice(f"{topic}.{bare(entry.name)}_scale", precise(np.exp(-at)))
 
