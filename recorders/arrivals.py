@@ -1,5 +1,7 @@
 """The streams of a sound that microphones heard: differences of its arrivals, and where they are."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,31 +11,42 @@ from recorders.models.arrivals import Weighting, arrivals
 Floats = NDArray[np.float64]
 
 
+class HeardSound(NamedTuple):
+    """Holds what n microphones recorded of one sound at the same time.
+
+    Attributes:
+        time_ns: the stamp of the sound.
+        recordings: (n, samples).
+        rate_hz: of the samples.
+        places_m: of the microphones (n, 3).
+        microphone_id: their numbers (n,).
+    """
+
+    time_ns: int
+    recordings: Floats
+    rate_hz: float
+    places_m: Floats
+    microphone_id: NDArray[np.int64]
+
+
 def difference_stream(
     prefix: str,
-    time_ns: int,
-    recordings: Floats,
-    rate_hz: float,
-    places_m: Floats,
-    microphone_id: NDArray[np.int64],
+    heard: HeardSound,
     *,
     band_hz: tuple[float, float],
     speed_of_sound_mps: float,
     weighting: Weighting = "phat",
 ) -> Stream:
-    """The arrivals of one sound at n microphones, as recorded at the same time (n, samples).
+    """The arrivals of one sound at several microphones.
 
     Args:
         prefix: of the topic, which ends with `/differences`.
-        time_ns: the stamp of all its messages.
-        recordings: (n, samples), of the same time.
-        rate_hz: of the samples.
-        places_m: of the microphones (n, 3).
-        microphone_id: their numbers (n,).
+        heard: what the microphones recorded.
         band_hz: the frequencies that are used.
         weighting: see `recorders.models.arrivals`.
         speed_of_sound_mps: sets how much later a sound may come at all, and is stated.
     """
+    time_ns, recordings, rate_hz, places_m, microphone_id = heard
     away_m = np.linalg.norm(places_m[:, None] - places_m, axis=2)
     longest_s = away_m / speed_of_sound_mps + 2.0 / rate_hz
     found = arrivals(recordings, rate_hz, band_hz, longest_s, weighting)

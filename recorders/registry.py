@@ -35,13 +35,18 @@ def load(kind: str, name: str, expected: type = object) -> Any:
     if name not in known:
         raise BadInput(f"no {one} '{name}'; {choices(name, known)}")
     with foreign_code(f"{one} '{name}' ({known[name].value})"):
-        found = known[name].load()
+        found = _object_of(known[name])
     if not isinstance(found, expected):
         raise BadInput(
             f"{one} '{name}' ({known[name].value}) is {type(found).__name__}; "
             f"the entry point must lead to {expected.__name__}"
         )
     return found
+
+
+@cache
+def _object_of(entry: EntryPoint) -> Any:
+    return entry.load()
 
 
 @contextmanager

@@ -16,13 +16,16 @@ from pipeline.output.charts import Axis, Chart, Panel, curve, path, thinned
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.output.summary import summary_table
+from recorders.errors import BadInput
 from recorders.log import schemas
 from recorders.log.planes import stated_in
 from recorders.trajectories import Trajectory, read_trajectory
+from replay.engine.streams.blocks import gather
 from replay.engine.streams.planes import into_plane_of
 from replay.engine.streams.sources import LogSource, Source
 from replay.judging.errors.alignment import Align, AlignedEstimates
 from replay.judging.errors.evaluation import split_topic
+from replay.judging.errors.planes import first_fixes, unlike
 from replay.judging.errors.trajectories import (
     Association,
     Compared,
@@ -233,12 +236,15 @@ def compare_logs(
 
     Memory holds the poses of all runs.
 
-    Raises BadInput as `compare`, and where an alignment would turn a planar state out of its plane.
+    Raises BadInput as `compare`, where an alignment would turn a planar state out of its plane, and
+    without one where estimates and truth are in planes that cannot be compared.
     """
     compared: dict[tuple[str, str], list[Compared]] = {}
     aligned: list[Source] = []
     for of_run, source in zip(estimates, sources, strict=True):
         alignments = {}
+        told = [each for each in of_run.topics if each.endswith("/origin")]
+        origins = first_fixes({each: gather([of_run[each]]) for each in told})
         for topic, stated in of_run.topics.items():
             truth_topic = stated.metadata.get("truth", "")
             if stated.schema_name != schemas.GAUSSIAN_ESTIMATE.full_name:
@@ -252,6 +258,8 @@ def compare_logs(
             if found is None or true is None or not len(found) or not len(true):
                 continue
             found = replace(found, name=f"{of_run.name}: topic {topic}")
+            if comparison.align == "none" and (why := unlike(of_run.empty(topic), [source], origins)):
+                raise BadInput(f"{found.name}: cannot be compared as it is: {why}")
             done = compare(found, true, comparison)
             compared.setdefault(split_topic(topic), []).append(done)
             alignments[topic] = done.alignment

@@ -8,6 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.altering.sources import alter
 from pipeline.api.planning import plan_replay
 from pipeline.output.alarming import alarms_of
 from pipeline.output.alarms import Alarm
@@ -336,6 +337,8 @@ def _draw_log(
     is_estimates = any(topic.startswith("/estimates/") for topic in log.topics)
     if is_estimates and log.run is not None and "log" in log.run.notes:
         source = source_of_estimates(log, recover=recover)
+    elif not is_estimates:
+        source = alter(source, {})  # of several planes, it is drawn in one
     shown = span_of(source, *span, "publish_time")
     identity = f"{path} {span}"
     with Drawing(shown, identity=identity, focus=focus, save=rrd, connect=connect) as drawing:

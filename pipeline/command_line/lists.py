@@ -83,7 +83,6 @@ def cache(pairs: tuple[str, ...], clear: bool, warm: bool, as_json: bool) -> Non
 @command(
     "Print the folder of fuselog_filter.h, for a compiler.",
     "fuselog header",
-    "fuselog replay run.mcap -e lib:./mine.so",
 )
 def header() -> None:
     """Print the folder of the header that a filter of your own in C, C++ or Rust is compiled with.

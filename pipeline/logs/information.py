@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.output.results import RESULT_FILE
+from pipeline.output import RESULT_FILE
 from pipeline.output.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
 from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span

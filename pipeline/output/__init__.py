@@ -2,3 +2,5 @@
 
 Begin with `results`.
 """
+
+RESULT_FILE = "result.json"  # says what a result folder is

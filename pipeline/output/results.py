@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
+from pipeline.output import RESULT_FILE as RESULT_FILE
 from pipeline.output.alarms import Alarm
 from pipeline.output.charts import Chart, draw
 from pipeline.output.claims import Claim, known
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
     from replay.judging.errors.evaluation import Errors
 
-RESULT_FILE = "result.json"
 # Longer tables are no reading matter: they are Parquet alone.
 CSV_ROWS = 20_000
 # Raised when result.json changes in a way that its readers must know; one without it is of the first.

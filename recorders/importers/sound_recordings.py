@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 from scipy.io import wavfile
 
-from recorders.arrivals import difference_stream, microphone_stream
+from recorders.arrivals import HeardSound, difference_stream, microphone_stream
 from recorders.errors import BadInput
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.arrivals import Weighting
@@ -327,13 +327,11 @@ def _streams(
             f"and a higher frequency in Hz, the higher one at most {0.5 * rate_hz:g}"
         )
     shortest = min(map(len, kept.values()))
+    recordings = np.array([samples[:shortest] for samples in kept.values()])
+    numbers = np.array([array.numbers[each] for each in kept])
     yield difference_stream(
         f"/{name}",
-        sound.begin_ns,
-        np.array([samples[:shortest] for samples in kept.values()]),
-        float(rate_hz),
-        places,
-        np.array([array.numbers[each] for each in kept]),
+        HeardSound(sound.begin_ns, recordings, float(rate_hz), places, numbers),
         band_hz=(low, high),
         speed_of_sound_mps=parameters.speed_of_sound_mps,
         weighting=parameters.weighting,

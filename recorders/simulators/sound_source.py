@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 from scipy import fft
 
-from recorders.arrivals import difference_stream, microphone_stream
+from recorders.arrivals import HeardSound, difference_stream, microphone_stream
 from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.models.states import state_metadata
@@ -74,13 +74,10 @@ def simulate(parameters: SoundSourceParameters, rng: np.random.Generator) -> Rec
         metadata=state_metadata(components),
         state=source[None, : len(components)],
     )
+    recordings, numbers = _recordings(parameters, places, source, rng), np.arange(1, len(places) + 1)
     differences = difference_stream(
         "/sound",
-        time_ns,
-        _recordings(parameters, places, source, rng),
-        parameters.rate_hz,
-        places,
-        np.arange(1, len(places) + 1),
+        HeardSound(time_ns, recordings, parameters.rate_hz, places, numbers),
         band_hz=parameters.band_hz,
         speed_of_sound_mps=parameters.speed_of_sound_mps,
     )

@@ -279,7 +279,7 @@ class _OfLibraries(Estimator[Any]):
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> Estimator[Any]:
         """Return the estimator of the library."""
-        path = Path(what_runs(label, "lib", settings))
+        path = Path(what_runs(label, "lib", settings)).absolute()  # processes have folders of their own
         in_process = settings.get("in_process", False) is True
         description = _description(path, in_process)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from recorders.errors import BadInput, choices
 from recorders.log import Stream, Topic
+from recorders.log.streams import check_stream
 from replay.engine.arrays import Booleans, Floats, Integers
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.failures import Failure
@@ -136,6 +137,7 @@ def streams_of(
     made = [Ragged(state, offsets), failures_by_run(topic, failures, len(offsets) - 1)]
     if description.innovation:
         made.append(recorded_innovations(topic, description.innovation, truth, innovations, recorded))
+        check_stream(made[-1].stream)
     return made
 
 

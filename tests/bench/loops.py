@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from replay.engine.replaying.estimator import Bound
 from replay.engine.replaying.replaying import replay
 from replay.engine.streams.sources import Source
-from replay.inference.run import filtering, recursion
-from replay.inference.run.recursion import Estimates, Innovations, filled
+from replay.inference.run import filtering
+from replay.inference.run.recursion import Estimates, Innovations, RunResults, filled
 
 Floats = NDArray[np.float64]
 
@@ -25,11 +25,6 @@ class Call(NamedTuple):
     before: tuple[Any, ...]
     results: tuple[Estimates, Innovations]
     scratch: Callable[[], Any]
-
-    @property
-    def events(self) -> int:
-        """How many events there are."""
-        return len(getattr(self.before[0], "events", self.before[0]).time_ns)
 
     def __call__(self) -> Floats:
         """Do it again, into new arrays; returns the means of all runs end to end."""
@@ -44,9 +39,8 @@ class Call(NamedTuple):
 
 
 def handed_over(estimates: Estimates, innovations: Innovations) -> tuple[Any, ...]:
-    """What a loop fills, as the checkout at hand gives it: together, or in earlier ones apart."""
-    together = getattr(recursion, "RunResults", None)
-    return (together(estimates, innovations),) if together else (estimates, innovations)
+    """What a loop fills, as it takes it."""
+    return (RunResults(estimates, innovations),)
 
 
 def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
@@ -58,9 +52,7 @@ def calls_of(bound: Sequence[Bound], sources: Sequence[Source]) -> list[Call]:
         loop, steps = compiled(*key)
 
         def record(runs: int, *arguments: Any, scratch: Callable[[], Any]) -> None:
-            *before, estimates, innovations = arguments
-            if hasattr(recursion, "RunResults"):
-                *before, (estimates, innovations) = arguments
+            *before, (estimates, innovations) = arguments
             kept = copy.deepcopy((estimates.end, innovations.end, before[-1]))
             results = (estimates._replace(end=kept[0]), innovations._replace(end=kept[1]))
             calls.append(Call(loop, runs, (*before[:-1], kept[2]), results, scratch))

@@ -1,29 +1,39 @@
 """What an estimator costs in one checkout of fuselog: its first use, and its loops.
 
 `python -P tests/bench/meter.py SCENARIO PARAMETERS RUNS ESTIMATOR` prints CPU seconds. It measures
-the checkout that PYTHONPATH names, so that today's is measured beside an earlier one: what it imports is
-in both.
+the checkout that PYTHONPATH names, so that today's is measured beside an earlier one: back to 8bc94bb,
+from before modules moved into rooms of rooms. Names of estimators and models stand for what that
+checkout registers, whichever is installed.
 """
 
 import copy
 import json
 import sys
+import tomllib
 from collections.abc import Mapping
+from contextlib import suppress
+from importlib import import_module
+from importlib.metadata import EntryPoint
+from pathlib import Path
 from time import process_time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pipeline.runs.recorded import record_ensemble
-from replay.engine.replaying.estimator import Bound, bind
-from replay.engine.streams.sources import MemorySource
+from recorders import registry
 from replay.inference.all_methods import METHODS
 from replay.inference.estimators import bind_model, combined
-from tests.bench.loops import Call, calls_of, handed_over
+from tests.bench import loops
+from tests.bench.loops import Call, calls_of
+
+if TYPE_CHECKING:
+    from replay.engine.replaying.estimator import Bound
+    from replay.engine.streams.sources import MemorySource
 
 OWN = "a user's own model"
 
 
 def main(scenario: str, parameters: Mapping[str, Any], runs: int, estimator: str) -> dict[str, float]:
     """CPU seconds of a first use beyond a second one, and of the loops for each of their events."""
+    register(Path.cwd())
     sources = recorded(scenario, parameters, runs)
     taken = []
     for _ in range(2):
@@ -31,26 +41,47 @@ def main(scenario: str, parameters: Mapping[str, Any], runs: int, estimator: str
         calls = calls_of(bound(scenario, estimator, sources), sources)
         taken.append(process_time() - begin)
     assert calls, "no filter is made of a model"
-    events = sum(call.events for call in calls)
+    events = sum(len(getattr(call.before[0], "events", call.before[0]).time_ns) for call in calls)
     least, begin = float("inf"), process_time()
     while process_time() < begin + 1.0:
         least = min(least, sum(loop_seconds(call) for call in calls))
     return {"first_use": taken[0] - taken[1], "event": least / events}
 
 
-def recorded(scenario: str, parameters: Mapping[str, Any], runs: int) -> list[MemorySource]:
+def register(checkout: Path) -> None:
+    """Have names stand for what the checkout's own pyproject.toml says."""
+    stated = tomllib.loads((checkout / "pyproject.toml").read_text(encoding="utf-8"))
+    groups = stated["project"]["entry-points"]
+
+    def entry_points(group: str) -> list[EntryPoint]:
+        return [EntryPoint(name, value, group) for name, value in groups.get(group, {}).items()]
+
+    vars(registry)["entry_points"] = entry_points
+
+
+def either(name: str, *modules: str) -> Any:
+    """What a checkout has by this name, in the first of these modules that it has."""
+    for module in modules:
+        with suppress(ModuleNotFoundError, AttributeError):
+            return getattr(import_module(module), name)
+    raise AssertionError(f"none of {', '.join(modules)} has {name}")
+
+
+def recorded(scenario: str, parameters: Mapping[str, Any], runs: int) -> "list[MemorySource]":
     """Runs of the scenario, or logs for the user's model."""
     if scenario != OWN:
-        return record_ensemble(scenario, parameters, 1, runs)
+        places = "pipeline.runs.recorded", "pipeline.runs.ensemble", "pipeline.ensemble"
+        return either("record_ensemble", *places)(scenario, parameters, 1, runs)
     from tests.replay.inference.vehicle_a import simulate, source
 
     return [source(simulate(run)[0]) for run in range(runs)]
 
 
-def bound(scenario: str, estimator: str, sources: list[MemorySource]) -> list[Bound]:
+def bound(scenario: str, estimator: str, sources: "list[MemorySource]") -> "list[Bound]":
     """The estimator, of whichever registered model the log has, or of the user's."""
     if scenario != OWN:
-        return bind(estimator, sources, {})
+        places = "replay.engine.replaying.estimator", "replay.engine.estimator"
+        return either("bind", *places)(estimator, sources, {})
     from tests.replay.inference.vehicle_a import VEHICLE_A as MODEL
 
     method = METHODS[estimator]
@@ -61,8 +92,10 @@ def bound(scenario: str, estimator: str, sources: list[MemorySource]) -> list[Bo
 def loop_seconds(call: Call) -> float:
     """CPU seconds of one more call of a loop, into the arrays that it filled before."""
     *columns, carried = call.before
-    results = (type(each)(each.end.copy(), *each[1:]) for each in call.results)
-    arguments = (*columns, copy.deepcopy(carried), *handed_over(*results))
+    results = tuple(type(each)(each.end.copy(), *each[1:]) for each in call.results)
+    if hasattr(loops, "handed_over"):  # earlier loops take them apart
+        results = loops.handed_over(*results)
+    arguments = (*columns, copy.deepcopy(carried), *results)
     begin = process_time()
     call.loop(call.runs, *arguments, scratch=call.scratch)
     return process_time() - begin

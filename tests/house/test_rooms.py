@@ -43,7 +43,6 @@ WIDER = {
     "pipeline/runs/ensemble.py": {"replay_parts"},
     "pipeline/tuning/command.py": {"tune_logs"},
     "pipeline/tuning/tuning.py": {"tune"},
-    "recorders/arrivals.py": {"difference_stream"},
     "replay/engine/api/functions.py": {"batch", "recursive"},
 }
 

@@ -501,8 +501,6 @@ def test_what_need_not_be_positive_is_found_too() -> None:
             "analytic",
             ["size_drift_m2", "position_drift_m2", "point_variance_m2"],
         ),
-        ("batch-reactor", {}, "lrkf:ukf", ["process_variance", "pressure_variance"]),
-        ("navigation", {"duration_s": 20.0}, "ekf", ["force_noise_density", "gyro_noise_density"]),
     ],
 )
 def test_a_start_ten_times_off_leads_to_the_same_optimum(

@@ -83,7 +83,8 @@ def test_what_rounding_once_decided_is_the_same_on_an_older_cpu() -> None:
 
 def test_every_estimator_has_a_golden() -> None:
     """Of each at least one variant; and the page that says which is of today."""
-    assert {kind.partition(":")[0] for kind in covered()} == set(available("estimators"))
+    of_others = {"lib", "exec"}  # held to ours on their logs, see tests/replay/foreign
+    assert {kind.partition(":")[0] for kind in covered()} == set(available("estimators")) - of_others
     assert {path.name for path in store.FOLDER.iterdir()} == {store.path_of(n).name for n in RECIPES}
     assert (store.FOLDER.parent / "README.md").read_text(encoding="utf-8") == index()
 

@@ -16,6 +16,8 @@ from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
+from replay.engine.compiling.scratch import Memory, Scratch
+
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
@@ -23,10 +25,10 @@ Result = TypeVar("Result")
 class Loop(Protocol):
     """Represents a compiled loop over runs."""
 
-    def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
+    def of(self, arguments: Sequence[Any], memory: Memory | None = None) -> Callable[[int, int], None]:
         """Return what goes through the runs from a first one up to an end, with these arguments.
 
-        The last of them, `scratch`, is what one core works in.
+        Their last is the memory, where there is one.
         """
         ...
 
@@ -78,8 +80,8 @@ def compile_over_runs(
         title: what it is to who waits until it is compiled, such as "ekf of robot".
 
     Returns `loop(runs, *arguments, scratch=None, per_run=None)`; its results do not depend on the number
-    of runs or cores. What `scratch()` returns, made anew for every core, is the last argument of
-    `run_once`: arrays that one run after another may work in. Or that is `per_run[run]`, such as the
+    of runs or cores. What `scratch()` returns, made for every core (see `Scratch`), is the last argument
+    of `run_once`: arrays that one run after another may work in. Or that is `per_run[run]`, such as the
     run's generator of random numbers; a run for which that is None is left out.
     Raises BadInput where a source is not at hand (a function typed at a prompt, say).
 
@@ -140,31 +142,48 @@ def _share(
     scratch: Callable[[], Any] | None = None,
     per_run: Sequence[Any] | None = None,
 ) -> None:
-    """Share the runs among the cores; in a few pieces per core, since runs differ in length."""
+    """Share the runs among the cores."""
+    cores, lent = min(runs, core_count()), list[Memory]()
 
     def prepared() -> Callable[[int, int], None]:
-        if per_run is None:
-            return loop.of(arguments, [scratch()] if scratch else [])
-        by_run = {
-            run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None
-        }
+        if per_run is not None:
+            return _one_by_one(loop, arguments, per_run)
+        if scratch is None:
+            return loop.of(arguments)
+        lent.append(scratch.lend() if isinstance(scratch, Scratch) else Memory(scratch()))
+        return loop.of(arguments, lent[-1])
 
-        def through(first: int, end: int) -> None:
-            for run in range(first, end):
-                if run in by_run:
-                    by_run[run](run, run + 1)
+    if cores <= 1:
+        prepared()(0, runs)
+    else:
+        _on_cores(cores, runs, prepared)
+    if isinstance(scratch, Scratch):
+        scratch.take_back(lent)
 
-        return through
+
+def _one_by_one(
+    loop: Loop, arguments: Sequence[Any], per_run: Sequence[Any]
+) -> Callable[[int, int], None]:
+    """Return what goes through the runs with a last argument for each."""
+    by_run = {run: loop.of((*arguments, each)) for run, each in enumerate(per_run) if each is not None}
+
+    def through(first: int, end: int) -> None:
+        for run in range(first, end):
+            if run in by_run:
+                by_run[run](run, run + 1)
+
+    return through
+
+
+def _on_cores(cores: int, runs: int, prepared: Callable[[], Callable[[int, int], None]]) -> None:
+    """Go through runs on several cores; in a few pieces per core, since runs differ in length."""
 
     def work(through: Callable[[int, int], None] | None) -> None:
         through = through or prepared()
         for first, end in waiting:
             through(first, end)
 
-    cores, first = min(runs, core_count()), prepared()
-    if cores <= 1:
-        first(0, runs)
-        return
+    first = prepared()
     cuts = [runs * piece // (4 * cores) for piece in range(4 * cores + 1)]
     waiting = iter(list(pairwise(cuts)))  # all threads take their next piece from here
     first(0, 0)  # compiles here: a thread would wait for ever for a module that is being imported

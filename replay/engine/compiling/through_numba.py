@@ -23,6 +23,7 @@ from numba.core.errors import NumbaError
 from replay.engine.compiling.inlining import Inlined
 from replay.engine.compiling.kernel_cache import execute, load
 from replay.engine.compiling.kernel_source import DoesNotCompile, KernelSource
+from replay.engine.compiling.scratch import Memory
 
 # Where what kernels are made of is defined, each once; compiled code that was kept looks for it there.
 _PARTS = sys.modules.setdefault("kernel_parts", ModuleType("kernel_parts"))
@@ -54,12 +55,13 @@ class _Loop:
         title = title or f"{run_once.__module__}.{run_once.__name__}"
         self._loop = _compile(source, kernel, text, title)
 
-    def of(self, arguments: Sequence[Any], scratch: Sequence[Any] = ()) -> Callable[[int, int], None]:
+    def of(self, arguments: Sequence[Any], memory: Memory | None = None) -> Callable[[int, int], None]:
         """Make the loop for these arguments."""
+        everything = arguments if memory is None else (*arguments, memory.value)
 
         def through(first: int, end: int) -> None:
             try:
-                self._loop(first, end, *arguments, *scratch)
+                self._loop(first, end, *everything)
             except NumbaError as error:
                 raise self._explained(error) from error
 

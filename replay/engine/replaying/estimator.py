@@ -22,7 +22,7 @@ from recorders.registry import foreign_code, load
 from replay.engine.compiling.kernel_source import DoesNotCompile
 from replay.engine.renamed import renamed
 from replay.engine.streams.blocks import Block, Ragged
-from replay.engine.streams.sources import Source, ensemble_of
+from replay.engine.streams.sources import Ensemble, Source, ensemble_of
 from replay.engine.vectors.components import Components
 
 
@@ -82,7 +82,7 @@ class Reading:
 
 
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recursive:
     """Describes an estimator that goes through its topics in time.
 
@@ -129,7 +129,7 @@ class Recursive:
 
 
 @renamed(whole="static")
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Batch:
     """Describes an estimator that needs everything at once: `solve` turns its topics into outputs.
 
@@ -251,6 +251,8 @@ def code_of(name: str) -> Iterator[None]:
 def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> list[Bound]:
     """Bind an estimator to an ensemble; see `configure`.
 
+    An ensemble keeps what was bound to it last, which is bound with the same settings again.
+
     Raises BadInput where it does not fit the log, or the runs are no ensemble: what the estimator reads
     of them must be stated alike.
 
@@ -259,8 +261,18 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
         sources: the runs.
         settings: its parameters by name, with `kind` perhaps among them.
     """
+    ensemble = ensemble_of(sources)
+    key = "bound", label, *((name, type(value), value) for name, value in settings.items())
+    try:
+        hash(key)
+    except TypeError:  # a list or a table among the settings
+        return _bound(label, ensemble, settings)
+    return list(ensemble.findings.once(key, lambda: _bound(label, ensemble, settings)))
+
+
+def _bound(label: str, ensemble: Ensemble[Source], settings: Mapping[str, Any]) -> list[Bound]:
     estimator, parameters = configure(label, settings)
-    first = sources[0]
+    first = ensemble[0]
     try:
         with code_of(label):
             bound = estimator.bind(label, first.topics, parameters)
@@ -272,7 +284,7 @@ def bind(label: str, sources: Sequence[Source], settings: Mapping[str, Any]) -> 
             f"the log has {', '.join(first.topics) or 'no topics'}"
         )
     read = dict.fromkeys(topic for each in bound for topic in (*each.static, *each.streams))
-    ensemble_of(sources).require_alike(read)
+    ensemble.require_alike(read)
     return [
         each if each.parameters is not None else replace(each, parameters=parameters) for each in bound
     ]

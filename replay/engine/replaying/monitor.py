@@ -9,7 +9,7 @@ time that the estimator took.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial, reduce
+from functools import lru_cache, partial, reduce
 from math import isqrt
 from typing import TypeVar
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Clock, make_stream, schemas
 from recorders.log.planes import Origin, in_plane
+from replay.engine.compiling.scratch import Scratch
 from replay.engine.replaying.coverage import Coverage
 from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
 from replay.engine.replaying.usage import Usage
@@ -46,18 +47,29 @@ class RunMonitor:
         name: the bound estimator's.
         runs: how many there are.
         seconds: how long the estimator worked.
-        usage: what became of its measurements.
+        usage: what became of its measurements; None where that is not counted.
         static: the streams that it begins with.
         refused: what all runs of a part of an ensemble raised.
         plane: the origin of the plane that its estimates are in, where the runs state one.
     """
 
     def __init__(
-        self, name: str, runs: int, order: Clock, *, is_batch: bool, is_part: bool = False
+        self,
+        name: str,
+        runs: int,
+        order: Clock,
+        static: Mapping[str, Ragged],
+        *,
+        is_batch: bool,
+        is_part: bool = False,
+        is_counting: bool = True,
     ) -> None:
         self.seconds = 0.0
-        self.usage = Usage(name)
-        self.static: Mapping[str, Ragged] = {}
+        self.static = static
+        self.usage: Usage | None = None
+        if is_counting:
+            self.usage = Usage(name)
+            self.usage.note_start(static)
         self.refused: BadInput | None = None
         self.plane: Origin | None = None
         self.name = name
@@ -67,6 +79,7 @@ class RunMonitor:
         self._is_part = is_part
         # a run gets no message from here on
         self._end_ns = np.full(runs, FOREVER)
+        self._has_ends = False
         self._first_ns, self._last_ns = np.full(runs, FOREVER), np.full(runs, -1)
         self._unable: dict[int, str] = {}
         self._failed: dict[int, Failure] = {}
@@ -79,7 +92,11 @@ class RunMonitor:
         """These runs cannot start, for a reason each."""
         self._unable |= reasons
         for run in reasons:
-            self._end_ns[run] = 0
+            self._end(run, 0)
+
+    def _end(self, run: int, time_ns: int) -> None:
+        self._end_ns[run] = time_ns
+        self._has_ends = True
 
     def take(self, work: Callable[[Streams], Result], streams: Streams) -> Result:
         """Return what `work` makes of the next streams of the runs that have not failed.
@@ -88,11 +105,12 @@ class RunMonitor:
         where every run has, and there are no others, or it is no run's fault.
         """
         self._note_span(streams)
-        self.usage.note_given(streams, self.static, self._order)
+        if self.usage is not None:
+            self.usage.note_given(streams, self.static, self._order)
         began = time.perf_counter()
         try:
             try:
-                return work(self._before(streams, self._end_ns))
+                return work(self._before(streams, self._end_ns) if self._has_ends else streams)
             except BadInput as error:
                 self._end_raising(work, streams, error)
                 return work(self._before(streams, self._end_ns))
@@ -103,14 +121,15 @@ class RunMonitor:
         """Take a block's outputs up to the first that is no estimate; failures are held back."""
         cuts = [self._unsound(each) for each in outputs]
         sound = [self._cut(each, cut) for each, cut in zip(outputs, cuts, strict=True)]
-        self.usage.note_outputs(sound)
+        if self.usage is not None:
+            self.usage.note_outputs(sound)
         passed = []
         for each in sound:
             topic, schema = each.stream.topic, each.stream.schema.full_name
             if schema == FAILURE:
                 self._told.setdefault(topic, []).append(each)
                 continue
-            if schema == GAUSSIAN:
+            if schema == GAUSSIAN and self.plane is not None:
                 passed.append(replace(each, stream=in_plane(each.stream, self.plane)))
             else:
                 passed.append(each)
@@ -126,7 +145,8 @@ class RunMonitor:
 
     def finish(self) -> list[Ragged]:
         """Return all failures of all runs: those found here beside the estimator's own."""
-        self.usage.shares.end()
+        if self.usage is not None:
+            self.usage.shares.end()
         told = {topic: join(parts) for topic, parts in self._told.items()}
         for run, reason in self._unable.items():
             if self._last_ns[run] >= 0:
@@ -137,7 +157,9 @@ class RunMonitor:
         self._find_silence(failed)
         own_topic = f"/estimates/{self.name}/failure"
         topic = own_topic if own_topic in told else next(iter(told), own_topic)
-        if self._failed or not told:
+        if not (self._failed or told):
+            return [_no_failures(topic, self.runs)]
+        if self._failed:
             runs = sorted(self._failed)
             own = failure_stream(topic, [self._failed[run] for run in runs])
             ours = Ragged(own, np.searchsorted(runs, np.arange(self.runs + 1)))
@@ -174,17 +196,12 @@ class RunMonitor:
 
     def _note_span(self, streams: Streams) -> None:
         for ragged in streams.values():
-            runs = np.flatnonzero(np.diff(ragged.offsets))
-            times = ragged.stream.times(self._order)
-            begin = ragged.offsets[runs]
-            first, last = np.minimum.reduceat(times, begin), np.maximum.reduceat(times, begin)
-            self._first_ns[runs] = np.minimum(self._first_ns[runs], first)
-            self._last_ns[runs] = np.maximum(self._last_ns[runs], last)
+            first, last = ragged.findings.once(self._order, partial(_span_of, ragged, self._order))
+            np.minimum(self._first_ns, first, out=self._first_ns)
+            np.maximum(self._last_ns, last, out=self._last_ns)
 
     def _before(self, streams: Streams, end_ns: Integers) -> dict[str, Ragged]:
         """Return the messages of every run before its end (runs,)."""
-        if (end_ns == FOREVER).all():
-            return dict(streams)
         return {
             topic: _kept(ragged, ragged.stream.times(self._order) < end_ns[_run_of(ragged)])
             for topic, ragged in streams.items()
@@ -231,7 +248,7 @@ class RunMonitor:
                 until[run] = stamps[middle] + 1
                 good, bad = (good, middle) if raised(until) else (middle + 1, bad)
             self._failed[run] = Failure(int(stamps[bad]), reason_of(found))
-            self._end_ns[run] = 0 if self._is_batch else stamps[bad]
+            self._end(run, 0 if self._is_batch else stamps[bad])
 
     def _unsound(self, estimates: Ragged) -> Integers | None:
         """Find the first row (runs,) of every run that is no estimate, and end it there.
@@ -255,7 +272,7 @@ class RunMonitor:
             covariance,
             rows,
             found,
-            scratch=partial(np.empty, (size, size)),
+            scratch=_factor_of(size),
         )
         bad = np.flatnonzero(found >= 0)
         for run in bad:
@@ -266,12 +283,12 @@ class RunMonitor:
             known = self._failed.get(int(run))
             if known is None or time_ns < known.time_ns:
                 self._failed[int(run)] = Failure(time_ns, UNSOUND[found[run]])
-            self._end_ns[run] = min(self._end_ns[run], time_ns)
+            self._end(int(run), min(int(self._end_ns[run]), time_ns))
         return rows if len(bad) else None
 
     def _cut(self, output: Ragged, first_bad: Integers | None) -> Ragged:
         """Return an output without the rows from a run's first bad one on, or from the run's end on."""
-        if first_bad is None and (self._end_ns == FOREVER).all():
+        if first_bad is None and not self._has_ends:
             return output
         run = _run_of(output)
         kept = np.ones(len(run), bool) if first_bad is None else np.arange(len(run)) < first_bad[run]
@@ -303,6 +320,25 @@ class RunMonitor:
             silent_s = (self._last_ns[run] - last_ns[run]) * 1e-9
             reason = f"it gave no estimate in the last {silent_s:.1f} s of its measurements"
             self._failed[run] = Failure(int(last_ns[run]), reason)
+
+
+@lru_cache(maxsize=64)
+def _factor_of(size: int) -> Scratch:
+    return Scratch(partial(np.empty, (size, size)))
+
+
+@lru_cache(maxsize=64)
+def _no_failures(topic: str, runs: int) -> Ragged:
+    return Ragged(failure_stream(topic, []), np.zeros(runs + 1, np.int64))
+
+
+def _span_of(ragged: Ragged, clock: Clock) -> tuple[Integers, Integers]:
+    """Return the first and the last stamp of every run (runs,); FOREVER and -1 where it has none."""
+    first, last = np.full(ragged.runs, FOREVER), np.full(ragged.runs, -1)
+    runs, times = np.flatnonzero(np.diff(ragged.offsets)), ragged.stream.times(clock)
+    begin = ragged.offsets[runs]
+    first[runs], last[runs] = np.minimum.reduceat(times, begin), np.maximum.reduceat(times, begin)
+    return first, last
 
 
 def _run_of(ragged: Ragged) -> Integers:

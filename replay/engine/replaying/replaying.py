@@ -6,19 +6,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from math import isqrt
-from typing import Any
+from math import inf, isqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from recorders.errors import BadInput
 from recorders.log import Clock
-from recorders.log.planes import common_origin
-from replay.engine.replaying.estimator import Batch, Bound, Recursive, code_of
+from recorders.log.planes import Origin, common_origin
+from replay.engine.replaying.estimator import Batch, Bound, Initialized, Recursive, code_of
 from replay.engine.replaying.late import Late, taking_late
 from replay.engine.replaying.monitor import RunMonitor
 from replay.engine.replaying.usage import Usage
-from replay.engine.streams.blocks import Block, Ragged, gather, join, merge_events
+from replay.engine.streams.blocks import Block, Ragged, gather, join
 from replay.engine.streams.priors import start_of_runs
 from replay.engine.streams.sources import Ensemble, Source, ensemble_of
 
@@ -27,6 +27,8 @@ BLOCK_MESSAGES = 1 << 16
 FIRST_MESSAGES = 1 << 15
 # Of the product of two standard deviations: rounding is far below.
 ASYMMETRIC = 1e-6
+# A start of so many bytes is kept with an ensemble in memory, to be begun from again.
+SMALL_BYTES = 1 << 16
 # The state of what can start in no run.
 _REFUSED = object()
 
@@ -89,20 +91,30 @@ def replay(
         _refuse_asymmetric_priors(bound, ensemble, static)
     stamps: Clock = order if late is None else "publish_time"
     monitors = [
-        RunMonitor(bound.name, len(sources), stamps, is_batch=isinstance(bound, Batch), is_part=is_part)
-        for bound in estimators
+        RunMonitor(
+            bound.name,
+            len(sources),
+            stamps,
+            static,
+            is_batch=isinstance(bound, Batch),
+            is_part=is_part,
+            is_counting=report is not None,
+        )
+        for bound, static in zip(estimators, statics, strict=True)
     ]
-    plane = common_origin({name: topic.metadata for name, topic in ensemble[0].topics.items()})
-    for monitor, static in zip(monitors, statics, strict=True):
-        monitor.static, monitor.plane = static, plane
-        if report is None:  # nobody asks what became of measurements
-            monitor.usage.shares.end(is_known=False)
-        monitor.usage.note_start(static)
-    told: list[Ragged] = []
-    initialization = partial(_open, ensemble, order, stamps, told)
-    states, refused = _start(estimators, monitors, statics, initialization)
+    plane = ensemble.findings.once("plane", partial(_plane_of, ensemble[0]))
+    starts = [
+        _kept_start(ensemble, bound, static, order, stamps)
+        for bound, static in zip(estimators, statics, strict=True)
+    ]
+    for monitor, start in zip(monitors, starts, strict=True):
+        monitor.plane = plane
+        monitor.exclude(start.unable)
+    refused = _refused(estimators, starts)
     if refused and not is_part:
         raise next(iter(refused.values()))
+    states = [start.state for start in starts]
+    told = [ragged for start in starts for ragged in start.told]
     if told:
         yield told
     for bound, monitor, given in zip(estimators, monitors, states, strict=True):
@@ -115,7 +127,7 @@ def replay(
         for index, (bound, monitor) in enumerate(zip(estimators, monitors, strict=True)):
             if isinstance(bound, Recursive):
                 streams = {topic: block[topic] for topic in bound.streams}
-                work = partial(_advance, bound, states[index], order)
+                work = partial(_advance, bound, states[index], partial(ensemble.block, order=order))
                 states[index], produced = monitor.take(work, streams)
                 outputs += monitor.receive(produced)
         yield outputs
@@ -130,59 +142,108 @@ def replay(
                 report.refused[monitor.name] = monitor.refused
             report.seconds[monitor.name.partition("/")[0]] += monitor.seconds
             report.coverage += monitor.coverage()
-            report.usages[monitor.name] = monitor.usage
+            if monitor.usage is not None:
+                report.usages[monitor.name] = monitor.usage
 
 
-def _open(
+def _plane_of(source: Source) -> Origin | None:
+    return common_origin({name: topic.metadata for name, topic in source.topics.items()})
+
+
+class _Start(NamedTuple):
+    """Holds what a bound estimator begins with.
+
+    Attributes:
+        state: of a recursion, or what a batch is given; _REFUSED where it can start in no run.
+        unable: by run why it cannot start there.
+        why: the reason where it can start in no run.
+        told: the streams of what it begins with.
+    """
+
+    state: Any
+    unable: Mapping[int, str] = {}
+    why: BadInput | None = None
+    told: Sequence[Ragged] = ()
+
+
+def _kept_start(
     ensemble: Ensemble[Source],
-    order: Clock,
-    stamps: Clock,
-    told: list[Ragged],
     bound: Bound,
     static: Mapping[str, Ragged],
-) -> dict[str, Ragged]:
-    """Find what an estimator starts from in the first messages; `told` gets its streams."""
+    order: Clock,
+    stamps: Clock,
+) -> _Start:
+    """Return the start of an estimator, which an ensemble in memory keeps where it is small."""
+    key = "start", bound, order, stamps
+    kept: _Start | None = ensemble.findings.get(key)
+    if kept is not None:
+        return kept
+    start = _start(ensemble, bound, static, order, stamps)
+    if ensemble.is_in_memory and _bytes_of(start.state) <= SMALL_BYTES:
+        ensemble.findings.once(key, lambda: start)
+    return start
+
+
+def _bytes_of(state: Any) -> float:
+    """Count the bytes of a state that is made of arrays; of any other they are unknown: infinite."""
+    if isinstance(state, np.ndarray):
+        return state.nbytes
+    if isinstance(state, tuple):
+        return sum(map(_bytes_of, state))
+    if isinstance(state, dict):
+        return sum(map(_bytes_of, state.values()))
+    return 0 if state is None else inf
+
+
+def _start(
+    ensemble: Ensemble[Source],
+    bound: Bound,
+    static: Mapping[str, Ragged],
+    order: Clock,
+    stamps: Clock,
+) -> _Start:
+    """Begin an estimator; what can start in no run says why."""
+    told: Sequence[Ragged] = ()
+    try:
+        found, told = _initialized(ensemble, bound, static, order, stamps)
+        given, unable = start_of_runs({**static, **found}, bound.priors)
+        with code_of(bound.name):
+            state = given if isinstance(bound, Batch) else bound.start(given)
+    except BadInput as error:
+        return _Start(_REFUSED, dict.fromkeys(range(len(ensemble)), str(error)), error, told)
+    starts = len(unable) < len(ensemble)
+    why = None if starts else BadInput(f"{unable[0]}; the filter cannot start")
+    return _Start(state, unable, why, told)
+
+
+def _initialized(
+    ensemble: Ensemble[Source],
+    bound: Bound,
+    static: Mapping[str, Ragged],
+    order: Clock,
+    stamps: Clock,
+) -> Initialized:
+    """Find what an estimator starts from in the first messages."""
     if not isinstance(bound, Recursive) or bound.initialization is None:
-        return {}
+        return Initialized({}, [])
     topics = bound.initialization.topics
     nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
     first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
     with code_of(bound.name):
-        found = bound.initialization.find(first, static, stamps)
-    told += found.outputs
-    return found.static
+        return bound.initialization.find(first, static, stamps)
 
 
-def _start(
-    estimators: Sequence[Bound],
-    monitors: Sequence[RunMonitor],
-    statics: Sequence[Mapping[str, Ragged]],
-    initialization: Callable[[Bound, Mapping[str, Ragged]], dict[str, Ragged]],
-) -> tuple[list[Any], dict[str, BadInput]]:
-    """Return the states of recursions and what batches are given; _REFUSED where there is none.
+def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str, BadInput]:
+    """Return by estimator's label why it can start in no run.
 
-    Of what one estimator estimates (each robot, say), what cannot start fails alone. Where that is all,
-    there is also the reason, by the estimator's label.
+    Of what one estimator estimates (each robot, say), what cannot start fails alone.
     """
-    states: list[Any] = []
     told_of: dict[str, list[BadInput | None]] = {}
-    for bound, monitor, static in zip(estimators, monitors, statics, strict=True):
-        told = told_of.setdefault(bound.name.partition("/")[0], [])
-        try:
-            given, unable = start_of_runs({**static, **initialization(bound, static)}, bound.priors)
-            monitor.exclude(unable)
-            with code_of(bound.name):
-                states.append(given if isinstance(bound, Batch) else bound.start(given))
-            starts = len(unable) < monitor.runs
-            told.append(None if starts else BadInput(f"{unable[0]}; the filter cannot start"))
-        except BadInput as error:
-            monitor.exclude(dict.fromkeys(range(monitor.runs), str(error)))
-            states.append(_REFUSED)
-            told.append(error)
-    refused = {
+    for bound, start in zip(estimators, starts, strict=True):
+        told_of.setdefault(bound.name.partition("/")[0], []).append(start.why)
+    return {
         label: errors[0] for label, errors in told_of.items() if errors[0] is not None and all(errors)
     }
-    return states, refused
 
 
 def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]:
@@ -193,13 +254,16 @@ def _solve(bound: Batch, given: Any, streams: dict[str, Ragged]) -> list[Ragged]
 
 
 def _advance(
-    bound: Recursive, state: Any, order: Clock, streams: dict[str, Ragged]
+    bound: Recursive,
+    state: Any,
+    block_of: Callable[[dict[str, Ragged]], Block],
+    streams: dict[str, Ragged],
 ) -> tuple[Any, list[Ragged]]:
     if state is _REFUSED:
         return state, []
-    events = merge_events(streams, order)
+    block = block_of(streams)
     with code_of(bound.name):
-        return bound.run(state, Block(streams, events))
+        return bound.run(state, block)
 
 
 def _finish(
@@ -232,19 +296,25 @@ def _refuse_asymmetric_priors(
 ) -> None:
     """Raise BadInput where a prior's covariance is none, whose triangles would give two answers."""
     for topic in bound.priors.keys() & static.keys():
-        covariance = static[topic].stream["covariance"]
-        size = isqrt(covariance.shape[1])
-        if not len(covariance) or size**2 != covariance.shape[1]:
-            continue
-        matrix = covariance.reshape(-1, size, size)
-        deviation = np.sqrt(np.abs(matrix.diagonal(0, 1, 2)))
-        apart = np.abs(matrix - matrix.swapaxes(1, 2))
-        wrong = (apart > ASYMMETRIC * deviation[:, :, None] * deviation[:, None, :]).any(axis=(1, 2))
-        if wrong.any():
-            run = int(np.searchsorted(static[topic].offsets, np.argmax(wrong), "right")) - 1
+        prior = static[topic]
+        run = prior.findings.once("asymmetric", partial(_first_asymmetric, prior))
+        if run is not None:
             raise BadInput(
                 f"{ensemble[run].name}: the covariance of {topic} is not symmetric; mend the prior"
             )
+
+
+def _first_asymmetric(prior: Ragged) -> int | None:
+    """Return the first run of which a covariance is not symmetric; None where all are."""
+    covariance = prior["covariance"]
+    size = isqrt(covariance.shape[1])
+    if not len(covariance) or size**2 != covariance.shape[1]:
+        return None
+    matrix = covariance.reshape(-1, size, size)
+    deviation = np.sqrt(np.abs(matrix.diagonal(0, 1, 2)))
+    apart = np.abs(matrix - matrix.swapaxes(1, 2))
+    wrong = (apart > ASYMMETRIC * deviation[:, :, None] * deviation[:, None, :]).any(axis=(1, 2))
+    return int(np.searchsorted(prior.offsets, np.argmax(wrong), "right")) - 1 if wrong.any() else None
 
 
 def _required(

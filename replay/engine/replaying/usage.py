@@ -20,7 +20,7 @@ from replay.engine.streams.failures import sentences_of
 CONTROLS = {schemas.ODOMETRY.full_name, schemas.INERTIAL_SAMPLE.full_name}
 INNOVATION, SKIPPED = schemas.INNOVATION.full_name, schemas.SKIPPED.full_name
 UNTAKEN = "the estimator does not take this topic"
-SILENT = "they gave no innovation"
+SILENT, EARLY = "they gave no innovation", "come before the prior"
 LANDMARK, TRUTH = schemas.LANDMARK.full_name, schemas.TRUTH_STATE.full_name
 PRIOR = schemas.GAUSSIAN_ESTIMATE.full_name
 
@@ -74,7 +74,7 @@ class Usage:
         speaks: whether it gives innovations.
         doubtful: a sentence on a topic that it begins with.
         shares: the innovations by topic.
-        begins_ns: (runs,) the stamps of the priors; None where there are none.
+        begins_ns: (runs,) the stamps of the priors, of several the first; None where there are none.
     """
 
     name: str
@@ -94,8 +94,10 @@ class Usage:
         for topic, ragged in static.items():
             if ragged.stream.schema.full_name == PRIOR:
                 there = np.diff(ragged.offsets) > 0
-                self.begins_ns = np.zeros(ragged.runs, np.int64)
-                self.begins_ns[there] = ragged.stream.publish_time_ns[ragged.offsets[:-1][there]]
+                begins_ns = np.zeros(ragged.runs, np.int64)
+                begins_ns[there] = ragged.stream.publish_time_ns[ragged.offsets[:-1][there]]
+                before = begins_ns if self.begins_ns is None else self.begins_ns
+                self.begins_ns = np.minimum(before, begins_ns)
             if ragged.stream.schema.full_name == LANDMARK:
                 self.given[topic] += len(ragged)
                 for run in range(ragged.runs):
@@ -132,7 +134,7 @@ class Usage:
             facts = self.facts.setdefault(topic, Counter())
             if self.begins_ns is not None:
                 begins_ns = np.repeat(self.begins_ns, np.diff(ragged.offsets))
-                facts["come before the prior"] += int((stream.times(order) < begins_ns).sum())
+                facts[EARLY] += int((stream.times(order) < begins_ns).sum())
             facts["are infinite"] += int(_infinite(stream).sum())
             facts["repeat the message before"] += int(_repeated(stream).sum())
             maps = [each.stream for each in static.values() if each.stream.schema.full_name == LANDMARK]
@@ -175,12 +177,6 @@ class Usage:
         for topic, why in self.doubtful.items():
             yield Row(label, topic, self.given[topic], None, None, 0, why)
         for group in [[topic] for topic in topics] if self._is_by_topic else [topics]:
-            facts = [
-                f"{count} {fact}" if len(group) == 1 else f"{count} of {topic} {fact}"
-                for topic in group
-                for fact, count in self.facts[topic].items()
-                if count
-            ]
             skipped = {
                 why: count
                 for why, count in self.skipped.items()
@@ -193,6 +189,12 @@ class Usage:
                 row = row._replace(used=self.used, gated=self.gated)
             if self.speaks and len(group) < len(topics):
                 row = row._replace(used=self.shares.used[group[0]], gated=self.shares.gated[group[0]])
+            facts = [
+                f"{count} {fact}" if len(group) == 1 else f"{count} of {topic} {fact}"
+                for topic in group
+                for fact, count in self.facts[topic].items()
+                if count and (fact != EARLY or row.unused > 0)  # a tracker may use those too
+            ]
             if row.unused > 0 and not facts and not told:
                 told = [SILENT]
             yield row._replace(why="; ".join([*told, *facts]))

@@ -1,8 +1,8 @@
 """Lays the streams of many runs end to end in ragged columns, and merges their events in time order."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, partial
 from itertools import compress
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,6 +13,29 @@ from recorders.log import Clock, Stream
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.failures import join_streams
 
+Found = TypeVar("Found")
+
+
+class Findings(dict[Hashable, Any]):
+    """Keeps what was worked out of columns, which never change: the last few things."""
+
+    def __init__(self, most: int = 16) -> None:
+        super().__init__()
+        self._most = most
+
+    def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
+        """Return what `find` gives; it is called where the key is none of the last few."""
+        try:
+            return self[key]
+        except KeyError:
+            found = find()
+        while len(self) >= self._most:
+            self.pop(list(self)[0], None)  # noqa: RUF015 other threads add to it meanwhile
+        return self.setdefault(key, found)
+
+    def __reduce__(self) -> tuple[type["Findings"], tuple[int]]:
+        return Findings, (self._most,)  # another process finds it again
+
 
 @dataclass(frozen=True)
 class Ragged:
@@ -20,6 +43,11 @@ class Ragged:
 
     stream: Stream
     offsets: NDArray[np.int64]
+
+    @cached_property
+    def findings(self) -> Findings:
+        """Keep what is found of these messages alone, such as the priors that they are."""
+        return Findings()
 
     def __getitem__(self, name: str) -> NDArray:
         """Return the column of one field, all runs end to end."""
@@ -59,12 +87,18 @@ class Block(NamedTuple):
     """Holds what an estimator gets at once: a span of its topics, in all runs.
 
     `arrival` (n, 2) says of every event when it was taken and its place in the file, where that is not
-    its stamp's order alone; see `replay.engine.replaying.late`.
+    its stamp's order alone; see `replay.engine.replaying.late`. `findings` are of a block that is
+    replayed again, None of any other.
     """
 
     streams: dict[str, Ragged]
     events: Events
     arrival: NDArray[np.int64] | None = None
+    findings: Findings | None = None
+
+    def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
+        """Return what is found of these messages alone, which may be known from an earlier replay."""
+        return find() if self.findings is None else self.findings.once(key, find)
 
     def column(self, *names: str, missing: float = np.nan) -> NDArray:
         """Return one field of every event: the first of `names` that its topic has, else `missing`."""
@@ -114,11 +148,27 @@ def filled_rows(
     offsets: NDArray[np.int64], end: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
     """Find the filled rows of ragged columns whose run r goes from offsets[r] to end[r], and offsets."""
-    if np.array_equal(end, offsets[1:]):
+    if (end == offsets[1:]).all():
         return slice(None), offsets
     run = np.repeat(np.arange(len(end)), np.diff(offsets))
     filled = np.arange(len(run)) < end[run]
     return np.flatnonzero(filled), ragged_rows(filled, offsets)
+
+
+def is_in_order(runs: Ragged, order: Clock) -> bool:
+    """Tell whether every run's messages go by one of the clocks, and by their places in the file.
+
+    Args:
+        runs: the messages of a topic, in all runs.
+        order: the clock.
+    """
+    clock, position = runs.stream.times(order), runs.stream.position
+    ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
+    if ordered.all():
+        return True
+    begins = runs.offsets[1:-1]  # where another run begins, or none is left
+    ordered[begins[(begins > 0) & (begins < len(clock))] - 1] = True
+    return bool(ordered.all())
 
 
 def gather(parts: Sequence[Stream]) -> Ragged:
@@ -159,7 +209,7 @@ def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     topic, source, time_ns = (np.empty(count, np.int64) for _ in range(3))
     events = Events(offsets, time_ns, topic, source, np.empty(count, bool))
     heads = partial(np.empty, len(everything), np.int64)
-    _merge()(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
+    _merge(len(offsets) - 1, bounds, times_ns, positions, events, scratch=heads)
     return events
 
 
@@ -177,11 +227,6 @@ def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> N
         is_last[:-1] |= column[1:] != column[:-1]
     is_last[offsets[1:][offsets[1:] > offsets[:-1]] - 1] = True
     return is_last
-
-
-@lru_cache(maxsize=1)
-def _merge() -> Callable[..., None]:
-    return compile_over_runs(merge_run, allocates=False)
 
 
 def merge_run(
@@ -210,3 +255,6 @@ def merge_run(
         events.time_ns[event], events.is_last[event] = time_ns, True
         events.topic[event], events.source[event] = first, heads[first]
         heads[first] += 1
+
+
+_merge = compile_over_runs(merge_run, allocates=False)

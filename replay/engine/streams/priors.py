@@ -1,7 +1,7 @@
 """Reads priors by component names; a run without a usable prior fails alone."""
 
 from collections.abc import Mapping
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import isqrt
 from typing import NamedTuple
 
@@ -139,13 +139,18 @@ def start_of_runs(
     """
     found, failed = dict(static), dict[int, str]()
     for topic, components in priors.items():
-        read = priors_of(static[topic], components)
-        for run, reason in enumerate(read.reasons):
-            if reason:
-                failed.setdefault(run, reason)
-        stream = gaussian_stream(topic, read.time_ns, read.mean, read.covariance, {})
-        found[topic] = Ragged(stream, np.arange(len(read.reasons) + 1))
+        prior, wanted = static[topic], (topic, *components.items())
+        found[topic], reasons = prior.findings.once(wanted, partial(_start_of, topic, prior, components))
+        failed |= {run: reason for run, reason in reasons.items() if run not in failed}
     return found, failed
+
+
+def _start_of(topic: str, prior: Ragged, components: Components) -> tuple[Ragged, dict[int, str]]:
+    """Return one message for every run, and why runs cannot start."""
+    read = priors_of(prior, components)
+    stream = gaussian_stream(topic, read.time_ns, read.mean, read.covariance, {})
+    reasons = {run: reason for run, reason in enumerate(read.reasons) if reason}
+    return Ragged(stream, np.arange(len(read.reasons) + 1)), reasons
 
 
 def gaussians(

@@ -44,13 +44,20 @@ def state_stream(
         mean: (n, d).
         covariance: (n, t, t).
     """
-    angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
-    if angular:
-        mean = mean.copy()
-        angles = mean[:, angular]  # those in range stay as they are, to the last bit
-        mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
+    mean = wrapped(mean, components)
     metadata = named(components) if truth is None else {**named(components), "truth": truth}
     return gaussian_stream(topic, time_ns, mean, covariance, metadata)
+
+
+def wrapped(mean: Floats, components: Components) -> Floats:
+    """Return means (n, d) with their angles wrapped."""
+    angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
+    if not angular:
+        return mean
+    mean = mean.copy()
+    angles = mean[:, angular]  # those in range stay as they are, to the last bit
+    mean[:, angular] = np.where(np.abs(angles) < np.pi, angles, wrap_angle(angles))
+    return mean
 
 
 def gaussian_stream(
@@ -65,7 +72,7 @@ def gaussian_stream(
         covariance: (n, t, t).
         metadata: of the channel.
     """
-    columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": _flat(covariance)}
+    columns = {"sensor_time_ns": time_ns, "mean": mean, "covariance": rows_of(covariance)}
     schema = schemas.GAUSSIAN_ESTIMATE
     return stream_of(topic, schema, time_ns, columns, metadata=metadata, allow_nan=True)
 
@@ -118,13 +125,13 @@ def innovation_stream(
         target_id=columns.target_id,
         accepted=columns.accepted,
         innovation=columns.innovation,
-        covariance=_flat(columns.covariance),
+        covariance=rows_of(columns.covariance),
         normalised_innovation_squared=columns.squared,
         log_likelihood=unknown if likelihood is None else likelihood,
     )
 
 
-def _flat(covariance: Floats) -> Floats:
+def rows_of(covariance: Floats) -> Floats:
     """Return matrices (n, m, m) as rows (n, m m)."""
     return covariance.reshape(len(covariance), covariance.shape[1] * covariance.shape[2])
 

@@ -21,7 +21,7 @@ from recorders.log import (
     read_streams,
 )
 from recorders.recording import Recording
-from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.blocks import Block, Findings, Ragged, gather, is_in_order, merge_events
 
 
 class Source(Protocol):
@@ -260,22 +260,6 @@ class MemorySource(_Readable):
         return self.streams[topic]
 
 
-def is_in_order(runs: Ragged, order: Clock) -> bool:
-    """Tell whether every run's messages go by one of the clocks, and by their places in the file.
-
-    Args:
-        runs: the messages of a topic, in all runs.
-        order: the clock.
-    """
-    clock, position = runs.stream.times(order), runs.stream.position
-    ordered = (clock[1:] >= clock[:-1]) & (position[1:] > position[:-1])
-    if ordered.all():
-        return True
-    begins = runs.offsets[1:-1]  # where another run begins, or none is left
-    ordered[begins[(begins > 0) & (begins < len(clock))] - 1] = True
-    return bool(ordered.all())
-
-
 def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
     """Make a source of a recording with a log's positions: merged by log time, ties in order.
 
@@ -298,19 +282,25 @@ def memory_source(recording: Recording, run: RunMetadata) -> MemorySource:
 
 
 SourceType = TypeVar("SourceType", bound=Source)
+# Of a block of few messages it is kept what a few filters make of it: of more that takes much memory.
+FEW_MESSAGES, FEW_FILTERS = 1 << 13, 4
 
 
 class Ensemble(list[SourceType]):
     """Represents runs that are replayed together: they hold the same topics.
 
-    An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept;
-    no run may be added to it or taken from it.
+    An ensemble is replayed many times, so topics that are in memory are laid end to end once and kept,
+    with what was found of them (`findings`); no run may be added to it or taken from it.
     """
 
     def __init__(self, sources: Iterable[SourceType]) -> None:
         super().__init__(sources)
+        self.findings = Findings()
         self._kept: dict[tuple[str, Clock], Ragged] = {}
         self._alike: set[str] = set()
+
+    def __reduce__(self) -> tuple[type["Ensemble[SourceType]"], tuple[list[SourceType]]]:
+        return type(self), (list(self),)
 
     @cached_property
     def starts_ns(self) -> dict[int, int]:
@@ -366,11 +356,28 @@ class Ensemble(list[SourceType]):
                 for topic, nothing in empty.items()
             }
 
+    def block(self, streams: dict[str, Ragged], order: Clock) -> Block:
+        """Return messages with their order in time; of whole recordings as they were found before."""
+
+        def merged(findings: Findings | None = None) -> Block:
+            return Block(streams, merge_events(streams, order), findings=findings)
+
+        if any(self._kept.get((topic, order)) is not ragged for topic, ragged in streams.items()):
+            return merged()
+        if sum(map(len, streams.values())) > FEW_MESSAGES:
+            return merged()
+        return self.findings.once(("block", order, *streams), lambda: merged(Findings(FEW_FILTERS)))
+
     @cached_property
     def _recordings(self) -> list[MemorySource]:
         """Return the runs, where all are in memory."""
         found: list[MemorySource] = [each for each in self if isinstance(each, MemorySource)]
         return found if len(found) == len(self) else []
+
+    @property
+    def is_in_memory(self) -> bool:
+        """Tell whether all runs are recordings."""
+        return bool(self._recordings)
 
     @cached_property
     def _are_whole(self) -> bool:

@@ -32,8 +32,10 @@ from replay.distributions.wrapped_normal_kernels import (
     fit_samples,
     five_samples,
 )
-from replay.engine.arrays import Floats, Integers
+from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.results import ALL_WELL
+from replay.inference.run.loops import over_events
 
 # A variance (rad^2) of a measurement that moves a Gaussian by less than its rounding.
 _VAGUE = 1e18
@@ -53,6 +55,21 @@ class HeadingModel(NamedTuple):
     drift_rad: Floats
     system: Floats
     measurement: Floats
+
+
+class HeadingRows(NamedTuple):
+    """Holds what all runs measure: run r owns offsets[r]:offsets[r + 1] of the measurements (n, 2)."""
+
+    offsets: Integers
+    measurement: Floats
+
+
+class HeadingInputs(NamedTuple):
+    """Holds what a filter goes by; its option is the central weight, or whether angles are wrapped."""
+
+    events: HeadingRows
+    model: HeadingModel
+    option: float | bool
 
 
 # One of `recorders.models.headings`: two angles, coupling and drifts -> the next two.
@@ -119,7 +136,7 @@ def run_unscented_filter(
 
 
 def _run(
-    step: Callable[..., None],
+    step: Function,
     motion: Motion,
     model: HeadingModel,
     state: WrappedNormal,
@@ -131,62 +148,52 @@ def _run(
         raise BadInput(f"heading measurements of shape {measurement.shape}; give ({offsets[-1]}, 2)")
     state = WrappedNormal(state.mean.copy(), state.covariance.copy())
     estimates = WrappedNormal(np.empty(measurement.shape), np.empty((*measurement.shape, 2)))
-    rows = np.ascontiguousarray(measurement)
+    rows = HeadingRows(offsets, np.ascontiguousarray(measurement))
     # a fit to samples is no wider than a uniform distribution
     most = UNIFORM + np.diagonal(model.system) + np.maximum(np.diagonal(model.measurement), UNIFORM)
-    memory = partial(blank_mixture, most)
-    _over_runs(step, motion)(
-        len(offsets) - 1, model, option, offsets, rows, state, estimates, scratch=memory
-    )
+    inputs, memory = HeadingInputs(rows, model, option), partial(blank_mixture, most)
+    _over_runs(step, motion)(len(offsets) - 1, inputs, state, estimates, scratch=memory)
     return state, estimates
 
 
 @cache
-def _over_runs(step: Callable[..., None], motion: Motion) -> Callable[..., None]:
-    """The compiled loop of a filter: `step` at every row, its state written down."""
-
-    def run_once(
-        run: int,
-        model: HeadingModel,
-        option: float | bool,
-        offsets: Integers,
-        measurement: Floats,
-        state: WrappedNormal,
-        estimates: WrappedNormal,
-        mixture: Mixture,
-    ) -> None:
-        for row in range(offsets[run], offsets[run + 1]):
-            step(motion, model, option, measurement[row], state, run, mixture)
-            estimates.mean[row] = state.mean[run]
-            estimates.covariance[row] = state.covariance[run]
-
-    return compile_over_runs(run_once, allocates=False)
+def _over_runs(step: Function, motion: Motion) -> Function:
+    """The compiled loop of a filter: what `step` makes processes a row, whose state is written down."""
+    loop = over_events(step(motion), _write, fails=False)
+    return compile_over_runs(loop, allocates=False, title="a filter of headings")
 
 
-def _toroidal_step(
-    motion: Motion,
-    model: HeadingModel,
-    central_weight: float,
-    z: NDArray,
-    state: WrappedNormal,
-    run: int,
-    mixture: Mixture,
-) -> None:
-    mean, covariance = state.mean[run], state.covariance[run]
-    x, weights = np.empty((5, 2)), np.empty(5)
-    five_samples(mean, covariance, central_weight, x, weights)
-    _move(motion, model, x)
-    _store(fit_samples(x, weights), mean, covariance)
-    for i in range(2):
-        for j in range(2):
-            covariance[i, j] += model.system[i, j]
-    if not covariance[0, 0] * covariance[1, 1] > covariance[0, 1] ** 2:
-        # no distribution: NaN stays, all later rows of the run are NaN as well
-        mean[:], covariance[:] = np.nan, np.nan
-    elif not math.isnan(z[0]):
-        measured, noise = np.empty(2), np.empty((2, 2))
-        _take(z, model.measurement, UNIFORM, measured, noise)
-        _store(fit_product(mean, covariance, measured, noise, mixture), mean, covariance)
+def _write(
+    run: int, row: int, _: HeadingInputs, state: WrappedNormal, estimates: WrappedNormal, __: Mixture
+) -> int:
+    estimates.mean[row] = state.mean[run]
+    estimates.covariance[row] = state.covariance[run]
+    return ALL_WELL
+
+
+def _toroidal_step(motion: Motion) -> Function:
+    def step(
+        run: int, row: int, inputs: HeadingInputs, state: WrappedNormal, _: WrappedNormal, work: Mixture
+    ) -> int:
+        mean, covariance = state.mean[run], state.covariance[run]
+        model, z = inputs.model, inputs.events.measurement[row]
+        x, weights = np.empty((5, 2)), np.empty(5)
+        five_samples(mean, covariance, inputs.option, x, weights)
+        _move(motion, model, x)
+        _store(fit_samples(x, weights), mean, covariance)
+        for i in range(2):
+            for j in range(2):
+                covariance[i, j] += model.system[i, j]
+        if not covariance[0, 0] * covariance[1, 1] > covariance[0, 1] ** 2:
+            # no distribution: NaN stays, all later rows of the run are NaN as well
+            mean[:], covariance[:] = np.nan, np.nan
+        elif not math.isnan(z[0]):
+            measured, noise = np.empty(2), np.empty((2, 2))
+            _take(z, model.measurement, UNIFORM, measured, noise)
+            _store(fit_product(mean, covariance, measured, noise, work), mean, covariance)
+        return ALL_WELL
+
+    return step
 
 
 def _take(z: NDArray, noise: NDArray, vague: float, measured: NDArray, covariance: NDArray) -> None:
@@ -214,38 +221,37 @@ def _store(
     covariance[1, 0] = covariance[0, 1]
 
 
-def _unscented_step(
-    motion: Motion,
-    model: HeadingModel,
-    wrapped: bool,
-    z: NDArray,
-    state: WrappedNormal,
-    run: int,
-    mixture: Mixture,
-) -> None:
-    mean, covariance, x = state.mean[run], state.covariance[run], np.empty((5, 2))
-    _fill_sigma_points(mean, covariance, x)
-    _move(motion, model, x)
-    for k in range(2):
-        mean[k] = 0.0
-        for n in range(len(x)):
-            x[n, k] = x[n, k] if wrapped else x[n, k] % TURN
-        for n in range(len(x)):
-            mean[k] += x[n, k] / len(x)
-    for i in range(2):
-        for j in range(i + 1):
-            spread = 0.0
-            for n in range(len(x)):
-                spread += (x[n, i] - mean[i]) * (x[n, j] - mean[j])
-            covariance[i, j] = covariance[j, i] = spread / len(x) + model.system[i, j]
-    if not math.isnan(z[0]):
-        measured, noise, innovation = np.empty(2), np.empty((2, 2)), np.empty(2)
-        _take(z, model.measurement, _VAGUE, measured, noise)
+def _unscented_step(motion: Motion) -> Function:
+    def step(
+        run: int, row: int, inputs: HeadingInputs, state: WrappedNormal, _: WrappedNormal, __: Mixture
+    ) -> int:
+        mean, covariance, x = state.mean[run], state.covariance[run], np.empty((5, 2))
+        model, wrapped, z = inputs.model, inputs.option, inputs.events.measurement[row]
+        _fill_sigma_points(mean, covariance, x)
+        _move(motion, model, x)
         for k in range(2):
-            innovation[k] = wrap_angle(measured[k] - mean[k]) if wrapped else measured[k] - mean[k]
-        condition(mean, covariance, innovation, noise)
-    for k in range(2):
-        mean[k] = wrap_angle(mean[k]) if wrapped else mean[k] % TURN
+            mean[k] = 0.0
+            for n in range(len(x)):
+                x[n, k] = x[n, k] if wrapped else x[n, k] % TURN
+            for n in range(len(x)):
+                mean[k] += x[n, k] / len(x)
+        for i in range(2):
+            for j in range(i + 1):
+                spread = 0.0
+                for n in range(len(x)):
+                    spread += (x[n, i] - mean[i]) * (x[n, j] - mean[j])
+                covariance[i, j] = covariance[j, i] = spread / len(x) + model.system[i, j]
+        if not math.isnan(z[0]):
+            measured, noise, innovation = np.empty(2), np.empty((2, 2)), np.empty(2)
+            _take(z, model.measurement, _VAGUE, measured, noise)
+            for k in range(2):
+                innovation[k] = wrap_angle(measured[k] - mean[k]) if wrapped else measured[k] - mean[k]
+            condition(mean, covariance, innovation, noise)
+        for k in range(2):
+            mean[k] = wrap_angle(mean[k]) if wrapped else mean[k] % TURN
+        return ALL_WELL
+
+    return step
 
 
 def _fill_sigma_points(mean: NDArray, covariance: NDArray, x: NDArray) -> None:

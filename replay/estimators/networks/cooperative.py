@@ -9,7 +9,7 @@ could.
 
 import copy
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache, partial
+from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ from recorders.parameters import Parameters
 from replay.distributions import chi2
 from replay.engine.api.functions import recursive
 from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Booleans, Floats, Function
+from replay.engine.arrays import Booleans, Floats
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import given_or_stated, numbered
@@ -111,9 +111,9 @@ def memory(states: int) -> RobotMemory:
     )
 
 
-@cache
-def _compiled() -> Function:
-    return compile_over_runs(over_events(cooperate, write_pose), allocates=False)
+_cooperate = compile_over_runs(
+    over_events(cooperate, write_pose), allocates=False, title="robots that see each other"
+)
 
 
 Cooperating = Given[CooperativeParameters]
@@ -164,7 +164,7 @@ def advance(
     fusion = SightingFusion(mode == "joint", mode == "ci", given.parameters.criterion == "trace")
     scratch = partial(memory, robots.mean.shape[1])
     inputs = RobotInputs(events, settings, fusion)
-    _compiled()(given.runs, inputs, robots, results, scratch=scratch)
+    _cooperate(given.runs, inputs, robots, results, scratch=scratch)
     is_estimated = np.isfinite(results.mean[:, 0])
     made = [
         states_in(

@@ -7,14 +7,14 @@ fuses K estimates of one state: scalar loops, so that networks compile it, calle
 weights, mean, covariance, memory) -> gap`, infinity where a covariance is singular.
 """
 
-from functools import cache, partial
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from recorders.errors import BadInput
-from replay.engine.arrays import Floats, Function
+from replay.engine.arrays import Floats
 from replay.engine.compiling.compile import compile_over_runs
 from replay.estimators.networks.estimates import (
     Estimate,
@@ -248,9 +248,7 @@ def fuse_run(
     fusions.gap[run] = fuse_by(rule, count, parts, into, tolerance, memory)
 
 
-@cache
-def _fuse_runs() -> Function:
-    return compile_over_runs(fuse_run, allocates=False)
+_fuse_runs = compile_over_runs(fuse_run, allocates=False)
 
 
 def fuse(
@@ -301,7 +299,7 @@ def fuse(
     fused = Fusions(
         np.empty((runs, size)), np.empty((runs, size, size)), np.empty((runs, count)), np.empty(runs)
     )
-    _fuse_runs()(
+    _fuse_runs(
         runs,
         rule_number(name),
         tolerance,

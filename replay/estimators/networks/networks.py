@@ -8,7 +8,7 @@ replay's output, so that one run is replayed with any rule. The state is (positi
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from recorders.parameters import Parameters
 from replay.distributions import chi2
 from replay.engine.api.functions import batch
 from replay.engine.api.inputs import Binding, Given
-from replay.engine.arrays import Function, Integers
+from replay.engine.arrays import Integers
 from replay.engine.compiling.compile import compile_over_runs
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.channels import numbered
@@ -81,9 +81,7 @@ class NetworkParameters(Parameters):
     lie_after_s: NonNegativeFloat = 0.0
 
 
-@cache
-def _compiled() -> Function:
-    return compile_over_runs(following(), allocates=False)
+_follow = compile_over_runs(following(), allocates=False, title="the nodes of a network")
 
 
 def _fusion(parameters: NetworkParameters, sensors: Collection[int], states: int) -> NodeFusion:
@@ -137,7 +135,7 @@ def solve(given: Given[NetworkParameters]) -> list[Ragged]:
     )
     failed_ns = np.full(runs, -1)
     most = 1 + int(np.diff(activities.received).max(initial=0))
-    _compiled()(
+    _follow(
         runs,
         NodeInputs(
             activities,

@@ -7,8 +7,8 @@ IEEE TAES 49(4), 2013: a detection that nothing explains begins a component, and
 is not kept. The state is (x, vx, y, vy); accelerations are white and constant between scans.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache, partial
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -78,9 +78,7 @@ class PhdParameters(Parameters):
     most_components: PositiveInt = 100
 
 
-@lru_cache(maxsize=1)
-def _compiled() -> Callable[..., None]:
-    return compile_over_runs(over_events(process, extract), allocates=False)
+_filter = compile_over_runs(over_events(process, extract), allocates=False, title="a PHD filter")
 
 
 Filtering = Given[PhdParameters]
@@ -127,7 +125,7 @@ def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[
     sets = _no_sets(scans, mixture, settings)
     largest = int((scans.end - scans.first).max(initial=0))
     inputs = PhdInputs(scans, settings)
-    _compiled()(runs, inputs, mixture, sets, scratch=partial(_work, most, largest))
+    _filter(runs, inputs, mixture, sets, scratch=partial(_work, most, largest))
     return mixture, sets
 
 

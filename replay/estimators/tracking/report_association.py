@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from replay.engine.arrays import Booleans, Floats, Integers, varying
+from replay.engine.arrays import Floats, Integers, varying
 from replay.inference.association.association import nearest
 from replay.inference.association.clusters import AssociationMemory, Weights
 
@@ -72,7 +72,6 @@ class Reports(NamedTuple):
 
     offsets: Integers
     time_ns: Integers
-    is_last: Booleans
     position: Floats
     velocity: Floats
     velocity_variance: Floats

@@ -13,8 +13,8 @@ pseudo-Bayesian filter (Bar-Shalom, Li, Kirubarajan, Estimation with Application
 Navigation, 11.6.2). Both axes have the same noise: three numbers are a track's covariance.
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from functools import lru_cache, partial
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
@@ -79,9 +79,7 @@ class ReportTrackerParameters(Parameters):
     forget_s: PositiveFloat = 7200.0
 
 
-@lru_cache(maxsize=1)
-def _compiled() -> Callable[..., None]:
-    return compile_over_runs(over_stamps(track), allocates=False)
+_track = compile_over_runs(over_stamps(track), allocates=False, title="tracks of reports")
 
 
 Reporting = Given[ReportTrackerParameters]
@@ -99,10 +97,10 @@ def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, lis
     tracks = _with_room(before, int(np.diff(reports.offsets).max(initial=0)))
     rows = len(reports.time_ns)
     results = ReportResults(np.empty(rows, np.int64), np.empty((rows, 4)), np.empty((rows, 3)))
-    ends = np.flatnonzero(reports.is_last)
+    ends = np.flatnonzero(block.events.is_last)
     together = int(np.diff(ends, prepend=-1).max(initial=1))
     memory = partial(_memory, together, tracks.number.shape[1])
-    _compiled()(given.runs, ReportInputs(reports, settings), tracks, results, scratch=memory)
+    _track(given.runs, ReportInputs(reports, settings), tracks, results, scratch=memory)
     stream = make_stream(
         f"/estimates/{given.name}/track",
         schemas.TRACK_ESTIMATE,
@@ -126,7 +124,7 @@ def covariances(spread: Floats) -> Floats:
 
 
 def _reports(block: Block, topic: str, settings: ReportSettings) -> Reports:
-    offsets, time_ns, _, source, is_last = block.events
+    offsets, time_ns, _, source, _ = block.events
     given = block.streams[topic]
     course_rad, speed_mps = given["course_rad"][source], given["speed_mps"][source]
     # nothing is known of the direction, or of the speed either: a wide velocity about zero
@@ -136,7 +134,7 @@ def _reports(block: Block, topic: str, settings: ReportSettings) -> Reports:
     velocity = np.stack([speed_mps * np.sin(course_rad), speed_mps * np.cos(course_rad)], axis=1)
     velocity[unknown] = 0.0
     position = read_vectors(given.stream, "position_m", PLANE)[source]
-    return Reports(offsets, time_ns, is_last, position, velocity, variance, course_rad, speed_mps)
+    return Reports(offsets, time_ns, position, velocity, variance, course_rad, speed_mps)
 
 
 def _no_tracks(runs: int) -> Tracks:

@@ -169,6 +169,15 @@ class Worker:
             return told
 
 
+def state_of(library: str) -> list[int]:
+    """Return when a library was last changed, and its size: a process that has an older one ends."""
+    try:
+        state = Path(library).stat()
+    except OSError:
+        return [0, 0]
+    return [state.st_mtime_ns, state.st_size]
+
+
 class Ran(NamedTuple):
     """Holds what one run's filter said, and why the run failed, if it did."""
 
@@ -190,6 +199,7 @@ def follow_apart(
         made.progress[0] = LOADING
         task = {
             "library": library,
+            "state": state_of(library),
             "folder": str(folder),
             "parameters": list(given.parameters),
             "seed": given.seed,
@@ -299,7 +309,9 @@ def describe_apart(library: str) -> str:
     while True:
         worker = _kept_or_new()
         try:
-            found = worker.ask({"library": library}, Limits(STARTS_S, 2000.0))["description"]
+            found = worker.ask(
+                {"library": library, "state": state_of(library)}, Limits(STARTS_S, 2000.0)
+            )["description"]
             _KEPT.put(worker)
             return str(found)
         except Ended as ended:

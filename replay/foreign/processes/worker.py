@@ -7,7 +7,6 @@ library finds nothing to read there, and what it prints goes nowhere.
 import json
 import os
 import threading
-from functools import cache
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -47,13 +46,21 @@ def main() -> None:
             answers.flush()
 
 
-@cache
-def _library(path: str) -> Library:
-    return Library(Path(path))
+def _library(task: dict[str, Any]) -> Library:
+    """Return the library of a task; one that has changed since is for another process to load."""
+    path, state = task["library"], task["state"]
+    if path in _LOADED and _LOADED[path][0] != state:
+        os._exit(IDLE)
+    if path not in _LOADED:
+        _LOADED[path] = state, Library(Path(path))
+    return _LOADED[path][1]
+
+
+_LOADED: dict[str, tuple[list[int], Library]] = {}
 
 
 def _describe(task: dict[str, Any]) -> dict[str, Any]:
-    return {"description": _library(task["library"]).description.decode(errors="replace")}
+    return {"description": _library(task).description.decode(errors="replace")}
 
 
 def _follow(task: dict[str, Any]) -> dict[str, Any]:
@@ -62,7 +69,7 @@ def _follow(task: dict[str, Any]) -> dict[str, Any]:
         follow_task,
     )  # NumPy and the compiler, which describing needs not
 
-    return follow_task(_library(task["library"]), Path(task["folder"]), task["parameters"], task["seed"])
+    return follow_task(_library(task), Path(task["folder"]), task["parameters"], task["seed"])
 
 
 if __name__ == "__main__":

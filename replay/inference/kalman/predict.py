@@ -31,7 +31,7 @@ def linear_motion(stage: Stage) -> Function:
         state = read_state(mean)
         linearise(state, read_control(control), duration_s, parameters, work)
         fill(mean, work.state)
-        move_covariance(covariance, work.transition, work.product)
+        move_covariance(covariance, work.transition, work.product, work.rest)
         add_noise(state, covariance, duration_s, parameters, work)
         return True
 

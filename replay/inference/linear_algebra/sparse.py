@@ -14,7 +14,8 @@ from replay.inference.linear_algebra.gaussian import (
     propagate_covariance,
 )
 
-Pattern = tuple[tuple[tuple[int, float | None], ...], ...]
+Row = tuple[tuple[int, float | None], ...]
+Pattern = tuple[Row, ...]
 
 
 def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) -> Pattern | None:
@@ -28,27 +29,50 @@ def pattern_of(known: Mapping[tuple[int, int], float | None] | None, rows: int) 
 
 
 def propagating_covariance(pattern: Pattern | None) -> Function:
-    """Make `move(covariance, transition, product)`: P (t, t) becomes F P F'; `product` becomes F P."""
-    if pattern is None:
-        return propagate_covariance
-    rows = tuple(enumerate(pattern))
+    """Make `move(covariance, transition, product, turned)`: P (t, t) becomes F P F', the product F P.
 
-    def move(covariance: Floats, transition: Floats, product: Floats) -> None:
+    `turned` is to work in: the inner loops all go along rows, so that the compiler takes several columns
+    at once. What F leaves as it is, such as a bias, takes no sums.
+    """
+    if pattern is None:
+
+        def move_all(covariance: Floats, transition: Floats, product: Floats, turned: Floats) -> None:
+            propagate_covariance(covariance, transition, product)
+
+        return move_all
+    rows = tuple(enumerate(pattern))
+    moved = tuple((row, entries) for row, entries in rows if entries != ((row, 1.0),))
+    left = tuple(row for row, entries in rows if entries == ((row, 1.0),))
+    end = max((row + 1 for row, _ in moved), default=0)
+    changed = rows[:end]
+
+    def move(covariance: Floats, transition: Floats, product: Floats, turned: Floats) -> None:
         size = len(covariance)
-        for row, entries in rows:
+        for row, entries in moved:
+            factors = tuple(transition[row, k] if value is None else value for k, value in entries)
             for column in range(size):
                 entry = 0.0
-                for k, value in entries:
-                    factor = transition[row, k] if value is None else value
+                for factor, (k, _) in zip(factors, entries, strict=True):
                     entry += factor * covariance[k, column]
                 product[row, column] = entry
-        for column, entries in rows:
-            for row in range(column, size):
+        for row in left:
+            for column in range(size):
+                product[row, column] = covariance[row, column]
+        for row in range(end):
+            for k in range(size):
+                turned[k, row] = product[row, k]
+        for row, entries in changed:
+            factors = tuple(transition[row, k] if value is None else value for k, value in entries)
+            for column in range(row, end):
                 entry = 0.0
-                for k, value in entries:
-                    factor = transition[column, k] if value is None else value
-                    entry += product[row, k] * factor
-                covariance[row, column] = covariance[column, row] = entry
+                for factor, (k, _) in zip(factors, entries, strict=True):
+                    entry += turned[k, column] * factor
+                covariance[row, column] = entry
+            for column in range(end, size):
+                covariance[row, column] = product[row, column]
+        for row in range(size):
+            for column in range(min(row, end)):
+                covariance[row, column] = covariance[column, row]
 
     return move
 

@@ -126,45 +126,53 @@ def _one_thing(
     """Return the one thing of a model whose topics are in several namespaces; None where they are not.
 
     With one control there is one thing, in its namespace. With none there is one where no sensor, prior
-    or truth is there twice. What its namespace lacks, and one other has, is its own; what several others
-    have is not taken. Nor is a pose, which may be a goal, or in a frame of its own.
+    or truth is there twice, in the namespace of the prior, or that which its sensors have in common.
+    What its namespace lacks, and one other has, is its own; what several others have is not taken. Nor
+    is a pose, which may be a goal, or in a frame of its own.
     """
     there = {name: topic for name, topic in topics.items() if not name.startswith("/estimates/")}
-    sensors = {
-        sensor.topic: [
-            name
-            for name in _named(there, sensor.topic, sensor.schema)
-            if there[name].metadata.get("system", model.system) == model.system
-        ]
-        for sensor in model.all_sensors
-        if sensor.schema is not schemas.POSE
-    }
-    priors = [
-        name
-        for name in _named(there, model.prior, schemas.GAUSSIAN_ESTIMATE)
-        if model.state.keys() <= set(there[name].metadata.get("components", "").split(","))
-    ]
-    others = {model.prior: priors, model.truth: _named(there, model.truth, schemas.TRUTH_STATE)}
-    given = {name for name in (*sensors, *others) if name in names or name.startswith("/") or not name}
-    found = {name: each for name, each in (sensors | others).items() if name not in given}
+    homes: list[str] = []
     if model.control is not None:
         name = names.get(model.control.topic, model.control.topic)
         controls = _named(there, name, model.control.schema)
         homes = [each.removesuffix(f"/{name.removeprefix('/')}") for each in controls]
-    else:
+        if len(homes) != 1:
+            return None
+    found: dict[str, list[str]] = {}
+    for name, schema in {
+        **{each.topic: each.schema for each in model.all_sensors if each.schema is not schemas.POSE},
+        model.prior: schemas.GAUSSIAN_ESTIMATE,
+        model.truth: schemas.TRUTH_STATE,
+    }.items():
+        if name and name not in names and not name.startswith("/"):
+            found[name] = [
+                each for each in _named(there, name, schema) if _serves(model, name, there[each])
+            ]
+            if not homes and len(found[name]) > 1:
+                return None
+    if not homes:
         spaces = {
-            each.removesuffix(f"/{name}") for name in sensors if name in found for each in found[name]
+            each.removesuffix(f"/{name}")
+            for name, own in found.items()
+            if name not in (model.prior, model.truth)
+            for each in own
         }
-        are_several = any(len(each) > 1 for each in found.values()) or len(spaces) < 2
-        own = [each.removesuffix(f"/{model.prior}") for each in priors] or [_common(spaces)]
-        homes = [] if are_several else own
-    if len(homes) != 1:
-        return None
+        if not spaces:
+            return None
+        of_prior = [each.removesuffix(f"/{model.prior}") for each in found.get(model.prior, [])]
+        homes = of_prior or [_common(spaces)]
     [home] = homes
     elsewhere = {
         name: each[0] for name, each in found.items() if len(each) == 1 and f"{home}/{name}" not in there
     }
     return UnderPrefix(topics, home, {**names, **elsewhere}) if elsewhere else None
+
+
+def _serves(model: Model, name: str, topic: Topic) -> bool:
+    """Tell whether a topic of the right type is of a model's system, and a prior of its state."""
+    if name == model.prior:
+        return model.state.keys() <= set(topic.metadata.get("components", "").split(","))
+    return topic.metadata.get("system", model.system) == model.system
 
 
 def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:

@@ -8,22 +8,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from replay.engine.arrays import Booleans, Floats, Integers
-from replay.engine.streams.blocks import Block, Ragged
+from replay.engine.streams.blocks import Block, Ragged, ragged_rows
+from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import GEODETIC, in_plane
 from replay.engine.streams.measurements import Fixes, read_fixes, read_vectors, unknown
 from replay.inference.kalman.update import reading
 from replay.inference.model.binding import Found
 from replay.inference.model.model import Control, Map, Sensor
 from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import reading_settings
+from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
 from replay.inference.run.recursion import CONTROL, NOTHING, FilterEvents
 from replay.inference.run.timing import last_of_stamps, select_events, where_wanted
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Points:
     """Holds the points of a map in all runs: keys are run * 2^32 + number, sorted; places (n, d)."""
 
@@ -77,6 +78,18 @@ def data_columns(stage: Stage) -> tuple[int, int]:
     )
     start = width if control is not None and control.interpolated else 0
     return max(width, start + stage.model.controls), start
+
+
+def events_of(
+    stage: Stage, found: Found, block: Block, context: Context, settings: Floats
+) -> tuple[FilterEvents, Booleans]:
+    """Return what `filter_events` does, which may be known from an earlier replay of the block."""
+    drives = () if found.control is None else (found.control.name,)
+    read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
+    origins = None if context.origins is None else context.origins.tobytes()
+    noise = settings.tobytes() if any(sensor.covariance for sensor in stage.sensors) else b""
+    key = stage, drives, *read, *context.points.values(), origins, noise
+    return block.once(key, lambda: filter_events(stage, found, block, context, settings))
 
 
 def filter_events(
@@ -285,3 +298,62 @@ def _computed(read: Callable[[Stream], Any], ragged: Ragged, components: int) ->
             f"{len(ragged)} messages; ({len(ragged)}, {components}) is needed"
         )
     return numbers
+
+
+def not_driven(name: str, control: Control, found: Found, events: FilterEvents) -> Ragged:
+    """List measurements that were skipped in a gap of the control.
+
+    Args:
+        name: of the filter.
+        control: an interpolated one, which is NaN in its gaps.
+        found: its topics.
+        events: with the control.
+    """
+    in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
+    reasons = [
+        f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
+        f"{control.gap}"
+        for _, topic in found.sensors
+    ]
+    stream = reason_stream(
+        f"/estimates/{name}/skipped",
+        schemas.SKIPPED,
+        events.time_ns[in_gap],
+        events.source[in_gap],
+        reasons,
+    )
+    return Ragged(stream, ragged_rows(in_gap, events.offsets))
+
+
+def passed_over(
+    name: str, stage: Stage, found: Found, block: Block, without_covariance: Booleans
+) -> list[Ragged]:
+    """List messages that were skipped since they lack a covariance, if any topic may.
+
+    Args:
+        name: of the filter.
+        stage: the model with the sensors at hand.
+        found: its topics.
+        block: their messages.
+        without_covariance: which of these (n,) have none.
+    """
+    control = stage.model.control
+    drops_controls = control is not None and control.interpolated
+    if not drops_controls and not any(sensor.covariance for sensor in stage.sensors):
+        return []
+    sensors = {topic.name: sensor for sensor, topic in found.sensors}
+    reasons = [
+        complaint_of(stage.model, sensors[topic], topic)
+        if topic in sensors
+        else f"topic {topic}: it is not finite"
+        for topic in block.streams
+    ]
+    merged = block.events
+    stream = reason_stream(
+        f"/estimates/{name}/skipped",
+        schemas.SKIPPED,
+        merged.time_ns[without_covariance],
+        merged.topic[without_covariance],
+        reasons,
+    )
+    return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]

@@ -1,7 +1,7 @@
 """Runs a filter in a replay: one model by one method, bound to the topics of a log."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -9,23 +9,31 @@ import numpy as np
 
 from recorders.log import Topic, schemas
 from recorders.log.planes import FRAME
+from recorders.log.streams import computed_stream
 from replay.distributions import chi2
-from replay.engine.arrays import Booleans, Floats, Function, Integers
+from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.compiling.scratch import Scratch
 from replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
-from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.geodetic import origins_of
 from replay.engine.streams.priors import gaussians
-from replay.engine.streams.results import ALL_WELL, failures_of, state_stream
+from replay.engine.streams.results import ALL_WELL, failures_of, named, rows_of, wrapped
 from replay.inference.kalman.methods import Method
 from replay.inference.kalman.steps import FAILURES, NOT_STARTED, Gaussian, Steps
 from replay.inference.kalman.update import innovation_components
 from replay.inference.linear_algebra.covariances import Form
 from replay.inference.model.binding import Found
 from replay.inference.model.parameters import number_fields
-from replay.inference.model.settings import complaint_of, placed_settings, reading_settings
+from replay.inference.model.settings import placed_settings, reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import Context, data_columns, filter_events, points_of
+from replay.inference.run.events import (
+    Context,
+    data_columns,
+    events_of,
+    not_driven,
+    passed_over,
+    points_of,
+)
 from replay.inference.run.out_of_sequence import issued
 from replay.inference.run.recursion import (
     Estimates,
@@ -142,7 +150,10 @@ class Filter:
         belief = Gaussian(mean, self.form.start(covariance))
         carried = RecursionState(belief, control, time_ns, accepted_ns, started)
         maps = {each.topic: each for sensor in self.stage.sensors for each in sensor.maps}
-        points = {topic: points_of(static[topic], asked) for topic, asked in maps.items()}
+        points = {
+            topic: static[topic].findings.once(asked, partial(points_of, static[topic], asked))
+            for topic, asked in maps.items()
+        }
         waiting = None
         if model.control is not None and model.control.interpolated:  # what drives from there on
             runs, (width, _) = np.arange(len(mean) + 1), data_columns(self.stage)
@@ -150,10 +161,15 @@ class Filter:
         context = Context(points, self.origins(static, len(mean)))
         return FilterState(carried, context, (), waiting, np.zeros(len(mean), np.int64))
 
+    @cached_property
+    def steps(self) -> Steps:
+        """Return the steps of its loop."""
+        return _steps(self.stage, self.method)
+
     @property
     def form(self) -> Form:
         """What stands for covariances in what it carries."""
-        return _steps(self.stage, self.method).form
+        return self.steps.form
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:
         """Find the origins of the planes (runs, 3), see `Context`: as stated, else the first fixes."""
@@ -168,12 +184,12 @@ class Filter:
 
     def run(self, state: FilterState, block: Block) -> tuple[FilterState, list[Ragged]]:
         """Filter a block."""
-        events, without_covariance = filter_events(
+        events, without_covariance = events_of(
             self.stage, self.found, block, state.context, self.settings
         )
-        passed_over = self.passed_over(block, without_covariance)
+        skipped = passed_over(self.name, self.stage, self.found, block, without_covariance)
         after, made = self.through(state, events, is_end=False)
-        return after, [*made, *passed_over]
+        return after, [*made, *skipped]
 
     def through(
         self, state: FilterState, events: FilterEvents, *, is_end: bool
@@ -196,50 +212,10 @@ class Filter:
             events = fill_control(self.stage, events)
         state = state._replace(waiting=waiting, next_output=next_output, unsettled=unsettled)
         state, made = self.follow(state, events)
-        return state, [*made, *self.not_driven(events)]
-
-    def not_driven(self, events: FilterEvents) -> list[Ragged]:
-        """List measurements that were skipped in a gap of the control, where that may have some."""
         control = self.stage.model.control
-        if control is None or not control.gap or not _steps(self.stage, self.method).resumes_after_gap:
-            return []
-        in_gap = (events.source >= 0) & np.isnan(events.data[:, -1])
-        reasons = [
-            f"topic {topic.name}: nothing is known while {control.topic} is silent for longer than "
-            f"{control.gap}"
-            for _, topic in self.found.sensors
-        ]
-        stream = reason_stream(
-            f"/estimates/{self.name}/skipped",
-            schemas.SKIPPED,
-            events.time_ns[in_gap],
-            events.source[in_gap],
-            reasons,
-        )
-        return [Ragged(stream, ragged_rows(in_gap, events.offsets))]
-
-    def passed_over(self, block: Block, without_covariance: Booleans) -> list[Ragged]:
-        """List messages that were skipped since they lack a covariance, if any topic may."""
-        control = self.stage.model.control
-        drops_controls = control is not None and control.interpolated
-        if not drops_controls and not any(sensor.covariance for sensor in self.stage.sensors):
-            return []
-        sensors = {topic.name: sensor for sensor, topic in self.found.sensors}
-        reasons = [
-            complaint_of(self.stage.model, sensors[topic], topic)
-            if topic in sensors
-            else f"topic {topic}: it is not finite"
-            for topic in block.streams
-        ]
-        merged = block.events
-        stream = reason_stream(
-            f"/estimates/{self.name}/skipped",
-            schemas.SKIPPED,
-            merged.time_ns[without_covariance],
-            merged.topic[without_covariance],
-            reasons,
-        )
-        return [Ragged(stream, ragged_rows(without_covariance, merged.offsets))]
+        if control is None or not control.gap or not self.steps.resumes_after_gap:
+            return state, made
+        return state, [*made, not_driven(self.name, control, self.found, events)]
 
     def finish(self, state: FilterState) -> list[Ragged]:
         """Filter what still waits for messages that do not come any more."""
@@ -287,7 +263,7 @@ class Filter:
             return f"{control.topic} is interpolated, so that messages wait for the next one of it"
         if self.delays_ns.any():
             return "its messages are put where they were measured, and wait for each other"
-        if any(each.redrawn for each in self.samplers):
+        if self.is_random:
             return "its samples are random, so that a message that is used again gets others"
         return ""
 
@@ -302,25 +278,29 @@ class Filter:
     ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
         """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
         sensors = self.stage.sensors
-        loop, steps = _compiled(self.stage, self.method)
+        loop, _ = _compiled(self.stage, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
         due = ragged_rows(events.wants_estimate, events.offsets)
         recorded = ragged_rows(events.source >= 0, events.offsets)
-        innovation_size = len(innovation_components(sensors))
+        innovation_size = len(self.measured)
         estimates, innovations = self.no_results(due, recorded, innovation_size)
-        if innovation_size > min((len(sensor.measured) for sensor in sensors), default=innovation_size):
+        if any(len(sensor.measured) < innovation_size for sensor in sensors):
             innovations.difference[:], innovations.covariance[:] = np.nan, np.nan
         settings, generators = self.settings_of_runs(state.context, runs), state.generators
-        if any(each.redrawn for each in self.samplers):
+        if self.is_random:
             generators = seeded_generators(generators, events, len(self.samplers), self.parameters.seed)
-        for part, sets in self.sets(generators, events):
+        for part, scratch in self.parts(generators, events):
+            inputs = RunInputs(events, settings, self.gates)
+            results = RunResults(estimates, innovations)
+            if part is None:
+                loop(runs, inputs, carried, results, scratch=scratch)
+                continue
             own = events._replace(offsets=events.offsets[part.start : part.stop + 1])
             inputs = RunInputs(own, settings[part], self.gates)
             ends = estimates.end[part], innovations.end[part]
             results = RunResults(estimates._replace(end=ends[0]), innovations._replace(end=ends[1]))
-            memory = partial(steps.memory, sets)
-            loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=memory)
+            loop(part.stop - part.start, inputs, of_runs(carried, part), results, scratch=scratch)
         made = [self.innovations(*filled(innovations, recorded))] if sensors else []
         if (carried.failure != before.failure).any():
             failures = before.failure, carried.failure, carried.time_ns, FAILURES
@@ -328,11 +308,26 @@ class Filter:
         after = state._replace(carried=carried, generators=generators)
         return after, filled(estimates, due), made
 
-    def sets(
+    def parts(
         self, generators: tuple[Any, ...], events: FilterEvents
-    ) -> Iterator[tuple[slice, tuple[Any, ...]]]:
-        """Iterate over runs and the samples of all functions for them."""
-        return sample_sets(self.samplers, generators, events.offsets)
+    ) -> Iterator[tuple[slice | None, Function]]:
+        """Iterate over runs, None for all, and what makes the memory of a core with their samples."""
+        if not self.is_random:
+            yield None, self.scratch
+            return
+        for part, sets in sample_sets(self.samplers, generators, events.offsets):
+            yield part, partial(self.steps.memory, sets)
+
+    @cached_property
+    def is_random(self) -> bool:
+        """Tell whether its samples are drawn, for every event anew."""
+        return any(each.redrawn for each in self.samplers)
+
+    @cached_property
+    def scratch(self) -> Scratch:
+        """Make the memory of cores, with samples that serve every event."""
+        [(_, sets)] = sample_sets(self.samplers, (), np.zeros(1, np.int64))
+        return Scratch(partial(self.steps.memory, sets))
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
@@ -363,23 +358,31 @@ class Filter:
 
     def states(self, estimates: Estimates, offsets: Integers) -> Ragged:
         """Make the stream of states; run r owns offsets[r]:offsets[r + 1]."""
-        model = self.stage.model
-        stream = state_stream(
-            f"/estimates/{self.name}/{model.output}",
-            estimates.time_ns,
-            model.state,
-            self.truth,
-            estimates.mean,
-            estimates.covariance,
-        )
-        if self.found.frame:
-            stream = replace(stream, metadata={**stream.metadata, FRAME: self.found.frame})
-        return Ragged(stream, offsets)
+        model, (_, time_ns, mean, covariance) = self.stage.model, estimates
+        columns = {
+            "sensor_time_ns": time_ns,
+            "mean": wrapped(mean, model.state),
+            "covariance": rows_of(covariance),
+        }
+        topic, metadata = f"/estimates/{self.name}/{model.output}", self.state_metadata
+        schema = schemas.GAUSSIAN_ESTIMATE
+        return Ragged(computed_stream(topic, schema, time_ns, columns, metadata), offsets)
+
+    @cached_property
+    def state_metadata(self) -> Mapping[str, str]:
+        """Return what the channel of the states says."""
+        frame = {FRAME: self.found.frame} if self.found.frame else {}
+        return {**named(self.stage.model.state), "truth": self.truth, **frame}
+
+    @cached_property
+    def measured(self) -> Mapping[str, str]:
+        """Return the components of all innovations."""
+        return innovation_components(self.stage.sensors)
 
     def innovations(self, innovations: Innovations, offsets: Integers) -> Ragged:
         """Make the stream of innovations, which needs a sensor; see `states`."""
-        topic, components = f"/estimates/{self.name}", innovation_components(self.stage.sensors)
-        return recorded_innovations(topic, components, self.truth, innovations, offsets)
+        topic = f"/estimates/{self.name}"
+        return recorded_innovations(topic, self.measured, self.truth, innovations, offsets)
 
 
 @lru_cache(maxsize=64)

@@ -25,7 +25,7 @@ from replay.inference.model.model import Model
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, title_of
-from replay.inference.run.events import filter_events
+from replay.inference.run.events import filter_events, passed_over
 from replay.inference.run.history import (
     History,
     KeptMessages,
@@ -258,7 +258,8 @@ class OutOfSequenceFilter:
         if (carried.failure != state.carried.failure).any():
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
-        made += [self.reprocessed(events, repeated), *inner.passed_over(block, without_covariance)]
+        skipped = passed_over(inner.name, inner.stage, inner.found, block, without_covariance)
+        made += [self.reprocessed(events, repeated), *skipped]
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:

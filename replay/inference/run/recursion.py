@@ -7,14 +7,17 @@ belief is no Gaussian any more.
 
 import math
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recorders.log import schemas
+from recorders.log.streams import computed_stream
 from replay.engine.streams.blocks import Ragged, filled_rows
-from replay.engine.streams.results import ALL_WELL, InnovationColumns, innovation_stream
+from replay.engine.streams.results import ALL_WELL, named, rows_of
 from replay.inference.kalman.steps import (
     NOT_DRIVEN,
     NOT_FINITE,
@@ -126,17 +129,19 @@ def recorded_innovations(
     topic: str, components: Mapping[str, str], truth: str, innovations: Innovations, offsets: Integers
 ) -> Ragged:
     """Make the stream of innovations that a recursion filled in; run r has offsets[r]:offsets[r + 1]."""
-    numbers = innovations.numbers
-    columns = InnovationColumns(
-        innovations.time_ns,
-        innovations.target_id,
-        numbers[:, 2].astype(np.uint32),
-        innovations.difference,
-        innovations.covariance,
-        numbers[:, 0],
-        numbers[:, 1],
-    )
-    return Ragged(innovation_stream(f"{topic}/innovation", components, truth, columns), offsets)
+    _, time_ns, target_id, difference, covariance, numbers = innovations
+    columns: dict[str, NDArray] = {
+        "sensor_time_ns": time_ns,
+        "target_id": target_id,
+        "accepted": numbers[:, 2].astype(np.uint32),
+        "innovation": difference,
+        "covariance": rows_of(covariance),
+        "normalised_innovation_squared": numbers[:, 0],
+        "log_likelihood": numbers[:, 1],
+    }
+    topic, metadata = f"{topic}/innovation", {**named(components), "truth": truth}
+    stream = computed_stream(topic, schemas.INNOVATION, time_ns, columns, metadata)
+    return Ragged(stream, offsets)
 
 
 ResultsType = TypeVar("ResultsType", bound=tuple[Any, ...])
@@ -156,19 +161,10 @@ def no_results(
         model: the model, for the sizes of its state and tangent space.
         innovation_size: how many components the sensors measure together.
     """
-    n, t = model.size, model.tangent
-    shapes = [
-        *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
-        *(
-            (int(recorded[-1]), *shape)
-            for shape in ((), (), (innovation_size,), (innovation_size, innovation_size), (3,))
-        ),
-    ]
-    ends = list(accumulate(map(math.prod, shapes), initial=0))
-    memory = np.empty(ends[-1])
+    places = _places(int(due[-1]), int(recorded[-1]), model.size, model.tangent, innovation_size)
+    memory = np.empty(places[-1][0].stop)
     time_ns, mean, covariance, noted_ns, target_id, difference, spread, numbers = (
-        memory[begin:end].reshape(shape)
-        for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
+        memory[place].reshape(shape) for place, shape in places
     )
     estimates = Estimates(due[:-1].copy(), time_ns.view(np.int64), mean, covariance)
     reference = target_id.view(np.uint32)[: len(target_id)]
@@ -176,6 +172,19 @@ def no_results(
         recorded[:-1].copy(), noted_ns.view(np.int64), reference, difference, spread, numbers
     )
     return estimates, innovations
+
+
+@lru_cache(maxsize=64)
+def _places(
+    estimates: int, innovations: int, n: int, t: int, m: int
+) -> tuple[tuple[slice, tuple[int, ...]], ...]:
+    """Return where the columns of so many estimates and innovations lie in memory, and their shapes."""
+    shapes = (
+        *((estimates, *shape) for shape in ((), (n,), (t, t))),
+        *((innovations, *shape) for shape in ((), (), (m,), (m, m), (3,))),
+    )
+    ends = accumulate(map(math.prod, shapes), initial=0)
+    return tuple((slice(*both), shape) for both, shape in zip(pairwise(ends), shapes, strict=True))
 
 
 def filled(results: ResultsType, offsets: Integers) -> tuple[ResultsType, Integers]:

@@ -156,9 +156,9 @@ class BoundFilter(Filter):
         failures = [each for each in made if each.stream.schema is schemas.FAILURE]
         return after._replace(generators=()), nodes, failures
 
-    def sets(self, generators: tuple[Any, ...], events: FilterEvents) -> Any:
-        """Return all runs, and the truths."""
-        yield slice(0, len(events.offsets) - 1), generators
+    def parts(self, generators: tuple[Any, ...], events: FilterEvents) -> Any:  # noqa: ARG002
+        """Return all runs, and what makes a core's memory with the truths."""
+        yield None, partial(self.steps.memory, generators)
 
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int

@@ -5,17 +5,16 @@ is small, and a lever l for which e_k - R(h_k) l is. What is kept are sums, whic
 """
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from replay.judging.errors.evaluation import Errors, Floats
+from replay.judging.errors.evaluation import Errors, Floats, errors_at
 
 SHARE = 0.5  # of the mean squared error, from which on a constant makes the most of it
 HALVED = 0.5  # NEES without the constant, as a share of NEES with it
 EXPLAINED, TENTH = 5.0, 0.1  # and what it is then: so much of each component, or a tenth
 DRIFTS = 0.5  # share of the rest that a line in time takes away: the error grows, and is not constant
-AXES = 3
 
 
 class Constant(NamedTuple):
@@ -37,44 +36,46 @@ class Constant(NamedTuple):
 
 @dataclass
 class FrameSums:
-    """Sums of errors e (n, 3) with weights W = P^-1 and times t in one frame; unused axes are zero.
+    """Sums of errors e (axes, n) with weights W = P^-1 (axes, axes, n) and times t (n,) in one frame.
 
     Attributes:
         count: n.
-        error, weighted: (3,) of e and W e.
-        weight: (3, 3) of W.
+        error, weighted: (axes,) of e and W e.
+        weight: (axes, axes) of W.
         squared, nees: of e' e and e' W e.
-        time: of t and t^2.
-        timed: (3,) of t e.
+        time, time_squared: of t and t^2.
+        timed: (axes,) of t e.
     """
 
     count: int = 0
-    error: Floats = field(default_factory=lambda: np.zeros(AXES))
-    weighted: Floats = field(default_factory=lambda: np.zeros(AXES))
-    weight: Floats = field(default_factory=lambda: np.zeros((AXES, AXES)))
+    error: Any = 0.0
+    weighted: Any = 0.0
+    weight: Any = 0.0
     squared: float = 0.0
     nees: float = 0.0
-    time: Floats = field(default_factory=lambda: np.zeros(2))
-    timed: Floats = field(default_factory=lambda: np.zeros(AXES))
+    time: float = 0.0
+    time_squared: float = 0.0
+    timed: Any = 0.0
 
     def add(self, error: Floats, weight: Floats, time_s: Floats) -> None:
-        """Take in errors (n, 3), weights (n, 3, 3) and times (n,)."""
-        weighted = np.einsum("nij,nj->ni", weight, error)
-        self.count += len(error)
-        self.error = self.error + error.sum(axis=0)
-        self.weighted = self.weighted + weighted.sum(axis=0)
-        self.weight = self.weight + weight.sum(axis=0)
-        self.squared += float(np.sum(error**2))
-        self.nees += float(np.sum(error * weighted))
-        self.time = self.time + np.array([time_s.sum(), np.sum(time_s**2)])
-        self.timed = self.timed + time_s @ error
+        """Take in errors, weights and times."""
+        weighted = np.einsum("ijn,jn->in", weight, error)
+        self.count += error.shape[1]
+        self.error = self.error + error.sum(axis=1)
+        self.weighted = self.weighted + weighted.sum(axis=1)
+        self.weight = self.weight + weight.sum(axis=2)
+        self.squared += float(np.vdot(error, error))
+        self.nees += float(np.vdot(error, weighted))
+        self.time += float(time_s.sum())
+        self.time_squared += float(time_s @ time_s)
+        self.timed = self.timed + error @ time_s
 
     def merge(self, other: "FrameSums") -> None:
         """Take in the sums of other runs."""
         for name, value in vars(other).items():
             setattr(self, name, getattr(self, name) + value)
 
-    def constant(self, size: int, *, turns: bool) -> Constant | None:
+    def constant(self, *, turns: bool) -> Constant | None:
         """The mean error, where it makes most of the error, is constant, and NEES tells it."""
         if not self.count or not self.squared:
             return None
@@ -82,49 +83,43 @@ class FrameSums:
         nees = self.nees / self.count
         rest = nees + (mean @ self.weight @ mean - 2.0 * mean @ self.weighted) / self.count
         left = self.squared - self.count * mean @ mean
-        spread = self.time[1] - self.time[0] ** 2 / self.count
-        slope = self.timed - self.time[0] * mean
+        spread = self.time_squared - self.time**2 / self.count
+        slope = self.timed - self.time * mean
         drifts = spread > 0.0 and slope @ slope > DRIFTS * spread * left
         share = self.count * float(mean @ mean) / self.squared
-        explains = rest < HALVED * nees and rest < max(EXPLAINED * size, TENTH * nees)
+        explains = rest < HALVED * nees and rest < max(EXPLAINED * len(mean), TENTH * nees)
         if share <= SHARE or drifts or not explains:
             return None
-        return Constant(turns, mean[:size], share, nees, max(float(rest), 0.0))
+        return Constant(turns, mean, share, nees, max(float(rest), 0.0))
 
 
 @dataclass
 class ConstantSums:
     """Sums of one estimate stream's errors of position, as they stand and as seen from the body."""
 
-    size: int = 0
     fixed: FrameSums = field(default_factory=FrameSums)
     turned: FrameSums = field(default_factory=FrameSums)
 
     def add(self, errors: Errors) -> None:
         """Take in a block; a bound has no errors, and what has no position no origin."""
-        self.size = len(errors.position)
-        if errors.is_bound or self.size < 2:
-            return
-        known = np.isfinite(errors.nees) & np.isfinite(errors.covariance).all(axis=(1, 2))
         place = errors.position
-        error, weight = np.zeros((known.sum(), AXES)), np.zeros((known.sum(), AXES, AXES))
-        error[:, : self.size] = errors.error[known][:, place]
-        block = errors.covariance[known][:, place][:, :, place]
-        weight[:, : self.size, : self.size] = np.linalg.inv(block)
-        time_s = errors.elapsed_s[known]
+        if errors.is_bound or len(place) < 2:
+            return
+        known = np.isfinite(errors.nees)
+        if not known.all():
+            errors = errors_at(errors, known)
+        error = np.array([errors.error[:, axis] for axis in place])
+        weight = _inverse(np.array([[errors.covariance[:, i, j] for j in place] for i in place]))
+        time_s = errors.elapsed_s
         self.fixed.add(error, weight, time_s)
         if errors.heading_rad is not None:
-            turn = np.zeros_like(weight)
-            turn[:, 0, 0] = turn[:, 1, 1] = np.cos(errors.heading_rad[known])
-            turn[:, 0, 1] = -np.sin(errors.heading_rad[known])
-            turn[:, 1, 0] = -turn[:, 0, 1]
-            turn[:, 2, 2] = 1.0
-            back = turn.transpose(0, 2, 1)
-            self.turned.add(np.einsum("nij,nj->ni", back, error), back @ weight @ turn, time_s)
+            cosine, sine = np.cos(errors.heading_rad), np.sin(errors.heading_rad)
+            rows = _turned(weight, cosine, sine)
+            both = _turned(rows.swapaxes(0, 1), cosine, sine)
+            self.turned.add(_turned(error, cosine, sine), both, time_s)
 
     def merge(self, other: "ConstantSums") -> None:
         """Take in the sums of other runs."""
-        self.size = max(self.size, other.size)
         self.fixed.merge(other.fixed)
         self.turned.merge(other.turned)
 
@@ -133,8 +128,27 @@ class ConstantSums:
 
         Of a body that never turns it is not known, and counts as that of another origin.
         """
-        fixed = self.fixed.constant(self.size, turns=False)
-        turned = self.turned.constant(self.size, turns=True)
+        fixed, turned = self.fixed.constant(turns=False), self.turned.constant(turns=True)
         if fixed is None or turned is None:
             return fixed or turned
         return turned if turned.share > fixed.share else fixed
+
+
+def _inverse(covariance: Floats) -> Floats:
+    """The inverses of covariances (axes, axes, n); an infinite variance weighs nothing."""
+    if len(covariance) > 2:
+        finite = np.where(np.isfinite(covariance), covariance, 1e300)
+        return np.moveaxis(np.linalg.inv(np.moveaxis(finite, 2, 0)), 0, 2)
+    (a, b), (_, c) = covariance
+    if not np.isfinite(a + c).all():
+        a, c = (np.where(np.isfinite(each), each, 1e150) for each in (a, c))
+        b = np.where(np.isfinite(b), b, 0.0)
+    return np.array([[c, -b], [-b, a]]) / (a * c - b * b)
+
+
+def _turned(vector: Floats, cosine: Floats, sine: Floats) -> Floats:
+    """Vectors (axes, ..., n) as seen from bodies with these headings (n,)."""
+    turned = vector.copy()
+    turned[0] = cosine * vector[0] + sine * vector[1]
+    turned[1] = cosine * vector[1] - sine * vector[0]
+    return turned

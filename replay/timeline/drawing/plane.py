@@ -42,8 +42,8 @@ CLOUD_POINTS = 100_000
 PARTICLE_PX = 1.5
 # What is left free beside the places, as a share of their side, or of so much of the longer one.
 MARGIN, LEAST_SIDE = 0.07, 0.3
-# A legend has room for so many entries, one below another.
-LEGEND_ROWS = 14
+# A legend has room for so many entries, one below another; names are centred so far from the left.
+LEGEND_ROWS, LEGEND_INDENT = 14, 0.05
 # Points closer than this share of the map's extent share one label.
 LABEL_SHARE = 0.04
 
@@ -296,7 +296,8 @@ def draw_legend(canvas: Canvas, entity: str, entries: Mapping[str, Colour], plac
     """What colours stand for in a view of places (n, 2): a dot with its name each, at the left edge."""
     low, high = bounds_of(places)
     step = (high[1] - low[1]) / LEGEND_ROWS
-    at = [(low[0], high[1] - (row + 0.5) * step) for row in range(len(entries))]
+    left = low[0] + LEGEND_INDENT * (high[0] - low[0])
+    at = [(left, high[1] - (row + 0.5) * step) for row in range(len(entries))]
     radii = rr.Radius.ui_points(5.0)
     dots = rr.Points2D(
         at, labels=[*entries], colors=[*entries.values()], radii=radii, show_labels=True, draw_order=30.0

@@ -35,6 +35,8 @@ from replay.timeline.drawing.canvas import (
 SIGMAS = 2.0
 # What a legend takes of a plot's height: for itself, for each entry, and at most.
 LEGEND_MARGIN, LEGEND_ENTRY, LEGEND_MOST = 0.1, 0.1, 0.6
+# The same in the low panels of NEES and NIS.
+SMALL_ENTRY, SMALL_MOST = 0.15, 0.7
 # Where plots of shares and probabilities end, below their legends.
 SHARES = 1.5
 WHOLE_RUN = rrb.TimeAxis(
@@ -177,19 +179,20 @@ def _draw_squares(
                 _mark_above(canvas, plot, estimator, colour, time_ns[above], end)
                 counted.append(f"{estimator} {np.count_nonzero(above)} of {len(values)}")
         title = f"{name} of {of or f'{degrees} component' + 's' * (degrees != 1)}"
-        title += f"; 95 % are below {high:.3g}" if end > 2.5 * high else ""
+        title += f"; 95 % are below {high:.3g}" if high < 0.2 * end else ""
         title += f"; above {end:.3g}: {', '.join(counted)}" if counted else ""
         views.append(plot_view(plot, title, (-0.1 * end, end), legend=legend, zoom_lock=not counted))
     return views
 
 
 def _end_of(high: float, values: Sequence[Floats]) -> float:
-    """Where a panel of chi-square values ends whose band ends at `high`."""
+    """Where a panel of chi-square values ends whose band, below the legend, ends at `high`."""
+    room = min(LEGEND_MARGIN + SMALL_ENTRY * (1 + len(values)), SMALL_MOST)
     medians = [np.median(each[np.isfinite(each)]) for each in values if np.isfinite(each).any()]
     if not medians or min(medians) <= high:
-        return 2.5 * high
+        return high * max(2.5, 1.05 / (1.0 - room))
     best = values[int(np.argmin(medians))]
-    return nice(1.5 * max(float(np.quantile(best[np.isfinite(best)], 0.99)), high))
+    return nice(max(float(np.quantile(best[np.isfinite(best)], 0.99)), high) / (1.0 - room))
 
 
 def _mark_above(

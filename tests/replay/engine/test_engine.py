@@ -1,5 +1,6 @@
 """The replay: ensembles, blocks, files and memory give the same numbers, bit for bit."""
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +32,7 @@ LATE = {
     "range": {"rate_hz": 5.0},
     "bearing": {"rate_hz": 10.0, "latency_s": 0.05, "stamp_offset_s": -0.1},
 }
+CLOCKS: tuple[Clock, ...] = ("publish_time", "log_time")
 # Runs of one ensemble whose schedules have nothing in common.
 SCHEDULES = [
     {},
@@ -88,6 +90,18 @@ def test_an_ensemble_is_its_runs_alone(
         assert_equal(of_run(together, run), of_run(single, 0))
     poses = together["/estimates/ekf/robot1/pose"]
     assert np.all(np.diff(poses.offsets) > 50)
+
+
+def test_what_an_ensemble_keeps_changes_no_replay():
+    """Replayed again, by either clock, with other settings between, and after it went to a worker."""
+    ensemble = Ensemble([record(0, **LATE)])
+    wanted = {order: of_run(replayed([record(0, **LATE)], order), 0) for order in CLOCKS}
+    for order in (*CLOCKS, *CLOCKS):
+        collect(replay(ensemble, bind("ekf", ensemble, {"gate_probability": 0.5}), order=order))
+        assert_equal(of_run(replayed(ensemble, order), 0), wanted[order])
+    assert bind("ekf", ensemble, {}) == bind("ekf", ensemble, {})
+    sent = pickle.loads(pickle.dumps(ensemble))
+    assert_equal(of_run(replayed(sent), 0), wanted["publish_time"])
 
 
 @pytest.fixture(scope="module")

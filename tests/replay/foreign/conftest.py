@@ -44,9 +44,14 @@ def compile_filter(tmp_path_factory: pytest.TempPathFactory) -> Compile:
 def nothing_left() -> Iterator[None]:
     """No process of a filter is left behind."""
     own = psutil.Process(os.getpid())
-    before = {each.pid for each in own.children(recursive=True)}
+
+    def living() -> set[int]:
+        found = own.children(recursive=True)
+        return {each.pid for each in found if each.status() != psutil.STATUS_ZOMBIE}
+
+    before = living()
     yield
     began = time.monotonic()
-    while {each.pid for each in own.children(recursive=True)} - before:
+    while living() - before:
         assert time.monotonic() < began + 20.0, "a filter's process is still there"
         time.sleep(0.05)

@@ -11,7 +11,6 @@ from fuselog import BadInput
 from pipeline.checking.golden import golden_of
 from pipeline.checking.stored import write
 from pipeline.command_line.process import main
-from pipeline.output.results import read_result
 from tests.replay.foreign.conftest import EXAMPLES, Compile
 
 MINE = "lib:./robot_ekf.so"
@@ -27,33 +26,31 @@ def here(compile_filter: Compile, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     return tmp_path
 
 
-def test_commands(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Tuned, diagnosed, compared, held back for late messages, run by workers, swept."""
-    free = ["--free", "sigma_range_m", "--set", "sigma_range_m=0.3", "--out", "tuned"]
-    assert main(["tune", "run.mcap", "-e", MINE, *free]) == 0
-    assert main(["replay", "run.mcap", "-e", MINE, "--settings", "tuned/settings.toml"]) == 0
-    capsys.readouterr()
-    biased = ["--set", "bias_range_m=1.0", "--set", "in_process=true"]
-    assert main(["diagnose", "run.mcap", "-e", MINE, *biased, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["hypotheses"] > 2
-    assert main(["compare", "run.mcap", "-e", MINE, "-e", "ekf", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["differences"]
-    assert {row["verdict"] for row in rows} <= {"unclear", "no difference"}
-    late = ["--arrival-order", "--late", "wait:0.1"]
-    assert main(["replay", "run.mcap", "-e", MINE, "-e", "ekf", "-o", "late.mcap", *late]) == 0
+def test_what_ours_have(here: Path) -> None:
+    """Tuned, diagnosed, compared, held back for late messages, and run by workers."""
+    mine = {"kind": "lib", "path": "robot_ekf.so", "in_process": True}
+    tuned = [
+        fl.tune("run.mcap", each, "sigma_range_m", set={"sigma_range_m": 0.3, "gate_probability": 1.0})
+        for each in ({"mine": mine}, "ekf")
+    ]
+    values = [found.parameters["value"].tolist() for found in tuned]
+    assert values[0] == pytest.approx(values[1], rel=1e-3)
+    found = fl.diagnose("run.mcap", {"mine": mine}, set={"bias_range_m": 1.0})
+    assert found.sentences
+    assert found.hypotheses > 2
+    compared = fl.compare("run.mcap", estimators=[{"mine": mine}, "ekf"])
+    assert set(compared.table["verdict"]) <= {"unclear", "no difference"}
+    late = {"arrival_order": True, "late": "wait:0.1"}
+    done = fl.replay("run.mcap", {"mine": mine, "ekf": {"gate_probability": 1.0}}, **late)
+    rmse = done.metrics.set_index("quantity").loc["position_rmse_m", "value"]
+    assert rmse.iloc[0] == pytest.approx(rmse.iloc[1], rel=1e-9)
     Path("own.toml").write_text(
         'title = "mine"\nruns = 4\n[record]\nscenario = "landmarks"\nparameters = {duration_s = 2.0}\n'
         '[estimators.mine]\nkind = "lib"\npath = "robot_ekf.so"\n'
         "[estimators.ekf]\ngate_probability = 1.0\n"
     )
-    assert main(["run", "own.toml", "--workers", "2", "--out", "two"]) == 0
-    made = read_result(Path("two")).metrics
+    made = fl.run("own.toml", workers=2, out="two").result.metrics
     assert made["mine.nees.robot1"] == pytest.approx(made["ekf.nees.robot1"], rel=1e-9)
-    sweep = ["sweep", "own.toml", "--over", "mine.sigma_range_m=0.1,0.4", "--runs", "2", "--json"]
-    capsys.readouterr()
-    assert main(sweep) == 0
-    found = json.loads(capsys.readouterr().out)["metrics"]["mine.position_rmse_m.robot1"]
-    assert found[0] < found[1]
 
 
 CRAFTED = {"mine": {"kind": "exec", "command": "touch stolen"}}
@@ -96,6 +93,17 @@ def test_a_golden_of_a_foreign_filter(here: Path) -> None:
     assert main([*check, "--update", "-e", MINE]) == 0
     assert main(check) == 2
     assert main([*check, "--allow-programs"]) == 0
+
+
+def test_settings_with_the_program_that_is_named(here: Path) -> None:
+    """As `fuselog tune` writes them: they say nothing that was not named."""
+    Path("tuned.toml").write_text(
+        '[robot_ekf]\nkind = "lib"\npath = "./robot_ekf.so"\nbias_range_m = 1.0\n'
+    )
+    replay = ["replay", "run.mcap", "-o", "est.mcap", "--settings", "tuned.toml"]
+    assert main([*replay, "-e", MINE]) == 0
+    Path("other.so").write_bytes(Path("robot_ekf.so").read_bytes())
+    assert main([*replay, "-e", "robot_ekf"]) == 2
 
 
 def test_estimates_that_name_a_program_are_judged_without_it(here: Path) -> None:

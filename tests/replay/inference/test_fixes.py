@@ -1,5 +1,6 @@
 """Position fixes, in the plane and on the ellipsoid, as sensors of any model that has a position."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from replay.engine.streams.blocks import gather
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.geodetic import in_plane
 from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.model.binding import topics_of
 from replay.inference.model.model import Model, Motion
 from replay.inference.model.parameters import ModelParameters
 from tests.replay.inference.replays import bound, outputs
@@ -232,3 +234,15 @@ def test_a_topic_may_stand_for_another(uncompiled: None) -> None:
         with pytest.raises(BadInput, match=words):
             bound(PLANE, "ekf", [source], topics=names)
     assert bound(PLANE, "ekf", [log(PLANE, fix)], topics={"fix": ""}) == []
+
+
+def test_what_nothing_drives_is_one_thing_unless_something_is_there_twice() -> None:
+    """A prior beside a receiver's namespace; with a second receiver nobody knows whose is whose."""
+    spread = np.ones((6, 2))
+    fix = fixes(np.zeros((6, 2)), spread)
+    first, second = (replace(fix, topic=f"/{name}/fix") for name in ("gps", "radar"))
+    [found] = topics_of(PLANE, log(PLANE, first).topics)
+    assert (found.prefix, [topic.name for _, topic in found.sensors]) == ("", ["/gps/fix"])
+    assert topics_of(PLANE, log(PLANE, first, second).topics) == []
+    [chosen] = topics_of(PLANE, log(PLANE, first, second).topics, {"fix": "/radar/fix"})
+    assert [topic.name for _, topic in chosen.sensors] == ["/radar/fix"]

@@ -27,6 +27,7 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import kalman_update
 from replay.inference.linear_algebra.gaussian import cholesky
+from replay.inference.linear_algebra.sparse import pattern_of, propagating_covariance
 from replay.inference.model.model import Control, Map, Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
 from replay.inference.model.stage import Stage, stage_of
@@ -51,6 +52,29 @@ def test_cholesky_is_numpys_in_place_too(size: int, seed: int):
     assert_allclose(factor, np.linalg.cholesky(matrix), atol=1e-12)
     assert cholesky(matrix, matrix, size)
     assert_allclose(np.tril(matrix), factor, atol=1e-12)
+
+
+@given(st.integers(1, 6), seeds, st.booleans())
+def test_a_covariance_goes_through_a_known_pattern_as_through_any_matrix(
+    size: int, seed: int, has_pattern: bool
+):
+    generator = np.random.default_rng(seed)
+    given = np.where(generator.random((size, size)) < 0.5, 0.0, generator.normal(size=(size, size)))
+    left = generator.random(size) < 0.5
+    given[left] = np.eye(size)[left]
+    varies = [None if place[0] != place[1] else given[place] for place in np.ndindex(size, size)]
+    known = {
+        place: value
+        for place, value in zip(np.ndindex(size, size), varies, strict=True)
+        if given[place] != 0.0
+    }
+    covariance = positive_definite(generator, size)
+    wanted, product = given @ covariance, np.empty((size, size))
+    move = propagating_covariance(pattern_of(known if has_pattern else None, size))
+    move(covariance, given, product, np.empty((size, size)))
+    assert_allclose(product, wanted, atol=1e-12)
+    assert_allclose(covariance, wanted @ given.T, atol=1e-12)
+    assert_array_equal(covariance, covariance.T)
 
 
 @pytest.mark.parametrize("last", [0.0, -1.0, np.nan, 0.25])

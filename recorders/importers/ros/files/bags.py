@@ -9,8 +9,6 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import zstandard
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput
@@ -131,6 +129,9 @@ def _metadata(folder: Path) -> dict[str, Any]:
     place = folder / "metadata.yaml"
     if not place.exists():
         return {}
+    from ruamel.yaml import YAML  # which takes long to import
+    from ruamel.yaml.error import YAMLError
+
     try:
         about = YAML(typ="safe").load(place.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
     except (OSError, ValueError, KeyError, TypeError, YAMLError) as error:

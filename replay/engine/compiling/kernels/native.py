@@ -39,9 +39,27 @@ from replay.engine.compiling.kernels.lowering import lower
 from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
 from replay.engine.compiling.kernels.program import Program
 from replay.engine.compiling.notices import compiling
+from replay.engine.compiling.scratch import Memory
 
 _ALL = 64  # axes that an array may have
 _MADE_BY = "a kernel that fuselog compiled"
+
+
+class _Layout:
+    """Holds the kinds of what a core works in: the same object for the same kinds, quick to look up."""
+
+    def __init__(self, kinds: tuple[Any, ...]) -> None:
+        self.kinds = kinds
+
+
+_layout_of = cache(_Layout)
+
+
+def _described(memory: Any) -> tuple[_Layout, list[Any]]:
+    kinds: list[Any] = []
+    words: list[Any] = []
+    describe(memory, 0, kinds, words)
+    return _layout_of(tuple(kinds)), words
 
 
 class Kernel:
@@ -58,29 +76,35 @@ class Kernel:
         self._lock = Lock()
 
     def of(
-        self, arguments: Sequence[Any], scratch: Sequence[Any] = (), varies: int = 1
+        self, arguments: Sequence[Any], memory: Memory | None = None, varies: int = 1
     ) -> Callable[[int, int], None]:
         """Make the loop over the runs from `first` up to `end` for these arguments, which it holds.
 
-        So many first axes of arrays vary, none of those in `scratch`; see `describe`.
+        So many first axes of arrays vary, none of those in the memory; see `describe`.
         """
         kinds: list[Any] = [os.environ.get("FUSELOG_BOUNDSCHECK") == "1"]
         numbers: list[Any] = []
         for each in arguments:
             describe(each, varies, kinds, numbers)
-        for each in scratch:
-            describe(each, 0, kinds, numbers)
-        key = tuple(kinds)
+        layout_of_memory = None
+        if memory is not None:
+            memory.described = memory.described or _described(memory.value)
+            layout_of_memory, words = memory.described
+            numbers += words
+        key = layout_of_memory, *kinds
         known = self._entries.get(key)
         if known is None:
             with self._lock:
+                if memory is not None and layout_of_memory is not None:
+                    arguments = *arguments, memory.value
+                    kinds += layout_of_memory.kinds
                 known = self._entries.get(key) or self._entries.setdefault(
-                    key, self._entry((*arguments, *scratch), iter(key))
+                    key, self._entry(arguments, iter(kinds))
                 )
         layout, entry = known
         given = layout.pack(*numbers)
 
-        def loop(first: int, end: int, kept: Any = (arguments, scratch)) -> None:  # noqa: ARG001
+        def loop(first: int, end: int, kept: Any = (arguments, memory)) -> None:  # noqa: ARG001
             entry(first, end, given)
 
         return loop
