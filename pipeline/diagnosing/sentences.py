@@ -9,7 +9,10 @@ from pipeline.diagnosing.findings import FIRST, Finding
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 
 # What explains the numbers themselves, and no noise or bias that would have to be large.
-OF_FORM = ("factor or sign", "exchanged axes", "convention", "parameter", "delay", "clock drift")
+OF_FORM = (
+    *("factor or sign", "exchanged axes", "convention", "parameter", "delay", "clock drift"),
+    *("outliers", "exchanged numbers", "start"),
+)
 CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
 
 Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over the rest of a long log
@@ -50,13 +53,22 @@ def ranked(
     """Sentences in their order: stamps, causes, and what else is seen without any filter.
 
     What has a setting that undoes it stands before causes that are but its consequence, such as noise.
-    What the causes name of the same topic is not said twice.
+    What the causes advise is not said twice, nor what has no setting of a topic that they name.
     """
+    mends = [cause.hypothesis.mend(cause.value) for cause in causes]
+    advised = {key for mend in mends if mend is not None for key in mend.settings}
     of_stamps = [each for each in of_log if each.kind in FIRST]
     named = {each.hypothesis.topic for cause in causes for each in (cause, *cause.others)}
-    others = [each for each in of_log if each.kind not in FIRST and each.topic not in named]
+    others = [
+        each
+        for each in of_log
+        if each.kind not in FIRST
+        and (each.setting.partition("=")[0] not in advised if each.setting else each.topic not in named)
+    ]
     is_consequence = bool(causes) and causes[0].hypothesis.kind not in OF_FORM
-    before = [each for each in others if each.setting and is_consequence]
+    before = [
+        each for each in others if each.setting and is_consequence and each.kind != "measurement noise"
+    ]
     after = [each for each in others if each not in before]
     return [
         *map(Sentence.of, [*of_stamps, *before]),

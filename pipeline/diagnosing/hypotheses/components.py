@@ -147,13 +147,14 @@ def of_components(
 class _Own(NamedTuple):
     """The parameters that a number of a topic has: what is added to it, and what it is multiplied by.
 
-    `bias_sign` is by what a bias of the number is multiplied for the parameter's.
+    `bias_sign` is by what a bias of the number is multiplied for the parameter's, whose value is
+    `bias_value`.
     """
 
     bias: str
     bias_sign: float
+    bias_value: float
     factor: str
-    values: Mapping[str, float]
 
     @staticmethod
     def of(
@@ -163,8 +164,8 @@ class _Own(NamedTuple):
             return None
         key = topic, entry.number
         bias, factor = reading.biases.get(key, ""), reading.factors.get(key, "")
-        values = {name: float(getattr(parameters, name) or 0.0) for name in (bias, factor) if name}
-        return _Own(bias, -1.0 if topic in reading.controls else 1.0, factor, values)
+        value = float(getattr(parameters, bias) or 0.0) if bias else 0.0
+        return _Own(bias, -1.0 if topic in reading.controls else 1.0, value, factor)
 
 
 def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:
@@ -180,9 +181,8 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         return f"{topic}: {entry.name} is {factor} times ({least} to {most}) too {size}{more}"
 
     def mend(at: float) -> Advice:
-        if own and own.factor:
-            return Advice(own.factor, precise(own.values[own.factor] * np.exp(-at)), free=own.factor)
-        return Advice(f"{topic}.{bare(entry.name)}_scale", precise(np.exp(-at)))
+        key, free = f"{topic}.{bare(entry.name)}_scale", own.factor if own else ""
+        return Advice(key, precise(np.exp(-at)), free=free)
 
     without = in_topic(topic, alter.multiplied(entry.field, entry.place), stretch)
     return Hypothesis(
@@ -224,7 +224,7 @@ def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
 
     def mend(at: float) -> Advice:
         if own and own.bias:
-            return Advice(own.bias, rounded(own.values[own.bias] + own.bias_sign * at), free=own.bias)
+            return Advice(own.bias, rounded(own.bias_value + own.bias_sign * at), free=own.bias)
         return Advice(f"{topic}.{bare(entry.name)}_bias", precise(at))
 
     return Hypothesis(
