@@ -17,7 +17,10 @@ from pipeline.command_line.help import with_examples
 )
 @click.version_option(package_name="fuselog")
 def fuselog() -> None:
-    """All commands."""
+    """All commands; how long one goes is told from here on."""
+    from pipeline.output.terminal import once_a_minute
+
+    once_a_minute.begin()
 
 
 for each in (

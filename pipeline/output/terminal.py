@@ -56,10 +56,14 @@ class OnceAMinute:
     """Tells on standard error how long work goes where no terminal shows it, a line a minute at most."""
 
     def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Let the minute begin, as a command does."""
         self._last_s = monotonic()
 
     def tell(self, text: str) -> None:
-        """Write a line, unless there was one within the last minute, or the program began in it."""
+        """Write a line, unless there was one within the last minute, or the command began in it."""
         now_s = monotonic()
         if now_s - self._last_s >= TOLD_EVERY_S:
             self._last_s = now_s

@@ -498,8 +498,8 @@ FAULTS = [
     ),
     Fault(
         "pipeline/runs/experiment.py",
-        "experiment = build(Experiment, {**merge(self.values, own), **over}, where)",
-        "experiment = build(Experiment, {**over, **merge(self.values, own)}, where)",
+        "experiment = build(Experiment, {**merge(values, own), **over}, where)",
+        "experiment = build(Experiment, {**over, **merge(values, own)}, where)",
         "tests/pipeline/test_experiments.py",
     ),
     Fault(
