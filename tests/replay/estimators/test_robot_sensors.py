@@ -225,7 +225,7 @@ def test_headings_are_a_sensor() -> None:
 
 def test_a_pose_and_a_fix_in_planes_that_have_nothing_to_do_with_each_other() -> None:
     source = log(odometry(), seen(), fix())
-    with pytest.raises(BadInput, match=r"/fix has latitudes and longitudes, /pose positions in map"):
+    with pytest.raises(BadInput, match=r"/fix says where on earth, /pose in frame map, and no channel"):
         bound(ROBOT, "ekf", [source])
     for left_out, streams in (("fix", ("/odometry", "/pose")), ("pose", ("/odometry", "/fix"))):
         (only,) = bound(ROBOT, "ekf", [source], topics={left_out: ""})
