@@ -12,6 +12,7 @@ Account = Callable[[Series, Floats, Floats], Floats]  # of windows, from their b
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
 GAINS = np.linspace(-0.1, 0.1, 41)
 FEW = 400  # windows by which a clock is sought
+NEAR_S = 1.0  # a lag within it is as likely as all that are longer
 
 
 class Timing(NamedTuple):
@@ -55,7 +56,10 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     zero_s = np.arange(-tolerance_s, tolerance_s + 0.5 * FINE_S, max(FINE_S, tolerance_s / 10.0))
     without = _likeness(windows, source, account, zero_s)
     usual = float(np.nanmax(np.abs(without))) if np.isfinite(without).any() else 0.0
-    return Timing(lag_s, gain, likeness, _evidence(count, likeness, usual), tolerance_s)
+    evidence = _evidence(count * _share_within(windows, source, lag_s), likeness, usual)
+    if abs(lag_s) > NEAR_S:  # some lag of so many is the best by chance
+        evidence -= float(np.log(len(lags_s)))
+    return Timing(lag_s, gain, likeness, evidence, tolerance_s)
 
 
 def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, float, float]:
@@ -83,6 +87,14 @@ def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats
         y = np.where(is_in, y - (y.sum(axis=1) / count)[:, None], 0.0)
         found = np.sum(x * y, axis=1) / np.sqrt(np.sum(x * x, axis=1) * np.sum(y * y, axis=1))
     return np.where(count >= max(FEWEST, 0.5 * len(windows)), found, np.nan)
+
+
+def _share_within(windows: Windows, source: Series, lag_s: float) -> float:
+    """The share of the windows that are in the source's span when they are earlier by the lag."""
+    is_within = (windows.begin_s - lag_s >= source.times_s[0]) & (
+        windows.end_s - lag_s <= source.times_s[-1]
+    )
+    return float(is_within.mean())
 
 
 def _independent(windows: Windows) -> float:

@@ -68,12 +68,14 @@ def motion_of(streams: Mapping[str, Stream]) -> Motion:
     return Motion(body)
 
 
-def test_a_winding_road_is_no_wrong_sign() -> None:
-    """Bends of one length: half a period late, the turn rate would be the other way round."""
-    for seed in (4, 7):
+def test_a_winding_road_at_a_steady_speed_says_nothing() -> None:
+    """Bends of one length: half a period late, the turn rate would be the other way round.
+
+    And of six hundred lags some one is the best of speeds that hardly change.
+    """
+    for seed in (0, 1, 4, 7, 18, 24):
         odometry, fix, _ = car(HERE.metadata, HERE.metadata, seed)
-        told = findings({each.topic: each for each in (odometry, fix)})
-        assert "sign" not in [each.cause for each in told]
+        assert not findings({each.topic: each for each in (odometry, fix)})
 
 
 @pytest.mark.parametrize("name", SHEET)
