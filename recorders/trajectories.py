@@ -180,7 +180,10 @@ def _recognised(path: object, number: int, line: str) -> Format:
         if len(fields) == LAYOUTS[name].least:
             return name
     told = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
-    raise BadInput(f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {told}")
+    raise BadInput(
+        f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {told}; "
+        "fuselog import table makes a log of a table with other columns"
+    )
 
 
 def _known(name: str) -> Format:

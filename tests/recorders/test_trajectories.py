@@ -64,7 +64,11 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     ("text", "format_", "words"),
     [
         ("", None, ("has no poses", "TUM, KITTI or EuRoC")),
-        ("1 2 3\n", None, ("line 1 is not a pose", "3 columns", "tum has 8 numbers")),
+        (
+            "1 2 3\n",
+            None,
+            ("line 1 is not a pose", "3 columns", "tum has 8 numbers", "fuselog import table"),
+        ),
         (TUM + "1305031104 4 5 6 0 0 0\n", None, ("line 5 has 7 columns", "8 numbers")),
         (TUM + "1305031104 4 5 six 0 0 0 1\n", None, ("line 5 is not a pose", "'six'")),
         (TUM + "1305031104 4 5 nan 0 0 0 1\n", None, ("line 5 has a value that is not finite",)),
