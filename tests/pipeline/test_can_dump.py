@@ -74,13 +74,17 @@ def test_a_german_dump_is_imported_by_one_command(fuselog: Callable[..., Any], t
 
 # The setting that is named first, of each fault; of two both are among the first three.
 NAMED = {
-    "speed x 3.6": {"forward_scale": 1 / 3.6},
+    "speed x 3.6": {"/odometry.forward_scale": 1 / 3.6},
     "turn rate's sign": {"/odometry.turn_scale": -1.0},
     "degrees as radians": {"/odometry.turn_scale": np.pi / 180.0},
     "fixes .3 s late": {"/fix.delay_s": 0.3},
     "fix variance x 4": {"/fix.covariance_scale": 0.25},
     "lever (2, .6) m": {"lever_x_m": 2.0, "lever_y_m": 0.6},
-    "speed x 3.6 + lever (2, .6) m": {"forward_scale": 1 / 3.6, "lever_x_m": 2.0, "lever_y_m": 0.6},
+    "speed x 3.6 + lever (2, .6) m": {
+        "/odometry.forward_scale": 1 / 3.6,
+        "lever_x_m": 2.0,
+        "lever_y_m": 0.6,
+    },
 }
 
 
