@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # commands are started some hundred times: what they import is compiled once, whatever is usual here
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast fast-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -27,10 +27,14 @@ demo: .venv/with-fuselog
 test: .venv/with-test
 	$(MAKE) -j5 pipeline-lane estimators-lane inference-lane rooms-lane lint
 
-test-fast: lint fast-lane
+test-fast: .venv/with-test
+	$(MAKE) -j3 fast-replay-lane fast-rooms-lane lint
 
-fast-lane: .venv/with-test
-	$(BIN)/pytest -m "not paper"
+fast-rooms-lane: .venv/with-test
+	$(BIN)/pytest -m "not paper" tests/docs tests/house tests/pipeline
+
+fast-replay-lane: .venv/with-test
+	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
 	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py

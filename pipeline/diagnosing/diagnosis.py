@@ -61,7 +61,7 @@ class Diagnosis:
     Attributes:
         label: the estimator's.
         replay: the log replayed with it, as it is set.
-        sentences: what is wrong, at most five, the likeliest cause first.
+        sentences: what is wrong, at most five: faults of stamps, then causes, the likeliest first.
         components: a row per measured component; see `component_table`.
         tried: a row per fault that was tried on the log as it is, the one that gains most first: kind,
             topic, part, value, gain.
@@ -230,7 +230,8 @@ def diagnose(
     """Say why an estimator is inconsistent, or that nothing is wrong.
 
     Faults of the log and of the settings are undone one after the other, each by the number that gains
-    most in log-likelihood; what gains most is named first. A gate is open meanwhile.
+    most in log-likelihood; of causes what gains most is named first,
+    see `sentences.ranked` for what stands before. A gate is open meanwhile.
 
     Args:
         log: a path, a log that was opened, or a recording; or an estimates log beside the log that it

@@ -57,6 +57,7 @@ def _quantities_of(module: ModuleType) -> Iterator[str]:
             yield from (key.value for key in keys if isinstance(key, ast.Constant))
 
 
+@pytest.mark.paper
 def test_the_sweep_of_many_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a run at each of three points; the other block needs a cluster, and is parsed alone."""
     monkeypatch.chdir(tmp_path)

@@ -91,6 +91,7 @@ def flat(text: str) -> str:
     return " ".join(re.sub("[─│]", "", text).split())
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("name", WORKED)
 def test_a_page_can_be_worked_through(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest

@@ -115,6 +115,7 @@ def missing_from(path: Path, text: str) -> list[str]:
     ] + [each for each in PATH.findall(text) if not (ROOT / each).exists()]
 
 
+@pytest.mark.paper
 def test_what_is_named_is_there() -> None:
     missing = {str(path): missing_from(path, "\n".join(prose_of(path))) for path in PATHS}
     assert not {path: names for path, names in missing.items() if names}

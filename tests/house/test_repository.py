@@ -55,10 +55,11 @@ def test_the_types_that_one_meets_are_where_it_says() -> None:
             assert re.search(rf"\b{name}\b", (ROOT / path).read_text(encoding="utf-8")), (name, path)
 
 
-def test_the_lanes_run_every_test_once() -> None:
-    """Those that `make test` starts side by side."""
+@pytest.mark.parametrize("target", ["test", "test-fast"])
+def test_the_lanes_run_every_test_once(target: str) -> None:
+    """Those that `make test` starts side by side, and `make test-fast`."""
     joined = MAKEFILE.replace("\\\n", "")
-    (started,) = re.findall(r"^\t\$\(MAKE\) -j\d (.*)", joined, re.MULTILINE)
+    (started,) = re.findall(rf"^{target}: .*\n\t\$\(MAKE\) -j\d (.*)", joined, re.MULTILINE)
     lanes = [
         re.findall(rf"^{lane}: .*\n\t\$\(BIN\)/pytest (.*)", joined, re.MULTILINE)[0].split()
         for lane in started.removesuffix(" lint").split()

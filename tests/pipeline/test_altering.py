@@ -43,6 +43,7 @@ def drifting(stream: fl.Stream, rate: float) -> fl.Stream:
     return put.drifted(first_ns)(stream, rate)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("topic", "fault", "by", "undone"),
     [
@@ -129,6 +130,7 @@ def test_a_log_is_altered_block_by_block_as_a_recording_is(tmp_path: Path, run: 
                 assert np.array_equal(found[name], column, equal_nan=True)
 
 
+@pytest.mark.paper
 def test_every_command_alters_alike_and_says_so(
     tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog
 ) -> None:

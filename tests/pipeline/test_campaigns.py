@@ -138,6 +138,7 @@ class Backwards(InlineExecutor):
         return future
 
 
+@pytest.mark.paper
 def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monkeypatch, caplog):
     counted = campaigns.Cell.packed
 
@@ -162,6 +163,7 @@ def test_a_stopped_campaign_goes_on_where_it_was(place, files, worked_off, monke
     assert not unfinished(place).exists()
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("what", ["settings", "one cell", "code", "damaged", "a file is gone"])
 def test_cells_of_something_else_are_not_used(what, tmp_path, worked_off, monkeypatch):
     place = tmp_path / "result"
@@ -222,6 +224,7 @@ class Dying(InlineExecutor):
         return super().submit(work, *args, **kwargs)
 
 
+@pytest.mark.paper
 def test_workers_elsewhere_need_nothing_but_what_is_sent(tmp_path, monkeypatch):
     """While they work neither the logs nor the folder of kept cells is there, as on another machine."""
     monkeypatch.setattr("pipeline.runs.ensemble.RUNS_AT_ONCE", 1)
@@ -277,6 +280,7 @@ class Elsewhere(InlineExecutor):
         return done
 
 
+@pytest.mark.paper
 def test_a_campaign_without_logs_has_its_timeline(tmp_path):
     name, experiment = load_experiment("landmarks", SETTINGS, {"runs": 130})
     run_experiment(name, experiment, tmp_path / "result", logs=0)

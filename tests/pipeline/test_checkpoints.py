@@ -108,6 +108,7 @@ def _file_added_to_another(folder: Path, _: Path) -> None:
     (place / "mine.mcap").write_text("foreign")
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "change",
     [
@@ -137,6 +138,7 @@ def test_only_what_a_cell_wrote_enters_the_result(
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
+@pytest.mark.paper
 def test_a_cell_that_is_changed_while_others_are_worked_off_is_worked_off_again(
     prepared: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +167,7 @@ def test_a_cell_that_is_changed_while_others_are_worked_off_is_worked_off_again(
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
+@pytest.mark.paper
 @pytest.mark.unix
 @pytest.mark.parametrize(
     ("mode", "umask"), [(0o755, 0o022), (0o755, 0o000), (0o775, 0o002), (0o1777, 0o000)]

@@ -346,6 +346,7 @@ HEAVY = (
 KERNELS = ("replay.engine.compiling.kernel_cache", "replay.engine.compiling.inlining")
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "commands",
     [

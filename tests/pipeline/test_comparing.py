@@ -69,6 +69,7 @@ def test_noise_taken_for_too_small_is_worse_in_nees(logs: list[Path], tmp_path: 
     assert any("sigma_range_m" in note for note in found.notes)
 
 
+@pytest.mark.paper
 def test_a_result_gives_what_its_estimates_logs_and_a_replay_give(
     result: Path, estimates: Path, logs: list[Path]
 ) -> None:

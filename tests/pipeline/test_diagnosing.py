@@ -119,6 +119,7 @@ def test_noise_that_is_stated_too_small_is_named_with_its_scale(run: fl.MemorySo
     assert "so that Q is too large" in told.words
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("alteration", "by", "kind", "topic", "said"),
     [
@@ -146,6 +147,7 @@ def test_a_fault_of_the_log_is_named_first(
         assert low - 0.02 < by < high + 0.02
 
 
+@pytest.mark.paper
 def test_a_delay_outliers_and_a_drifting_clock_are_named() -> None:
     """The odometry is so good that the stamps of the sightings matter."""
     scenario = {"duration_s": 60.0, "speed_mps": 2.0, "forward_noise_density": 0.002}
@@ -288,6 +290,7 @@ def test_a_floor_of_the_covariance_is_told_from_a_steady_state() -> None:
     assert "is 0.2 in 7" in found.words
 
 
+@pytest.mark.paper
 def test_the_command_the_report_and_the_timeline_say_the_same(
     tmp_path: Path, run: fl.MemorySource, fuselog: Fuselog
 ) -> None:
@@ -345,6 +348,7 @@ def test_a_prior_that_states_no_kinds_is_diagnosed() -> None:
     assert found.sentences == fl.diagnose(run, "ekf").sentences
 
 
+@pytest.mark.paper
 def test_a_log_without_a_prior_is_diagnosed() -> None:
     """The filter began at the first fixes; there is no prior whose sigma could be wrong."""
     run = fl.record("landmarks", seed=3, duration_s=30.0, fix={"rate_hz": 2.0})
@@ -354,6 +358,7 @@ def test_a_log_without_a_prior_is_diagnosed() -> None:
     assert set(found.components["component"]) >= {"x_m", "y_m", "range_m", "bearing_rad"}
 
 
+@pytest.mark.paper
 def test_the_worked_example_of_the_page(
     fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -369,6 +374,7 @@ def test_the_worked_example_of_the_page(
     assert "nothing found" in told[2].out
 
 
+@pytest.mark.paper
 def test_the_study_counts_what_is_named_and_what_a_removal_gains(
     tmp_path: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

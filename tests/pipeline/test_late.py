@@ -71,6 +71,7 @@ def test_waiting_is_not_free(fuselog: Fuselog) -> None:
     assert "ekf.estimate_age_s.robot1" not in stamped
 
 
+@pytest.mark.paper
 def test_every_door_gives_the_same_and_says_what_is_left_out(log: Path, fuselog: Fuselog) -> None:
     found, said = replayed(fuselog, "dropped.mcap", "--arrival-order", "--late", "drop")
     reason = "topic /robot1/range_bearing: it is older than what was used before"
@@ -96,6 +97,7 @@ def test_every_door_gives_the_same_and_says_what_is_left_out(log: Path, fuselog:
         assert (stated["arrival_order"], stated["late"]) == (True, "drop")
 
 
+@pytest.mark.paper
 def test_the_report_counts_what_became_of_late_messages(log: Path, fuselog: Fuselog) -> None:
     """Dropped, inserted with what was repeated for them, waited for: as the streams have them."""
     seen = [fl.open(log)[f"/robot1/{name}"] for name in ("odometry", "range_bearing", "bearing")]

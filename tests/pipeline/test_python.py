@@ -55,6 +55,7 @@ def python(code: str, *folders: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", paths + code], capture_output=True, text=True)
 
 
+@pytest.mark.paper
 def test_the_page_works_as_written(capsys: pytest.CaptureFixture[str]) -> None:
     """The study of 20 lines says what it should, and all that follows runs."""
     study, *others = blocks_of(PAGE)
@@ -299,6 +300,7 @@ def test_a_component_that_was_not_measured_is_nan(recordings: list[fl.MemorySour
     assert np.isnan(innovation).sum(axis=0).tolist() == [0, (len(sightings) + 1) // 2]
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     "method",

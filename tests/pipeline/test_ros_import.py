@@ -57,6 +57,7 @@ def test_info_of_a_bag_that_is_no_mcap(
     assert sorted(folder.iterdir()) == before
 
 
+@pytest.mark.paper
 def test_from_the_bag_to_a_picture(
     fuselog: Callable[..., Any], real_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

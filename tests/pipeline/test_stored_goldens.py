@@ -45,6 +45,7 @@ def with_part(value: Any, *path: str) -> dict[str, Any]:
 MEAN = ("runs", "run.mcap", "streams", "/estimates/ekf/pose", "columns", "mean")
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "golden",
     [

@@ -33,6 +33,7 @@ def spiral(name: str, noise_m: float = 0.0) -> Trajectory:
     return Trajectory(name, noisy, rotation, np.rint(time_s * 1e9).astype(np.int64))
 
 
+@pytest.mark.paper
 def test_two_files(fuselog: Fuselog) -> None:
     """The keys and numbers that programs read; the same from Python; figures, tables and a report."""
     truth, estimate = spiral("truth"), spiral("estimate", 0.05)
@@ -80,6 +81,7 @@ def test_two_files(fuselog: Fuselog) -> None:
         assert words in table
 
 
+@pytest.mark.paper
 def test_estimates_of_a_log_in_another_frame(fuselog: Fuselog) -> None:
     """Where the truth is turned, shifted and scaled, the aligned judgement is the same."""
     recording, run = record_run("landmarks", {"duration_s": 5.0}, 3)

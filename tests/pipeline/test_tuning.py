@@ -70,6 +70,7 @@ def test_the_local_level_of_the_nile() -> None:
     assert not found.notes
 
 
+@pytest.mark.paper
 def test_the_robot_of_the_sheet() -> None:
     start = of_sigmas(0.3, 0.02, 0.6, 0.1)
     found = fl.tune(recorded(500, 100.0), "ekf", FREE, set={**start, "gate_probability": 1.0})
@@ -94,6 +95,7 @@ def short() -> fl.MemorySource:
     return recorded(500, 20.0)
 
 
+@pytest.mark.paper
 def test_what_logs_cannot_tell_is_said(short: fl.MemorySource) -> None:
     """Short logs leave the speed's noise open; a value at a bound has no interval."""
     given = {**of_sigmas(0.1, 0.05, 0.2, 0.03), "gate_probability": 1.0}
@@ -159,6 +161,7 @@ def test_a_log_without_a_prior_gives_the_same_from_far_and_near(drive: fl.Memory
     assert any("begins where its path fits the first fixes" in each for each in far.notes)
 
 
+@pytest.mark.paper
 def test_what_the_logs_tell_nothing_of_stays_at_its_start(drive: fl.MemorySource) -> None:
     """A speed's noise of a millimetre in a second, beside fixes of 0.7 m."""
     name, start = (
@@ -265,6 +268,7 @@ def test_ctrl_c_ends_with_the_best_so_far(short: fl.MemorySource) -> None:
     assert [each.cost for each in told] == sorted((each.cost for each in told), reverse=True)
 
 
+@pytest.mark.paper
 def test_the_worked_example_of_the_page(
     fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -377,6 +381,7 @@ def seen() -> list[fl.MemorySource]:
     return [fl.record("landmarks", seed=seed, duration_s=20.0, **rate) for seed in (2, 3)]
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("by", "begin", "quantity", "best"),
     [
@@ -413,6 +418,7 @@ def test_folds_and_a_grid(seen: list[fl.MemorySource]) -> None:
     np.testing.assert_allclose(again.found.optimum, found.found.optimum, rtol=1e-4)
 
 
+@pytest.mark.paper
 def test_any_number_of_cores_finds_the_same(
     seen: list[fl.MemorySource], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -468,6 +474,7 @@ def test_processes_tune_as_the_command_says(world: Path, tmp_path: Path, fuselog
     assert shared["parameters"] == fuselog(*tune, tmp_path / "alone").json["parameters"]
 
 
+@pytest.mark.paper
 def test_what_need_not_be_positive_is_found_too() -> None:
     """Biases and a scale, with the noise ten times off; what was put in lies in the intervals."""
     sensor = {"rate_hz": 2.0, "bias_range_m": 0.2, "bias_bearing_rad": -0.05}

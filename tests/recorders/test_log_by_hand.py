@@ -306,6 +306,7 @@ def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
             np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.paper
 def test_few_bytes_are_read_without_numba(path):
     code = (
         "import sys; from recorders.log import loops, open_log, read_streams\n"

@@ -50,6 +50,7 @@ def test_every_schema_reads_back_bit_for_bit(path, schema, data, compression):
         ]
 
 
+@pytest.mark.paper
 @settings(max_examples=60)
 @given(
     data=st.data(),

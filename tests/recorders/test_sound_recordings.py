@@ -164,6 +164,7 @@ def test_a_band_beyond_the_samples_is_named(folder):
         read(folder, band_hz=[300, 5000])
 
 
+@pytest.mark.paper
 def test_published_recordings(acoustic):
     """The synthetic array is shifted by whole samples, the real one is as published, to 1 ms."""
     recording = read(acoustic, band_hz=[5000.0, 10000.0])

@@ -17,6 +17,7 @@ from recorders.importers.tables.files import open_table
 from recorders.importers.tables.patterns import fitted, names_in
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     "nested",
     [
@@ -66,6 +67,7 @@ def test_a_line_that_is_too_long_is_refused(tmp_path: Path) -> None:
         open_table(path)
 
 
+@pytest.mark.paper
 def test_what_unpacks_to_much_is_known_at_once(tmp_path: Path) -> None:
     """Of an array of 400 MB its shape."""
     bomb = tmp_path / "bomb.npz"
@@ -75,6 +77,7 @@ def test_what_unpacks_to_much_is_known_at_once(tmp_path: Path) -> None:
     assert time.process_time() - begin_s < 0.5
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_arrays_are_read_block_by_block(order: str, tmp_path: Path) -> None:
     """Every row of an array of several blocks is as it was."""

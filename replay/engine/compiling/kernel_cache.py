@@ -1,4 +1,7 @@
-"""Keeps the compiled code of kernels on disk: each is loaded, or compiled once by one process."""
+"""Keeps numba's kernels on disk: each is loaded, or compiled once by one process.
+
+Our own compiler's kernels are kept by `kernels.native`.
+"""
 
 import __future__
 

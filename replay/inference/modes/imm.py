@@ -162,9 +162,6 @@ def interacting_steps(stage: Stage, filters: Sequence[Steps]) -> Steps:
     return Steps(memory, predict, updates, estimate, sampled, resumes_after_gap, form)
 
 
-# The probabilities of modes
-
-
 # As an estimator
 
 

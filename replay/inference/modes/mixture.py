@@ -44,7 +44,11 @@ class Mixtures(NamedTuple):
 
 
 def predicting(filters: Sequence[Steps]) -> Function:
-    """Make `predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well."""
+    """Make `predict(belief, ...)`: every mode's prediction of its own Gaussian; whether all are well.
+
+    Steps take the number of a run and Gaussians whose first axis is the run; here, and in
+    `mixture_update`, both are of one run, and the mode's number stands in its place.
+    """
     predictions = tuple(each.predict for each in filters)
 
     def predict(belief: Any, interval: Interval, memories: Any) -> bool:

@@ -46,6 +46,7 @@ def test_wrapped_mixture_has_the_density_of_its_parts():
     np.testing.assert_allclose(np.exp(found), parts @ WEIGHTS, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.paper
 def test_samples_are_fitted_back():
     """Parameters within five standard errors or so; other densities come to one optimum."""
     generator = np.random.default_rng(5)

@@ -93,6 +93,7 @@ def imported(module: str, folder: Path, cache: Path, *options: str) -> list[str]
     return done.stdout.splitlines()
 
 
+@pytest.mark.paper
 @BOTH
 def test_a_new_process_finds_the_kernel_and_a_changed_model_is_compiled_anew(
     tmp_path: Path, module: str
@@ -359,6 +360,7 @@ def test_only_a_folder_of_this_user_alone_is_used(
     ]
 
 
+@pytest.mark.paper
 def test_every_kernel_of_replay_is_compiled_here():
     """A raw `njit(cache=True)` would not notice a change in another file."""
     users = {path.name: path for path in Path("replay").rglob("*.py") if "numba" in imports_of(path)}

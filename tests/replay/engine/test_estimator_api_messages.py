@@ -383,6 +383,7 @@ def test_long_compiling_is_said_once(
     assert len(said) == 2
 
 
+@pytest.mark.paper
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
 def test_python_says_what_it_compiles_once(tmp_path: Path) -> None:
     """On standard error, as nothing else is there; not where the program logs in its own way."""

@@ -377,6 +377,7 @@ def test_filters_with_fixes_are_consistent(name: str, landmarks: str) -> None:
     assert honesty(name, runs).is_consistent()
 
 
+@pytest.mark.paper
 def test_a_robot_with_odometry_and_fixes_needs_no_prior() -> None:
     """It begins where its path fits the first fixes, and claims neither too much nor too little there.
 

@@ -176,6 +176,7 @@ def test_several_units_are_told_apart_before_another_model_is_taken():
         estimator.bind("ekf", topics, build(estimator.parameters, {}, "test"))
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(("method", "goes_on"), [("bank", True), ("particles", False)])
 def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, goes_on: bool):

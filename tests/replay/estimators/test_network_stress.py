@@ -59,6 +59,7 @@ def test_the_gate_keeps_honest_estimates_however_they_are_correlated(correlation
     assert not agrees(np.zeros(2), unit, Estimate(np.array([20.0, 0.0]), unit, unit), gate)
 
 
+@pytest.mark.paper
 def test_nodes_send_no_more_often_than_they_may(room):
     found = replayed(room, always={}, seldom={"send_interval_s": 0.5}, news={"send_divergence": 1.0})
     assert len(stamps_s(found, "always")) == 20

@@ -32,6 +32,7 @@ from tests.replay.inference.replays import bound, outputs
 # --- the models ------------------------------------------------------------------------------------
 
 
+@pytest.mark.paper
 def test_the_models_are_what_they_say() -> None:
     """Also with a bias, and with the errors of anchors and of links in the state."""
     check_model(RANGING_POSITION)

@@ -57,6 +57,7 @@ def test_what_ours_have(here: Path) -> None:
 CRAFTED = {"mine": {"kind": "exec", "command": "touch stolen"}}
 
 
+@pytest.mark.paper
 def test_nothing_runs_that_nobody_named(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A golden, a result, a settings file, or a log that names a program does not start it."""
     golden = golden_of(settings={"estimators": CRAFTED})

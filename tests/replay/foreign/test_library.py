@@ -82,6 +82,7 @@ REFUSED = {
 """What a library is, and the sentence on it."""
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("case", REFUSED)
 def test_libraries_that_cannot_be_used(compile_filter: Compile, tmp_path: Path, case: str) -> None:
     defined, sentence = REFUSED[case]

@@ -115,6 +115,7 @@ elif how == "table":
 """
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("place", "how"), [("{log}", "csv"), ("{csv}", "tum")])
 def test_a_program_that_reads_a_log(tmp_path: Path, place: str, how: str) -> None:
     """It gets the log without truth, and parameters; what it writes is judged run by run."""
@@ -132,6 +133,7 @@ def test_a_program_that_reads_a_log(tmp_path: Path, place: str, how: str) -> Non
     assert done.done.parameters["writes"]["sigma_m"] == 0.25
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(
     ("how", "sentence"),
     [

@@ -110,6 +110,7 @@ def test_it_is_the_model_that_has_it_in_its_state(method: str) -> None:
     assert_allclose(*likelihoods, rtol=1e-12)
 
 
+@pytest.mark.paper
 def test_augmented_models_keep_to_what_they_declare() -> None:
     """With noise of all kinds; what reads none of them stays linear."""
     check_model(augmented(ROBOT, tuple(ROBOT.augmentable)))

@@ -217,6 +217,7 @@ def test_two_hundred_trajectories_give_the_sheets_table() -> None:
     assert_allclose(np.mean(rmse / place), 1.0855, atol=5e-5)
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 def test_parts_blocks_and_orders_of_an_ensemble_give_the_same_bound() -> None:
     """Cut in two, and in blocks: equal but for round-off of the sums."""

@@ -53,6 +53,7 @@ def test_the_tangent_is_that_of_the_mean_given_the_heading():
     assert_allclose(workspace(STEP).slope, SLOPE)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("back", [False, True])
 def test_a_correction_carries_the_covariance_by_its_derivative(back: bool):
     mean, covariance = corrected(STEP, back)

@@ -232,6 +232,7 @@ def one_set(dimension: int, kappa: float) -> SampleSets:
     return SampleSets(samples.points[None], samples.weights[None], 0, 0)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize(("method", "kappa"), [("ekf", 0.0), ("iekf", 0.0), ("ukf", 0.0), ("ukf", 1.7)])
 @given(st.integers(1, 4), st.integers(1, 3), st.integers(1, 5), seeds)
 def test_filters_are_exact_for_linear_models_of_any_size(

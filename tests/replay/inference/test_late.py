@@ -298,6 +298,7 @@ def delayed(source: MemorySource, seed: int, *topics: str) -> MemorySource:
     return MemorySource(streams, source.run, source.name)
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("model", "method", "values"),

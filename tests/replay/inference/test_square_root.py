@@ -67,6 +67,7 @@ def test_registered_models_have_the_plain_estimates(
     assert_equal(rooted, plain)
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize(
     ("model", "method", "name", "values"),

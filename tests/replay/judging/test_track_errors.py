@@ -46,6 +46,7 @@ def last_scans(streams: Mapping[str, Stream], sensor: str, at_ns: np.ndarray) ->
     return found
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("scenario", SHEET)
 def test_the_sheets_check_without_a_tracker(autoferry: Path, scenario: int):
     source = memory_source(*import_run("autoferry", autoferry / f"scenario{scenario}", {}))

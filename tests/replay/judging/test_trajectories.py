@@ -196,6 +196,7 @@ def test_relative_errors_by_hand() -> None:
     assert_allclose(turned.relative_m, expected)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("offset_s", [0.0, 0.437, -7.0])
 def test_a_time_offset_is_found(offset_s: float) -> None:
     truth = walk(2000)

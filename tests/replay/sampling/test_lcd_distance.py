@@ -53,6 +53,7 @@ def test_distances_of_known_sets(dimension, pair, unscented_set):
     assert lcd_distance(*unscented(dimension)) == pytest.approx(unscented_set, abs=1e-9)
 
 
+@pytest.mark.paper
 @pytest.mark.parametrize("scale", [0.1, 1.0, 15.0])
 @pytest.mark.parametrize("dimension", [1, 3, 8])
 def test_distance_and_gradient_are_those_of_the_printed_integrals(dimension, scale):

@@ -559,6 +559,7 @@ def test_a_log_without_estimates_and_one_of_estimates_alone_are_shown(
     assert len(found["/map/robot1/ekf/pose"]["utc"]) == len(pose)
 
 
+@pytest.mark.paper
 def test_one_pass_goes_to_a_file_and_to_a_running_receiver(
     rrd: Path, ensemble: Replayed, tmp_path: Path
 ) -> None:
@@ -678,6 +679,7 @@ def test_without_a_vulkan_driver_the_picture_says_what_to_install(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.paper
 def test_the_picture_shows_the_estimators_and_no_view_complains(rrd: Path, tmp_path: Path) -> None:
     png = tmp_path / "picture.png"
     try:

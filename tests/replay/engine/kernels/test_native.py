@@ -217,6 +217,7 @@ def in_a_worker(number: float) -> float:
     return out[0]
 
 
+@pytest.mark.paper
 @pytest.mark.usefixtures("kernels")
 def test_workers_run_kernels_and_get_them_by_name():
     """Spawned, as `--workers` has them: a function is sent, and compiled or found there."""
