@@ -30,6 +30,7 @@ from pipeline.runs.recorded import KEPT_BYTES, require_memory
 from pipeline.runs.runner import Runner
 from recorders.errors import BadInput
 from recorders.parameters import merge
+from replay.foreign.naming import program_files
 
 # A cell whose workers died so often is given up.
 ATTEMPTS = 3
@@ -72,7 +73,8 @@ class Cell:
         """A hash of what decides about the result: this description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
-        said = [experiment, states_of(self.files), runs, str(self.place), version_of_code()]
+        files = [*self.files, *program_files(self.experiment.estimators)]
+        said = [experiment, states_of(files), runs, str(self.place), version_of_code()]
         return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:

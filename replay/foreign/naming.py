@@ -135,3 +135,13 @@ def what_runs(label: str, kind: str, settings: Mapping[str, Any]) -> str:
             f"you name it; give -e {kind}:{text}, or add --allow-programs"
         )
     return text
+
+
+def program_files(settings: Mapping[str, Mapping[str, Any]]) -> list[Path]:
+    """Return the files of programs that settings by label name: libraries, and words of commands."""
+    found = []
+    for label, own in settings.items():
+        kind = own.get("kind", label)
+        if kind in KINDS and isinstance(stated := own.get(KINDS[kind]), str):
+            found += [stated] if kind == "lib" else split_command(stated)
+    return [path for path in map(Path, found) if path.is_file()]

@@ -20,10 +20,12 @@ from pipeline.command_line import main
 from pipeline.runs import campaigns
 from pipeline.runs.checkpoints import checkpoints_of
 from pipeline.runs.executors import InlineExecutor, WorkerPool, pool_for, version_of_code
-from pipeline.runs.experiment import experiment_of_logs, load_experiment, run_experiment
+from pipeline.runs.experiment import Experiment, experiment_of_logs, load_experiment, run_experiment
+from pipeline.runs.inputs import Record
 from recorders.errors import BadInput
 from recorders.log import write_log
 from recorders.recording import record_run
+from replay.foreign.naming import Allowed
 from replay.judging.metrics.sums import BinnedSums
 from tests.bench import scaling
 
@@ -431,3 +433,16 @@ def test_dask_workers_give_the_same_bytes(place, files):
     loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **loopback) as cluster:
         assert run(place, pool_for(None, cluster.scheduler_address, RUNS)) == files
+
+
+def test_cells_of_a_library_that_was_compiled_again_are_not_used(tmp_path: Path) -> None:
+    library = tmp_path / "mine.so"
+    stated = {"kind": "lib", "path": Allowed(library)}
+    experiment = Experiment(
+        title="mine", record=Record(scenario="landmarks"), estimators={"mine": stated}
+    )
+    keys = []
+    for content in ("one", "another"):
+        library.write_text(content)
+        keys.append(campaigns.Cell(experiment, 0, 1, 1, False, False, tmp_path).key)
+    assert keys[0] != keys[1]
