@@ -124,7 +124,7 @@ def _case(
     tangent = tangent_components(components, kinds)
     mean = stream["mean"].reshape(len(stream), len(components))
     covariance = stream["covariance"].reshape(len(stream), len(tangent), len(tangent))
-    time_s: Floats = (stream.publish_time_ns - epoch_ns) * 1e-9
+    time_s = _elapsed_s(stream, epoch_ns)
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     plane = [components.index(each) for each in POSITION[:2] if each in components]
@@ -152,7 +152,7 @@ def _of_innovations(
 ) -> tuple[Nis | None, dict[str, Whiteness], float]:
     if stream is None:
         return None, {}, np.nan
-    time_s: Floats = (stream.publish_time_ns - epoch_ns) * 1e-9
+    time_s = _elapsed_s(stream, epoch_ns)
     degrees = np.isfinite(stream["innovation"]).sum(axis=1)
     spans = np.floor(time_s / BIN_S).astype(np.int64)
     starts, place = np.unique(spans, return_inverse=True)
@@ -161,7 +161,7 @@ def _of_innovations(
     known = count > 0
     starts, squared, count = starts[known], squared[known], count[known]
     low, high = (np.asarray(chi2.ppf(np.full(len(count), each), count)) for each in (0.025, 0.975))
-    nis = Nis((starts + 0.5) * BIN_S, squared / count, low / count, high / count)
+    nis = Nis(np.asarray((starts + 0.5) * BIN_S), squared / count, low / count, high / count)
     series = whitened(stream).T
     white = {name: whiteness([each]) for name, each in zip(stream.components, series, strict=True)}
     stated = stream.columns.get("log_likelihood")
@@ -224,7 +224,7 @@ def true_path(source: MemorySource, topic: str) -> Path | None:
         return None
     columns = [components.index(each) for each in POSITION[:2]]
     state = stream["state"].reshape(len(stream), len(components))[:, columns]
-    return Path((stream.publish_time_ns - source.epoch_ns) * 1e-9, state)
+    return Path(_elapsed_s(stream, source.epoch_ns), state)
 
 
 def map_points(source: MemorySource) -> Floats:
@@ -235,6 +235,10 @@ def map_points(source: MemorySource) -> Floats:
         if stated.schema_name == schemas.LANDMARK.full_name
     ]
     return np.concatenate(found) if found else np.empty((0, 2))
+
+
+def _elapsed_s(stream: Stream, epoch_ns: int) -> Floats:
+    return np.asarray((stream.publish_time_ns - epoch_ns) * 1e-9, np.float64)
 
 
 def _share(outside: NDArray[np.bool_]) -> float:
