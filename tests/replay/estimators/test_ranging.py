@@ -33,9 +33,8 @@ from tests.replay.inference.replays import bound, outputs
 
 
 @pytest.mark.paper
-def test_the_models_are_what_they_say() -> None:
-    """Also with a bias, and with the errors of anchors and of links in the state."""
-    check_model(RANGING_POSITION)
+def test_the_model_is_what_it_says_with_errors_in_its_state() -> None:
+    """With a bias, and with the errors of anchors and of links."""
     errors = PointError("range_m", (1,)), PointError("range_m", (0, 2))
     check_model(augmented(RANGING_POSE, ("bias_range_m",), errors))
 
