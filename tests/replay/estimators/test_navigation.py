@@ -348,8 +348,8 @@ def test_a_heading_that_nothing_ties_turns_alone():
     ],
 )
 def test_a_start_without_a_prior_is_no_surer_than_it_may_be(method: str, given: dict[str, Any]):
-    """Where the heading is next to unknown, by a bank: of 10 runs, which err alike for long."""
-    nees, _ = aligned_nees(method, 10, prior={"is_told": False}, **given)
+    """Where the heading is next to unknown, by a bank: of 6 runs, which err alike for long."""
+    nees, _ = aligned_nees(method, 6, prior={"is_told": False}, **given)
     assert 10.0 < nees.mean() < 20.0
 
 
