@@ -18,6 +18,8 @@ from recorders.log.streams import concatenate
 from recorders.parameters import parse_settings
 from tests.pipeline.test_python import robot
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 ODOMETRY, PRIOR, SEEN = "/robot1/odometry", "/robot1/prior", "/robot1/range_bearing"
 OPEN = {"gate_probability": 1.0}
