@@ -21,7 +21,7 @@ def run(name: str, folder: Path, settings: dict, runs: int) -> dict:
 @pytest.fixture(scope="module")
 def three_sensors(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("los") / "result"
-    return folder, run("los-three-sensors", folder, {"passes": 4}, 2)
+    return folder, run("los-three-sensors", folder, {"passes": 4}, 4)
 
 
 def verdicts(result: dict, start: str) -> dict[str, str]:
@@ -55,8 +55,8 @@ def test_tables_stand_side_by_side(three_sensors: tuple) -> None:
 
 def test_acoustic_refutes_what_does_not_hold(tmp_path: Path) -> None:
     """Claims that hang on bounds alone, so that few runs settle them."""
-    settings = {"shots": 4, "options": {"multipliers": [0.1, 1.0, 1.5], "maps": {"step_m": 50.0}}}
-    result = run("acoustic", tmp_path / "result", settings, 2)
+    settings = {"shots": 4, "options": {"multipliers": [0.1, 1.0, 1.5], "maps": {"step_m": 25.0}}}
+    result = run("acoustic", tmp_path / "result", settings, 4)
     expected = {
         "CRLB of native measurements is lower": "refuted",
         "estimating the sensors along improves": "refuted",
