@@ -57,7 +57,6 @@ def test_the_fault_is_named_first(fault: str, has_compass: bool, has_prior: bool
         assert found["value"] == pytest.approx(right[0].value, rel=0.15)
 
 
-@pytest.mark.paper
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
     log = recorded(faulty(SEED, "E, N exchanged"), has_compass=False)
