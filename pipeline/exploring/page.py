@@ -35,9 +35,12 @@ from pipeline.exploring.sliders import STEPS, Slider, in_words
 from pipeline.exploring.verdict import Verdict, numbers_of
 from recorders.errors import BadInput
 from recorders.log import schemas
+from replay.inference.all_methods import METHODS
 
 NONE = "none"
 SIDE = 300  # the width of the sliders' column, in pixels
+WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
+GROW = {"flex": "1 1 350px"}
 A_ROW = 2  # buttons
 SPREAD = '<div style="display:flex;justify-content:space-between">'
 SLOW_S = 1.0  # a replay that takes longer is said to
@@ -102,12 +105,14 @@ class Page:
         self._component.on_change("value", self._choose)
         self._side = column(width=SIDE, name="side")
         figures = {name: plot.figure for name, plot in self.plots.items()}
-        plane = row(figures["scene"], figures["lens"], sizing_mode="stretch_width")
+        plane = row(figures["scene"], figures["lens"], sizing_mode="stretch_width", styles=WRAP)
         left = column(plane, figures["whiteness"], figures["likelihood"], sizing_mode="stretch_width")
         right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
-        both = row(left, right, sizing_mode="stretch_width")
-        main = column(self._head, self._said, both, sizing_mode="stretch_width")
-        self._document.add_root(row(self._side, main, sizing_mode="stretch_width"))
+        for each in (left, right):
+            each.styles = {"flex": "1 1 330px"}
+        both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
+        main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
+        self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
         self._document.title = f"fuselog explore: {self.session.source.name}"
         self._fill_side()
 
@@ -115,7 +120,18 @@ class Page:
         """All that is to the left: filters, buttons, sliders."""
         session = self.session
         heading = Div(text=f"<b>fuselog</b> explore<br>{escape(session.source.name)}", width=SIDE)
-        filters = row(self._case_choice, self._component)
+        width = (SIDE - 20) // 2
+        names = list(dict.fromkeys([*session.filters, *(each for each in METHODS if each != "bound")]))
+        chosen = [*session.filters, NONE][:2]
+        choices = [
+            Select(title=title, name=title, options=options, value=value, width=width)
+            for title, options, value in (
+                ("Filter", names, chosen[0]),
+                ("Second", [NONE, *names], chosen[1]),
+            )
+        ]
+        for choice in choices:
+            choice.on_change("value", partial(self._choose_filters, choices))
         acts: dict[str, Callable[[], None]] = {
             "Tune": self._tune,
             "Diagnose": self._diagnose,
@@ -127,7 +143,12 @@ class Page:
             "Command": self._command,
         }
         self._widgets: dict[str, tuple[Slider, SliderWidget, Div]] = {}
-        shown: list[Any] = [heading, filters, *self._buttons(acts)]
+        shown: list[Any] = [
+            heading,
+            row(*choices),
+            row(self._case_choice, self._component),
+            *self._buttons(acts),
+        ]
         group = ""
         for slider in session.sliders:
             if slider.group != group:
@@ -185,6 +206,27 @@ class Page:
         """Show another case or component."""
         if 0 in self.played:
             self._show()
+
+    def _choose_filters(self, choices: list[Any], attr: str, old: str, new: str) -> None:  # noqa: ARG002
+        """Look at other filters with the same values."""
+        first, second = (each.value for each in choices)
+        labels = [first] if second in (NONE, first) else [first, second]
+        own = self.session.filters
+        like = own[self._label_of(0)]
+        try:
+            session = self.session.with_filters(
+                {label: own.get(label, {**like, "kind": label}) for label in labels}
+            )
+        except BadInput as error:
+            self._tell(str(error))
+            return
+        self.session = session
+        self.played = {place: each for place, each in self.played.items() if place == PINNED}
+        self.values = {name: self.values[name] for name in self.values if session.has(name)}
+        for plot in self.plots.values():
+            plot.clear(1)
+        self._first()
+        self._fill_side()
 
     def _dragged(self, slider: Slider, attr: str, old: float, new: float) -> None:  # noqa: ARG002
         if self._is_setting:
@@ -292,7 +334,8 @@ class Page:
 
     def _first(self) -> None:
         played: dict[int | str, Played] = {
-            place: self.session.play(label, {}) for place, label in enumerate(self.session.filters)
+            place: self.session.play(label, self.values)
+            for place, label in enumerate(self.session.filters)
         }
         self._take(played)
         self._at_s = instant_of(self.played[0], self._chosen_case())
@@ -350,6 +393,9 @@ class Page:
         component = options.index(self._component.value) if self._component.value in options else 0
         for place, played in self.played.items():
             show_played(self.plots, place, played, case, component)
+        self.plots["nees"].figure.visible = any(
+            one.errors is not None for each in self.played.values() for one in each.cases.values()
+        )
         if self.played[0].cases:
             fit_errors(self.plots["error"], self.played, case, component)
         self._show_lens()
@@ -410,11 +456,14 @@ def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
     cells = []
     before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
     for name, (value, unit) in numbers_of(played.cases[case]).items():
-        words = f"{value:,.0f}" if name == "log-likelihood" else in_words(value, unit)
         was = before.get(name)
-        ghost = f'<br><small style="color:{QUIET}">pinned {was[0]:,.4g}</small>' if was else ""
+        ghost = f'<br><small style="color:{QUIET}">pinned {_number(name, *was)}</small>' if was else ""
         cells.append(
             f'<div style="margin-right:32px"><small style="color:{QUIET}">{escape(name)}</small><br>'
-            f'<b style="font-size:18px">{escape(words)}</b>{ghost}</div>'
+            f'<b style="font-size:18px">{_number(name, value, unit)}</b>{ghost}</div>'
         )
     return f'<div class="numbers" style="display:flex">{"".join(cells)}</div>'
+
+
+def _number(name: str, value: float, unit: str) -> str:
+    return f"{value:,.0f}" if name == "log-likelihood" else escape(in_words(value, unit))

@@ -58,6 +58,12 @@ class Plot:
         self.sources[of, what] = made
         return made
 
+    def clear(self, of: int | str) -> None:
+        """Draw nothing of a filter."""
+        for own, what in self.sources:
+            if own == of:
+                self.fill(of, what, **{name: [] for name in self.sources[own, what].data})
+
     def fill(self, of: int | str, what: str, **columns: Any) -> None:
         """Draw other values; nothing where there is no such source."""
         if (of, what) in self.sources:
@@ -150,7 +156,7 @@ def lens_plot() -> Plot:
 
 
 def whiteness_plot() -> Plot:
-    """Autocorrelations of one component of the whitened innovations."""
+    """Autocorrelations of the component of the whitened innovations that is least white."""
     plot = blank("whiteness", "Whiteness", y_range=Range1d(-0.25, 0.25))
     interval = plot.source(0, "interval", "t", "low", "high")
     plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT)
@@ -182,9 +188,7 @@ def show_played(
     one = played.cases.get(case)
     if one is None:
         for plot in plots.values():
-            for own, what in plot.sources:
-                if own == of:
-                    plot.fill(of, what, **{name: [] for name in plot.sources[own, what].data})
+            plot.clear(of)
         return
     _show_errors(plots["error"], of, one, component)
     _show_nees(plots["nees"], of, one)
@@ -207,7 +211,7 @@ def _show_errors(plot: Plot, of: int | str, case: Case, component: int) -> None:
     rows, even = extremes(error), fewer(len(t))
     plot.fill(of, "line", x=t[rows], y=error[rows])
     plot.fill(of, "band", t=t[even], low=-sigma[even], high=sigma[even])
-    _show_foot(plot, of, t, np.abs(error) > sigma)
+    _show_foot(plot, of, f"Error of {errors.components[component]}", t, np.abs(error) > sigma)
 
 
 def _show_nees(plot: Plot, of: int | str, case: Case) -> None:
@@ -218,7 +222,7 @@ def _show_nees(plot: Plot, of: int | str, case: Case) -> None:
     rows = extremes(nees)
     plot.fill(of, "line", x=t[rows], y=np.maximum(nees[rows], 1e-6))
     plot.fill(of, "interval", t=t[[0, -1]], low=[low, low], high=[high, high])
-    _show_foot(plot, of, t, (nees < low) | (nees > high))
+    _show_foot(plot, of, "NEES", t, (nees < low) | (nees > high))
 
 
 def _show_nis(plot: Plot, of: int | str, case: Case) -> None:
@@ -231,13 +235,21 @@ def _show_nis(plot: Plot, of: int | str, case: Case) -> None:
     plot.fill(
         of, "interval", t=nis.time_s[even], low=np.maximum(nis.low[even], 1e-6), high=nis.high[even]
     )
-    _show_foot(plot, of, nis.time_s, (nis.mean < nis.low) | (nis.mean > nis.high))
+    _show_foot(
+        plot,
+        of,
+        "NIS per component, by second",
+        nis.time_s,
+        (nis.mean < nis.low) | (nis.mean > nis.high),
+    )
 
 
 def _show_whiteness(plot: Plot, of: int | str, case: Case) -> None:
-    name, white = next(iter(case.whiteness.items()), ("", None))
-    if white is None:
+    if not case.whiteness:
         return
+    name, white = min(
+        case.whiteness.items(), key=lambda each: np.nan_to_num(each[1].probability, nan=2.0)
+    )
     lags = np.arange(1, len(white.correlation) + 1, dtype=float)
     plot.fill(of, "line", x=lags + SHIFTS[of], y=white.correlation, zero=np.zeros(len(lags)))
     ends = [0.0, len(lags) + 1.0]
@@ -328,11 +340,12 @@ def instant_of(played: Played, case: str) -> float:
 
 
 def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
-    """A line for what is pinned and for each filter, the first on top."""
-    for of in (PINNED, 1, 0):
+    """A line for what is pinned and for each filter, the second dashed on top."""
+    for of in (PINNED, 0, 1):
         colour, width = (GHOST, 1.0) if of == PINNED else (COLOURS[int(of)], 1.5)
         source = plot.source(of, "line", x, y)
-        plot.figure.line(x, y, source=source, line_color=colour, line_width=width)
+        dash = "dashed" if of == 1 else "solid"  # so that two that coincide are both seen
+        plot.figure.line(x, y, source=source, line_color=colour, line_width=width, line_dash=dash)
 
 
 def _foot(plot: Plot) -> None:
@@ -343,12 +356,11 @@ def _foot(plot: Plot) -> None:
                         y_range_name="foot")  # fmt: skip
 
 
-def _show_foot(plot: Plot, of: int | str, time_s: Floats, outside: Any) -> None:
+def _show_foot(plot: Plot, of: int | str, title: str, time_s: Floats, outside: Any) -> None:
     if of == 0:
         t = time_s[outside]
         t = t[fewer(len(t))] if len(t) else t
         plot.fill(0, "outside", t=t, foot=np.full(len(t), 0.02))
         share = 100.0 * float(np.mean(outside)) if len(outside) else 0.0
-        plot.figure.title.text = (
-            f"{plot.figure.title.text.partition(':')[0]}: outside {share:.2g} %; 5 % is right"
-        )
+        shown = f"{share:.0f}" if share >= 10.0 else f"{share:.1f}"
+        plot.figure.title.text = f"{title}: outside {shown} %; 5 % is right"

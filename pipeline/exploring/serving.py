@@ -25,8 +25,11 @@ TEMPLATE = """
 <meta name="referrer" content="no-referrer">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>
-  body { font: 14px/1.4 Inter, system-ui, sans-serif; margin: 16px; color: #1c1f24; background: #fff; }
-  @media (prefers-color-scheme: dark) { body { filter: invert(.93) hue-rotate(180deg); } }
+  body { font: 14px/1.4 Inter, system-ui, sans-serif; margin: 16px; color: #1c1f24; }
+  @media (prefers-color-scheme: dark) {
+    html { background: #121417; }
+    body { filter: invert(.93) hue-rotate(180deg); }
+  }
 </style>
 {% endblock %}
 """

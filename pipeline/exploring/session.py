@@ -61,13 +61,13 @@ class Session:
         source: the log, altered as it was asked for.
         filters: settings by label.
         gap_limit_s: the truth is not interpolated over longer gaps.
-        estimated: parameters that are part of the state instead of being set.
+        estimated: parameters that are part of the state, with their standard deviations at the start.
     """
 
     source: LogSource | MemorySource
     filters: dict[str, dict[str, Any]]
     gap_limit_s: float = 0.2
-    estimated: tuple[str, ...] = ()
+    estimated: Mapping[str, float] = field(default_factory=dict)
     _run: Run = field(init=False)
     sliders: list[Slider] = field(init=False)
 
@@ -89,13 +89,21 @@ class Session:
             raise BadInput(f"no slider '{name}'; {choices(name, [each.name for each in self.sliders])}")
         return found
 
+    def has(self, name: str) -> bool:
+        """Tell whether a parameter has a slider."""
+        return any(each.name == name for each in self.sliders)
+
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
         """The same log with other filters; raises BadInput where one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
 
     def with_estimated(self, names: Sequence[str]) -> "Session":
-        """The same with other parameters in the state; raises BadInput where a model refuses one."""
-        return Session(self.source, self.filters, self.gap_limit_s, tuple(names))
+        """The same with these parameters in the state, each from a quarter of its slider's way.
+
+        Raises BadInput where a model cannot estimate one.
+        """
+        sigmas = {name: 0.25 * (self.slider(name).high - self.slider(name).low) for name in names}
+        return Session(self.source, self.filters, self.gap_limit_s, sigmas)
 
     def play(self, label: str, values: Values) -> Played:
         """Replay one filter with some parameters set, and judge it.
@@ -166,7 +174,9 @@ class Session:
         taken = {name: value for name, value in values.items() if self._takes(label, name)}
         for name, value in taken.items():
             own = merge(own, nested(name, value))
-        return merge(own, {"estimate": list(self.estimated)}) if self.estimated else dict(own)
+        if self.estimated:
+            own = merge(own, {"estimate": [*self.estimated], "estimate_sigma": dict(self.estimated)})
+        return dict(own)
 
     def toml(self, values: Values) -> str:
         """All filters' settings as a settings file has them, for `--settings`.
@@ -192,7 +202,8 @@ class Session:
             f"--set {shlex.quote(f'{key}={value}')}" for key, value in setting_of(self.source).items()
         ]
         if self.estimated:
-            words.append(f"--set estimate={shlex.quote(str(list(self.estimated)))}")
+            words.append(f"--set {shlex.quote(f'estimate={[*self.estimated]}')}")
+            words += [f"--set estimate_sigma.{name}={each!r}" for name, each in self.estimated.items()]
         return " ".join([*words, *setting_text(values)])
 
     def _bound(
