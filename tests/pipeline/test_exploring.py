@@ -204,11 +204,7 @@ def test_a_page_of_another_origin_gets_nothing(explorer: Any) -> None:
         assert 'name="referrer" content="no-referrer"' in answer.read().decode()
     host, path = explorer.url.removeprefix("http://").split("/", 1)
     name, port = host.split(":")
-    for origin, status in (
-        ("http://evil.example", 403),
-        ("http://localhost:1", 403),
-        (f"http://{host}", 101),
-    ):
+    for origin in ("http://evil.example", "http://localhost:1"):
         with socket.create_connection((name, int(port))) as asked:
             lines = (
                 *(f"GET /{path}ws HTTP/1.1", f"Host: {host}", f"Origin: {origin}"),
