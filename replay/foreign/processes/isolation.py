@@ -23,9 +23,10 @@ from replay.engine.streams.blocks import copied
 from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
 from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
-from replay.foreign.processes.tasks import LOADING, RunGiven, mapped
+from replay.foreign.native.library import Library
+from replay.foreign.processes.tasks import LOADING, RunGiven, follow_given, mapped, sizes_of
 from replay.foreign.processes.worker import IDLE
-from replay.foreign.results import begun
+from replay.foreign.results import begun, results
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
@@ -201,8 +202,6 @@ def follow_apart(
             "library": library,
             "state": state_of(library),
             "folder": str(folder),
-            "parameters": list(given.parameters),
-            "seed": given.seed,
         }
         failure = None
         try:
@@ -215,6 +214,15 @@ def follow_apart(
                 return None
             failure = failure_at(int(made.progress[0]), given, description, str(ended))
         return Ran(copied(followed(made, due, recorded)), failure)
+
+
+def follow_here(library: Library, given: RunGiven, description: Description) -> Ran:
+    """Take one run through its filter in this process."""
+    due, recorded = offsets_of(description, given.events)
+    made = begun(results(due, recorded, sizes_of(description)), due, recorded)
+    failed = follow_given(library, given, description, made)
+    failure = failed and Failure(failed[1], reason_of_code(failed[0], description))
+    return Ran(followed(made, due, recorded), failure)
 
 
 def failure_at(event: int, given: RunGiven, description: Description, why: str) -> Failure:

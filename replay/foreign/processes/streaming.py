@@ -231,6 +231,7 @@ def _note(
         estimates.mean[row] = state[: estimates.mean.shape[1]]
         estimates.covariance[row].ravel()[:] = state[estimates.mean.shape[1] :]
         estimates.time_ns[row] = time_ns
+        made.issued_ns[row] = events.arrival[event, 0] if events.arrival.shape[1] else time_ns
         estimates.end[0] = row + 1
     if innovation is not None and events.source[event] >= 0:
         row, innovations = made.innovations.end[0], made.innovations
