@@ -308,7 +308,10 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
         return ""
     verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
     truth = estimates.stream.metadata["truth"]
-    return f"{what}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
+    said = f"{what}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
+    if len(names) < len(_components(estimates.stream)):
+        return said
+    return f"{said}; it has {', '.join(stated_components(sources[0].topics[truth].metadata, {}, truth))}"
 
 
 def _components(stream: Stream) -> dict[str, Any]:

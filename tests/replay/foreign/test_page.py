@@ -62,6 +62,20 @@ def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_fil
         fl.tune(log, {"mine": given | {"path": str(silent)}}, "drift_density")
 
 
+def test_a_state_by_other_names_is_told_those_of_the_truth(
+    drifter: Path, compile_filter: Compile, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = Path("drifter.c").read_text(encoding="utf-8")
+    for own, other in (("x_m", "east"), ("y_m", "north"), ("prior", "none")):
+        text = text.replace(f'\\"{own}\\":', f'\\"{other}\\":')
+    Path("east.c").write_text(text.replace('\\"none\\": \\"prior\\",', ""), encoding="utf-8")
+    compile_filter(Path("east.c").resolve()).rename("east.so")
+    fl.write("run.mcap", fl.record("vehicles", vehicles=1, duration_s=3.0))
+    assert main(["replay", "run.mcap", "-e", "lib:./east.so", "--set", "in_process=true"]) == 0
+    said = "east, north are not judged: /vehicle1/truth lacks them; it has x_m, vx_mps, y_m, vy_mps"
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_client_in_cpp_gives_the_same(drifter: Path) -> None:
     if shutil.which("c++") is None:
         pytest.skip("there is no compiler: c++")
