@@ -99,17 +99,17 @@ class Errors:
 
     @property
     def position(self) -> list[int]:
-        """The indices of the position's components."""
+        """Return the indices of the position's components."""
         return [index for index, name in enumerate(self.components) if name in POSITION]
 
     @property
     def rotation(self) -> list[int]:
-        """The indices of an orientation's components, which are a rotation vector in rad."""
+        """Return the indices of an orientation's components, which are a rotation vector in rad."""
         return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
 
     @property
     def main(self) -> Quantity:
-        """The position, else the orientation, else the first component."""
+        """Return the position, else the orientation, else the first component."""
         if self.position:
             return Quantity("position_rmse_m", self.position)
         if self.rotation:
