@@ -192,9 +192,9 @@ def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
             )
             for each in failed
         }
-        told = followed(made, due, recorded)
+        results_of_runs = followed(made, due, recorded)
         after = _Running(filters, before.static, start_ns, next_output, _Owner(library, filters.handle))
-        return after, streams_of(found.name, description, found.truth, told, failures)
+        return after, streams_of(found.name, description, found.truth, results_of_runs, failures)
 
     return found.bound(start, run, None)
 
@@ -249,7 +249,7 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_
         if state.prior is not None:
             time_ns, mean, covariance = (column[run] for column in state.prior)
             if not np.isfinite(mean.sum()):
-                return None  # why is told
+                return None  # without a prior that can be used it takes no part
             prior = int(time_ns), mean, covariance
         static = static_of_run(state.static, run)
         events = of_run(state.events, run)
@@ -266,13 +266,13 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_
         ran = follow_runs(given, Limits.of(found.parameters))
         due = recorded = np.zeros(2, np.int64)
         nothing = followed(results(due, recorded, sizes_of(description)), due, recorded)
-        told = joined([nothing if each is None else each.followed for each in ran])
+        results_of_runs = joined([nothing if each is None else each.followed for each in ran])
         failures = {
             number: each.failure
             for number, each in enumerate(ran)
             if each is not None and each.failure is not None
         }
-        made = streams_of(found.name, description, found.truth, told, failures)
+        made = streams_of(found.name, description, found.truth, results_of_runs, failures)
         return made if window_ns == IN_ORDER else [*made, gone_back(found.name, state.events)]
 
     return found.bound(start, run, finish)

@@ -228,11 +228,11 @@ def _solve(
     failures = {run: each for run, each in enumerate(made) if isinstance(each, Failure)}
     if len(failures) == runs == 1:
         raise BadInput(f"estimator {label}: {failures[0].reason}")
-    told = [{} if isinstance(each, Failure) else each for each in made]
-    nothing = {topic: stream.take(slice(0, 0)) for each in told for topic, stream in each.items()}
+    written = [{} if isinstance(each, Failure) else each for each in made]
+    nothing = {topic: stream.take(slice(0, 0)) for each in written for topic, stream in each.items()}
     return [
         failures_by_run(f"/estimates/{label}", failures, runs),
-        *(gather([each.get(topic, empty) for each in told]) for topic, empty in nothing.items()),
+        *(gather([each.get(topic, empty) for each in written]) for topic, empty in nothing.items()),
     ]
 
 

@@ -205,8 +205,8 @@ def reason_of_code(code: int, description: Description) -> str:
     if code in FAILURES:
         return FAILURES[code]
     number = code - OWN
-    told = description.failures
-    return told[number - 1] if number <= len(told) else f"the filter returned {number}"
+    sentences = description.failures
+    return sentences[number - 1] if number <= len(sentences) else f"the filter returned {number}"
 
 
 class Followed(NamedTuple):

@@ -164,10 +164,10 @@ class Worker:
                 continue
             if not answer:
                 raise Ended(how_ended(self._process.wait()))
-            told = json.loads(answer)
-            if "refused" in told:
-                raise BadInput(told["refused"])
-            return told
+            reply = json.loads(answer)
+            if "refused" in reply:
+                raise BadInput(reply["refused"])
+            return reply
 
 
 def state_of(library: str) -> list[int]:
@@ -205,9 +205,9 @@ def follow_apart(
         }
         failure = None
         try:
-            told = worker.ask(task, limits, lambda: int(made.progress[0]))["failure"]
-            if told is not None:
-                failure = Failure(told[1], reason_of_code(told[0], description))
+            failed = worker.ask(task, limits, lambda: int(made.progress[0]))["failure"]
+            if failed is not None:
+                failure = Failure(failed[1], reason_of_code(failed[0], description))
         except Ended as ended:
             worker.end()
             if worker.code == IDLE and int(made.progress[0]) == LOADING:

@@ -76,8 +76,8 @@ class Stream(Program):
                 while len(buffer) >= 4:
                     size = _HEAD.unpack_from(buffer)[0]
                     if not 0 < size <= MOST_BYTES:
-                        said = printable(bytes(buffer[:60]).splitlines()[0].decode(errors="replace"))
-                        fault = f"wrote '{said}' to standard output, which is no frame,"
+                        text = printable(bytes(buffer[:60]).splitlines()[0].decode(errors="replace"))
+                        fault = f"wrote '{text}' to standard output, which is no frame,"
                         self._frames.put(_Frame(b"", fault))
                         return
                     if len(buffer) < 4 + size:
