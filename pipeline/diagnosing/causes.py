@@ -1,22 +1,27 @@
 """The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pipeline.diagnosing.advice import number
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from pipeline.diagnosing.hypotheses.hypothesis import (
+    GainsOf,
+    Hypothesis,
+    Number,
+    gains_over,
+)
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.diagnosing.pairs import companion, is_gross
 from pipeline.diagnosing.search import DROP_95, Peak, end, peak, side_by_side
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
-GainsOf = Callable[[Sequence[tuple[Hypothesis, Number]]], Sequence[float]]
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
 
 
@@ -112,28 +117,19 @@ def find_causes(
     found, listed = list[Cause](), list[Tried]()
     candidates, now = list(tried), base
     while candidates and len(found) < most:
-        gains_of = _gains_over(likelihood, now)
+        gains_of = gains_over(likelihood, now)
         peaks = _peaks(gains_of, candidates, len(tried))
         listed = listed or [Tried(each, at) for each, at in zip(candidates, peaks, strict=True)]
-        ranked = sorted(
-            (
-                (at, each)
-                for at, each in zip(peaks, candidates, strict=True)
-                if _is_named(at, each, len(tried))
-            ),
-            key=lambda pair: -pair[0].score(pair[1]),
-        )
-        first = next((pair for pair in ranked if not _is_at_end(gains_of, *pair)), None)
-        if first is None:
+        alike = _likeliest(gains_of, peaks, candidates, len(tried))
+        if alike and is_gross(*alike[0]):
+            beside = companion(likelihood, now, peaks, candidates)
+            if beside is not None:
+                gains_of = gains_over(likelihood, beside.without(now))
+                others = [each for each in candidates if each is not beside.of]
+                peaks = _peaks(gains_of, others, len(tried))
+                alike = _likeliest(gains_of, peaks, others, len(tried)) or alike
+        if not alike:
             break
-        least = first[0].score(first[1]) - RIVAL
-        near = [
-            pair
-            for pair in ranked
-            if pair is not first and (pair[0].score(pair[1]) > least or _is_other_name(pair, first))
-        ]
-        alike = [first, *(pair for pair in near if not _is_at_end(gains_of, *pair))]
-        alike.sort(key=_is_early)
         causes = _causes(gains_of, alike)
         found.append(causes[0]._replace(others=tuple(causes[1:])))
         now = causes[0].hypothesis.without(now, causes[0].value)
@@ -142,12 +138,25 @@ def find_causes(
     return found, listed
 
 
-def _gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
-    """What values of faults gain over a trial."""
-    [before] = likelihood([now])
-    return lambda asked: [
-        found - before for found in likelihood([each.without(now, at) for each, at in asked])
+def _likeliest(
+    gains_of: GainsOf, peaks: Sequence[Peak], candidates: Sequence[Hypothesis], count: int
+) -> list[tuple[Peak, Hypothesis]]:
+    """The hypothesis that gains most, and those that the log does not tell from it; none by chance."""
+    ranked = sorted(
+        ((at, each) for at, each in zip(peaks, candidates, strict=True) if _is_named(at, each, count)),
+        key=lambda pair: -pair[0].score(pair[1]),
+    )
+    first = next((pair for pair in ranked if not _is_at_end(gains_of, *pair)), None)
+    if first is None:
+        return []
+    least = first[0].score(first[1]) - RIVAL
+    near = [
+        pair
+        for pair in ranked
+        if pair is not first and (pair[0].score(pair[1]) > least or _is_other_name(pair, first))
     ]
+    alike = [first, *(pair for pair in near if not _is_at_end(gains_of, *pair))]
+    return sorted(alike, key=_is_early)
 
 
 def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:

@@ -57,6 +57,12 @@ def test_the_fault_is_named_first(fault: str, has_compass: bool, has_prior: bool
         assert found["value"] == pytest.approx(right[0].value, rel=0.15)
 
 
+@pytest.mark.parametrize("faults", battery.PAIRS[:2], ids=" + ".join)
+def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
+    """With one undone the other is still so large that a noise thousands of times larger fits."""
+    assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
+
+
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
     log = recorded(faulty(SEED, "E, N exchanged"), has_compass=False)

@@ -53,6 +53,17 @@ RIGHT: dict[str, Sequence[Right]] = {
 }
 
 
+# Two at once, each of which hides how large the other is.
+PAIRS = (
+    ("speed x 3.6", "fixes 18 s late"),
+    ("E, N exchanged", "speed / 3.6"),
+    ("turn rate's sign", "fix variance / 16"),
+    ("degrees as radians", "lever (2, .6) m"),
+    ("speed x .3048", "compass clockwise from north"),
+    ("compass + 4.5 deg", "fixes .3 s late"),
+)
+
+
 class Cell(NamedTuple):
     """A fault, and what the log has beside wheels and fixes."""
 
@@ -101,6 +112,20 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
         "first": " ".join(filter(None, named[0][0][:3])) if named else "",
         "value": value,
         "gain": gain,
+    }
+
+
+def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False) -> dict[str, Any]:
+    """Plant faults at once into a log with a compass, and see whether three causes name all."""
+    log = recorded(faulty(seed, *faults), has_prior=has_prior)
+    found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, 3)
+    named = {one[:3] for cause in found.causes for one in _named(cause)}
+    return {
+        "faults": " + ".join(faults),
+        "has_prior": has_prior,
+        "seed": seed,
+        "are_named": all(any(one[:3] in named for one in RIGHT[fault]) for fault in faults),
+        "first": " ".join(filter(None, next(_named(found.causes[0]))[:3])) if found.causes else "",
     }
 
 
