@@ -15,7 +15,6 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
 )
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.pairs import companion, is_gross
 from pipeline.diagnosing.search import DROP_95, Peak, end, peak, side_by_side
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import bind
@@ -23,9 +22,10 @@ from replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
-
-
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
+NOISES = ("measurement noise", "process noise")
+GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
+LEADING = 10  # of the likeliest faults: each is tried beside all others
 
 
 class Told(NamedTuple):
@@ -121,8 +121,8 @@ def find_causes(
         peaks = _peaks(gains_of, candidates, len(tried))
         listed = listed or [Tried(each, at) for each, at in zip(candidates, peaks, strict=True)]
         alike = _likeliest(gains_of, peaks, candidates, len(tried))
-        if alike and is_gross(*alike[0]):
-            beside = companion(likelihood, now, peaks, candidates)
+        if alike and _is_gross(*alike[0]):
+            beside = _companion(likelihood, now, peaks, candidates)
             if beside is not None:
                 gains_of = gains_over(likelihood, beside.without(now))
                 others = [each for each in candidates if each is not beside.of]
@@ -157,6 +157,49 @@ def _likeliest(
     ]
     alike = [first, *(pair for pair in near if not _is_at_end(gains_of, *pair))]
     return sorted(alike, key=_is_early)
+
+
+class _Supposed(NamedTuple):
+    """A fault with a number."""
+
+    of: Hypothesis
+    value: Number
+
+    def without(self, trial: Trial) -> Trial:
+        """The trial without it."""
+        return self.of.without(trial, self.value)
+
+
+def _is_gross(at: Peak, of: Hypothesis) -> bool:
+    """Whether it is a noise that is stated far too small."""
+    return of.kind in NOISES and at.value > GROSS
+
+
+def _companion(
+    likelihood: Likelihood, now: Trial, peaks: Sequence[Peak], candidates: Sequence[Hypothesis]
+) -> _Supposed | None:
+    """One of two gross faults, which gain more together than any noise does; None where no two do.
+
+    Beside the numbers that gain most by themselves, all special ones are tried: of two gross faults
+    none may gain by itself what it is worth.
+    """
+    supposed, most = list[_Supposed](), 0.0
+    for at, of in zip(peaks, candidates, strict=True):
+        if of.kind in NOISES:
+            most = max(most, at.gain)
+        elif of.kind != "outliers":
+            values = dict.fromkeys([at.value, *of.specials] if at.gain > 0.0 else of.specials)
+            supposed += [_Supposed(of, value) for value in values]
+    alone = np.array(gains_over(likelihood, now)(supposed))
+    best, found = most, None
+    for place in np.argsort(-alone, kind="stable")[:LEADING]:
+        leading = supposed[place]
+        others = [each for each in supposed if each.of is not leading.of]
+        gains = gains_over(likelihood, leading.without(now))(others)
+        together = alone[place] + max(gains, default=-np.inf)
+        if together > best:
+            best, found = float(together), leading
+    return found
 
 
 def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:
