@@ -65,7 +65,7 @@ class Cause(NamedTuple):
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
             return [Told(of.part, *(of.told(each) for each in (self.value, low, high)))]
-        names = [of.topic, *of.part.split(", ")]
+        names = [of.topic, *of.part.split(", ")][-of.size :]
         return [Told(*each) for each in zip(names, self.value, low, high, strict=True)]
 
     @property

@@ -18,6 +18,8 @@ from pipeline.diagnosing.battery.car import FAULTS, drive, faulty, recorded, sta
 from pipeline.diagnosing.consistency import judged_by_itself
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.tuning.measured import until_last_measured
+from recorders.log.planes import Origin
+from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.orientation import heading
 from replay.engine.replaying.estimator import bind
 
@@ -61,6 +63,34 @@ def test_the_fault_is_named_first(fault: str, has_compass: bool, has_prior: bool
 def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
     """With one undone the other is still so large that a noise thousands of times larger fits."""
     assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
+
+
+def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
+    """The origin is stated 40 m too far west and 25 m too far north: fixes are east and south."""
+    car = drive(SEED)
+    log = recorded(car, has_compass=False, has_prior=True)
+    right = Origin(52.5, 13.4, 40.0)
+    latitude, longitude, _ = out_of_tangent_plane((car.fix_m[:, 0], car.fix_m[:, 1]), right)
+    wrong = out_of_tangent_plane((-40.0, 25.0), right)
+    fixes = fl.make_stream(
+        FIX,
+        fl.schemas.GEODETIC_FIX,
+        stamps_ns(car.fix_s),
+        metadata=Origin(float(wrong[0]), float(wrong[1]), 40.0).metadata,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=np.full(len(latitude), 40.0),
+        covariance_m2=np.tile(np.diag([0.25, 0.25, 1.0]).ravel(), (len(latitude), 1)),
+    )
+    shifted = replace(log, streams={**log.streams, FIX: fixes})
+    [found] = fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0}).sentences
+    assert found.cause is not None
+    assert "the origin of the plane is another one" in found.words
+    for told, planted in zip(found.cause.numbers, (40.0, -25.0), strict=True):
+        assert told.low < planted < told.high
+        assert told.value == pytest.approx(planted, abs=3.0)
+    setting = dict([found.setting.split("=")])
+    assert fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0, **setting}).sentences == []
 
 
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
