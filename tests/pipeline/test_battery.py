@@ -33,33 +33,34 @@ def test_the_likelihood_with_a_compass_is_that_of_the_sheet() -> None:
     assert likelihood([base]) == pytest.approx([653.081316], abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("fault", "has_compass", "has_prior"),
-    [
-        ("nothing", False, False),
-        ("fixes .3 s late", False, False),
-        ("turn rate's sign", False, True),
-        ("speed x 3.6", False, True),
-        ("lever (2, .6) m", False, False),
-        ("E, N exchanged", False, True),
-        ("degrees as radians", False, True),
-        ("gyro bias .0004 t", False, True),
-        ("odometry clock 6 % fast", False, True),
-        ("fixes 18 s late", False, True),
-        ("half of the odometry lost", False, True),
-        ("compass + 4.5 deg", True, True),
-        ("compass clockwise from north", True, True),
-    ],
-)
-def test_the_fault_is_named_first(fault: str, has_compass: bool, has_prior: bool) -> None:
-    found = battery.tried(battery.Cell(fault, has_compass, has_prior), SEED)
+# Of the number that is found, by the sheet: its standard deviation over runs. Without one it is special,
+# and comes out as it was planted.
+SPREADS = {
+    "fixes .3 s late": 0.0113,
+    "lever (2, .6) m": 0.133,
+    "fix variance x 4": 0.0726,
+    "fix variance / 16": 0.0726,
+    "sd written as variance": 0.0726,
+    "gyro bias .02": 0.00112,
+    "gyro bias .0004 t": 4.49e-5,
+    "odometry clock 6 % fast": 0.000175,
+    "gyro density / 5": 0.451,
+    "compass + 4.5 deg": 0.00165,
+}
+CELLS = [battery.Cell(fault, fault.startswith("compass"), True) for fault in FAULTS]
+FREE = [battery.Cell(fault, False, False) for fault in ("nothing", "fixes .3 s late")]
+
+
+@pytest.mark.parametrize("cell", [*CELLS, *FREE], ids=lambda cell: cell.name)
+def test_the_fault_is_named_first(cell: battery.Cell) -> None:
+    found = battery.tried(cell, SEED)
     assert found["is_first"], found["first"]
-    right = battery.RIGHT[fault]
+    right = battery.RIGHT[cell.fault]
     if right and right[0].value is not None:
-        assert found["value"] == pytest.approx(right[0].value, rel=0.15)
+        assert abs(found["value"] - right[0].value) < 4.0 * SPREADS.get(cell.fault, 1e-6)
 
 
-@pytest.mark.parametrize("faults", battery.PAIRS[:2], ids=" + ".join)
+@pytest.mark.parametrize("faults", battery.PAIRS[:1], ids=" + ".join)
 def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
     """With one undone the other is still so large that a noise thousands of times larger fits."""
     assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
