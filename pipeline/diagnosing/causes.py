@@ -15,7 +15,7 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
 )
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import DROP_95, Peak, end, peak, side_by_side
+from pipeline.diagnosing.search import DROP_95, Peak, end, peak, rival, side_by_side
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import MemorySource
@@ -72,7 +72,10 @@ class Cause(NamedTuple):
     def words(self) -> str:
         """What is wrong, by how much, and what that is known by."""
         or_else = "".join(
-            f"; or else, which this log does not tell from it, {each.said}" for each in self.others
+            f"; this log does not determine it: as likely, {each.said}"
+            if each.hypothesis is self.hypothesis
+            else f"; or else, which this log does not tell from it, {each.said}"
+            for each in self.others
         )
         return f"{self.said}{or_else}; without this the log-likelihood gains {number(self.gain, 4)}"
 
@@ -130,6 +133,7 @@ def find_causes(
                 alike = _likeliest(gains_of, peaks, others, len(tried)) or alike
         if not alike:
             break
+        alike[1:1] = _rivals(gains_of, alike[0], least_gain(len(tried)))
         causes = _causes(gains_of, alike)
         found.append(causes[0]._replace(others=tuple(causes[1:])))
         now = causes[0].hypothesis.without(now, causes[0].value)
@@ -247,6 +251,20 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
     return last > at.gain - DROP_95
 
 
+def _rivals(
+    gains_of: GainsOf, pair: tuple[Peak, Hypothesis], apart: float
+) -> list[tuple[Peak, Hypothesis]]:
+    """Another number of a delay or angle, if it gains so little less that chance may explain it."""
+    at, of = pair
+    may_come_again = of.limit == np.pi or of.kind == "delay"
+    if not of.tried or of.size > 1 or not may_come_again:
+        return []
+    [found] = side_by_side(
+        [rival(of, at, at.gain - apart)], lambda asked: gains_of([(of, value) for _, value in asked])
+    )
+    return [] if found is None else [(found, of)]
+
+
 def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list[Cause]:
     """The causes with the intervals of their numbers."""
     asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others are, or are not
@@ -258,13 +276,14 @@ def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list
     ends = side_by_side(
         searches, lambda asked: gains_of([(asking[place // 2][1], value) for place, value in asked])
     )
-    of_one = {
-        id(of): (low, high) for (_, of), low, high in zip(asking, ends[::2], ends[1::2], strict=True)
-    }
+    of_one = iter(zip(ends[::2], ends[1::2], strict=True))
     found = []
     for at, of in pairs:
-        several = _intervals(gains_of, at, of) if of.size > 1 else (at.value, at.value)
-        found.append(Cause(of, at.value, of_one.get(id(of), several), at.gain))
+        if of.size > 1:
+            between = _intervals(gains_of, at, of)
+        else:
+            between = next(of_one) if of.tried else (at.value, at.value)
+        found.append(Cause(of, at.value, between, at.gain))
     return found
 
 

@@ -24,6 +24,8 @@ LARGEST = 1e12  # a loss, of what cannot be used
 NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
 CLEAR = 0.05  # of the same, where a peak is of several numbers
 FAR = 0.02  # of what a peak lacks to the greatest: one that is far from it need not be known better
+GRID = 49  # numbers, over all that are searched, among which another greatest gain is looked for
+WIDE = 4.0  # times what a parabola promises: more is not hoped for
 NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
 
 
@@ -187,6 +189,37 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
                 wide = np.sqrt(2.0 / np.maximum(-np.diag(bend), 1e-12)) * steps
             steps = np.minimum(steps, np.where(np.isfinite(wide), wide, steps))
     return Peak(tuple(map(float, at)), gain) if gain > 0.0 else Peak((0.0,) * size, 0.0)
+
+
+def rival(
+    of: Hypothesis, at: Peak, least: float
+) -> Generator[Sequence[Number], Sequence[float], Peak | None]:
+    """Search for another number of a fault that gains at least so much; None where there is none.
+
+    It is another greatest gain, with a valley to the first: as of a delay on laps of equal length.
+    """
+    values = np.linspace(-of.limit, of.limit, GRID).tolist()
+    known = dict(zip(values, (yield values), strict=True)) | {at.value: at.gain}
+    values = sorted(known)
+    tops = [
+        (low, best, high)
+        for low, best, high in zip(values, values[1:], values[2:], strict=False)
+        if known[best] >= max(known[low], known[high]) and at.value not in (low, best, high)
+    ]
+    if not tops:
+        return None
+    top = {value: known[value] for value in max(tops, key=lambda each: known[each[1]])}
+    before = -np.inf
+    for _ in range(ROUNDS):
+        now, promised = max(top.values()), _promised(top)
+        if now + WIDE * promised < least or (now - before < NEAR and promised < NEAR):
+            break
+        before, asked = now, _next(top, of.limit)
+        if not asked:
+            break
+        top.update(zip(asked, (yield asked), strict=True))
+    value = max(top, key=lambda each: top[each])
+    return Peak(value, top[value]) if top[value] >= least else None
 
 
 def end(at: Peak, scale: float) -> Generator[Sequence[Number], Sequence[float], float]:
