@@ -136,12 +136,21 @@ def _named(cause: Cause) -> Iterator[Right]:
             yield Right(each.hypothesis.kind, each.hypothesis.topic, told.part, told.value)
 
 
-def planted(seeds: Sequence[int], progress: Progress) -> pd.DataFrame:
-    """Try all cells, with and without a prior, with these seeds: a row for each run."""
+def results(
+    seeds: Sequence[int], progress: Progress
+) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
+    """Try all cells, with and without a prior, and all pairs, with these seeds: tables and metrics."""
     rows = []
     for cell in [*cells(), *cells(has_prior=True)]:
         rows += [tried(cell, seed) for seed in progress(seeds, cell.name, len(seeds))]
-    return pd.DataFrame(rows)
+    together = []
+    for pair in PAIRS:
+        for seed in progress(seeds, " + ".join(pair), len(seeds)):
+            together.append(tried_together(pair, seed, has_prior=True))
+    planted, pairs = pd.DataFrame(rows), pd.DataFrame(together)
+    tables = {"battery": summary(planted), "battery_runs": planted, "battery_pairs": pairs}
+    share = float(pairs["are_named"].mean())
+    return tables, {**metrics_of(planted), "diagnosis.battery_pairs_share": share}
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
