@@ -41,15 +41,17 @@ class Initialization:
         topics: those whose first messages it is handed.
         find: (first messages, the static topics, clock) -> what there is to start
             from; by the clock by which the replay stamps estimates.
-        find_broad: (first messages, the static topics, clock, stamp) -> the equally likely starts at a
-            stamp of a single run, so broad that no parameter counts: likelihoods with other parameters,
-            or of the log without a fault, are compared over these. None for what `find` finds.
+        find_broad: (first messages, the static topics, clock, a stamp for each run) -> the equally
+            likely starts of all runs there, so broad that no parameter counts: likelihoods with other
+            parameters, or of the log without a fault, are compared over these. None for what `find`
+            finds.
     """
 
     topics: tuple[str, ...]
     find: Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock], Initialized]
     find_broad: (
-        Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock, int], list[Initialized]] | None
+        Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock, Sequence[int]], list[Initialized]]
+        | None
     ) = None
 
 
