@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from pipeline.comparing.comparing import _chart as difference_chart
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, draw
 from pipeline.output.report.first_run import plan_of_first_run
-from pipeline.output.summary import effective_chart, error_chart, late_chart, mode_chart
+from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
 from pipeline.runs.sweeps import Over, figures_of
 from pipeline.tuning.outcome import Tuning
 from recorders.log import RunMetadata, make_stream, schemas, write_log
@@ -129,6 +130,8 @@ def test_modes_particles_and_late_messages_are_of_their_estimators() -> None:
         f"ukf: 4 dropped: {delay}": {"dropped": [[3.0], [0.3]]},
     }
     same(held(late_chart(late, "robot1")), wanted)
+    again = late.replace({"became": {"inserted": "dropped"}})
+    assert late_counts(again)["late_s"].tolist() == pytest.approx([(2 * 0.1 + 3 * 0.2) / 5, 0.3])
 
 
 def swept(over: list[Over], values: np.ndarray, quantity: str = "position_rmse_m") -> pd.DataFrame:

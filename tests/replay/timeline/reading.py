@@ -162,6 +162,11 @@ TOLERANCES = {
     "brightest": (0.0, 1.5),
     "far ends": (0.0, 0.05),
 }
+# These are in colours of their own, below whatever estimator.
+OF_NO_ESTIMATOR = {
+    *("detections", "axes", "grid", "genuine", "impostor", "threshold", "reports", "circle"),
+    "without_fixes",
+}
 SIZES = ("LineStrips2D:strips", "Points2D:positions", "Ellipsoids3D:centers", "LineStrips3D:strips")
 
 
@@ -220,9 +225,8 @@ def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("
     A title's grid has its steps and y up, paths with a trail are there, and ranges hold curves.
     """
     drawn = {*picture.moving, *picture.still}
-    assert sorted((view.name.partition(", grid")[0], view.roots[0]) for view in picture.views) == sorted(
-        titles
-    )
+    named = [(view.name.partition(", grid")[0], view.roots[0]) for view in picture.views]
+    assert sorted(named) == sorted(titles), {*named} ^ titles
     for view in picture.views:
         for root in view.roots:
             assert any(f"{entity}/".startswith(f"/{root}/") for entity in drawn), (view.name, root)
@@ -233,10 +237,22 @@ def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("
             across = np.unique(lines[lines[:, 0, 0] == lines[:, 1, 0], 0, 0])
             np.testing.assert_allclose(np.diff(across), float(step.removesuffix(" m")), rtol=1e-4)
             assert picture.still["/map"]["Transform3D:mat3x3"] == [[[1, 0, 0, 0, -1, 0, 0, 0, 1]]]
+            _check_bounds(picture, view)
         if view.span:
             _check_span(picture, view)
     for entity, columns in picture.still.items():
         _check_style(entity, columns, estimators)
+
+
+def _check_bounds(picture: Picture, view: View) -> None:
+    """What is true is within the bounds of its map, in which y points down."""
+    assert view.bounds is not None
+    for entity, columns in picture.moving.items():
+        is_shown = any(entity.startswith(f"/{root}/") for root in view.roots)
+        if is_shown and "truth" in entity.split("/") and "LineStrips2D:strips" in columns:
+            places = _strips(columns)[:, -1] * (1.0, -1.0)
+            low, high = zip(view.bounds["x_range"], view.bounds["y_range"], strict=True)
+            assert np.mean(((places >= low) & (places <= high)).all(axis=1)) > 0.8, view.name
 
 
 def _check_span(picture: Picture, view: View) -> None:
@@ -257,14 +273,17 @@ def _check_style(entity: str, columns: Columns, estimators: Sequence[str]) -> No
     for name in ("SeriesLines", "SeriesPoints", "Measurements"):
         if f"{name}:names" in columns:
             names = columns[f"{name}:names"][0]
-            assert names in ([last], [last, f"{last} band"]) or (last, names) == ("bounds", ["95 %"])
+            assert names in ([last], [last.replace("_", " ")], [last, f"{last} band"]) or (
+                last,
+                names,
+            ) == ("bounds", ["95 %"])
     colours = next((rows[0] for name, rows in columns.items() if name.endswith(":colors")), None)
     of = {each: PALETTE[number] for number, each in enumerate(estimators)} | {
         "truth": TRUTH,
         "bounds": MUTED,
     }
     named = [of[part] for part in parts if part in of]
-    if colours and named and last not in ("detections", "axes", "grid"):
+    if colours and named and last not in OF_NO_ESTIMATOR:
         assert {colour >> 8 for colour in colours} == {_packed(named[-1])}, entity
 
 

@@ -234,7 +234,7 @@ def test_two_headings_are_cells_of_a_torus(tmp_path: Path) -> None:
 
 
 def test_an_extended_target_is_a_rectangle(tmp_path: Path) -> None:
-    source = record("extended-target", points=6)
+    source = record("extended-target", points=40)
     run = drawn(tmp_path, source, of_both(source, ""))
     wanted, titles = run.quality()
     for name, stream, field in run.tracks():
