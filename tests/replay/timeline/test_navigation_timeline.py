@@ -9,6 +9,7 @@ from recorders.models.states import NAVIGATION, state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import memory_source
+from replay.timeline.drawing.canvas import PALETTE
 from replay.timeline.drawing.geodetic import POOR, QUALITIES
 from replay.timeline.show import show
 from tests.replay.timeline.reading import Picture, Wanted, check_views, compare, picture_of
@@ -152,3 +153,6 @@ def test_every_panel_is_called_by_what_it_shows(drawn: Picture):
     velocities = {"vx_mps": 0.0, "vy_mps": 2.0, "vz_mps": 0.0}
     wanted = {name: Wanted("curve", STAMPS, np.full(60, at)) for name, at in velocities.items()}
     compare({name: drawn.moving[f"/plots/motion/velocity/{name}"] for name in wanted}, wanted)
+    styles = [drawn.still[f"/plots/motion/velocity/{name}"] for name in velocities]
+    packed = [int.from_bytes(bytes((*colour, 255)), "big") for colour in PALETTE[:3]]
+    assert [style["SeriesLines:colors"][0] for style in styles] == [[colour] for colour in packed]
