@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+from tests.claims import limits
 from tests.words import commands
 from tests.words.made import alarms, claims, comparing, diagnosing, plausibility, reporting, tuning
 
@@ -20,10 +21,11 @@ MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
 
 
 def everything(folder: Path) -> dict[str, str]:
-    """The text of every command; an empty folder takes what they write."""
+    """The text of every command, and of claims; an empty folder takes what commands write."""
     found = commands.texts(folder)
     for command, cases in MADE.items():
         for case in cases:
             lines = [f"# {case.__doc__}", *case()]
             found[command] += "\n" + "\n".join(lines) + "\n"
+    found["claims"] = "\n".join(limits.in_words()) + "\n"
     return found
