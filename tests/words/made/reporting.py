@@ -6,6 +6,7 @@ from typing import Any
 from pipeline.output.claims import Claim
 from pipeline.output.report.verdict import verdict
 from pipeline.output.results import Result
+from replay.judging.diagnostics import LEAST_SHARE
 
 TWO = {"a.position_rmse_m": 0.5, "b.position_rmse_m": 0.25, "a.nees": 9.0}
 BOUNDS = {"b.nees": (2.0, 4.0)}
@@ -51,6 +52,8 @@ def best() -> Iterator[str]:
     yield _best(lacking)
     cases = {**lacking, "b.position_rmse_m.y": 0.2, "b.nees.x": 3.0, "b.nees.y": 5.0}
     yield _best({**cases, "b.failed_runs.x": 2.0, "b.estimated_share.x": 0.5})
+    for share in (LEAST_SHARE, 0.999 * LEAST_SHARE):
+        yield _best({**cases, "b.estimated_share.x": share, "b.estimated_share.y": 1.0})
     yield _best({**cases, "b.failed_runs.x": 0.0, "b.estimated_share.x": 1.0}, 1)
 
 
