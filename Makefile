@@ -47,7 +47,7 @@ pipeline-lane: .venv/with-test
 		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py
 
 rooms-lane: .venv/with-test
-	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders \
+	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \
 		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py
 
 lint: .venv/with-test
