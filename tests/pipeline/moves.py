@@ -11,11 +11,17 @@ BOUND = re.compile(r"(?:number|integer)((?: [<>]=? \S+)+)")
 
 
 def settable(kind: type[Parameters]) -> list[Described]:
-    """The parameters that can be set by themselves: no tables, and none in lists of tables."""
+    """The parameters that can be set by themselves.
+
+    Not so are tables that always stand, what is in lists of tables, and what is in a table that is none
+    unless it is given: that is set as a whole.
+    """
+    found = [each for each in describe(kind) if each.accepts != "table"]
+    wholes = tuple(f"{each.name}." for each in found)
     return [
         each
-        for each in describe(kind)
-        if each.accepts != "table" and "[]" not in each.name and ".NAME" not in each.name
+        for each in found
+        if not each.name.startswith(wholes) and "[]" not in each.name and ".NAME" not in each.name
     ]
 
 
@@ -35,6 +41,8 @@ def _others(value: Any, accepts: str) -> Iterator[Any]:
         yield from (value + 1, value - 1)
     elif isinstance(value, int | float):
         yield from (1.3 * value, 0.7 * value) if value else (0.3, -0.3)
+    elif value is None and "number" in accepts and "of number" not in accepts:
+        yield from (0.37, 1.37)
     elif isinstance(value, list | tuple):
         for place, entry in enumerate(value):
             for other in _others(entry, accepts):
