@@ -1,4 +1,4 @@
-"""Short logs in which each parameter of an estimator, model or method counts, and what counts nowhere."""
+"""Short logs in which each parameter of estimator, model and method counts, or why it counts nowhere."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
