@@ -264,7 +264,7 @@ DRAWN = [
         "recorders/importers/tables/rows.py",
         "int((steps < 0).sum())",
         "int((steps <= 0).sum())",
-        "tests/recorders/test_table_guess.py tests/recorders/test_tables.py tests/pipeline/test_can_dump.py",
+        "tests/recorders/test_tables.py tests/recorders/test_table_guess.py tests/pipeline/test_can_dump.py",
     ),
     Fault(
         "recorders/log/companions.py",
@@ -348,7 +348,7 @@ DRAWN = [
         "replay/engine/streams/results.py",
         "np.flatnonzero((after >= 0) & (before == ALL_WELL))",
         "np.flatnonzero(after >= 0)",
-        "tests/replay/engine/test_reading_streams.py tests/pipeline/test_autoferry_study.py tests/replay/inference/test_bound.py",
+        "tests/replay/engine/test_failing_runs.py tests/replay/engine/test_reading_streams.py tests/pipeline/test_autoferry_study.py",
     ),
     Fault(
         "replay/engine/streams/sources.py",
@@ -642,7 +642,7 @@ DRAWN = [
         "replay/sampling/lcd.py",
         "    if count < least:\n        kind",
         "    if count <= least:\n        kind",
-        "tests/replay/sampling/test_samplings.py tests/replay/sampling/test_sample_cache.py tests/pipeline/test_lrkf_dimension_study.py",
+        "tests/replay/sampling/test_lcd_samples.py tests/replay/sampling/test_samplings.py tests/replay/sampling/test_sample_cache.py",
     ),
     Fault(
         "replay/sampling/samplers.py",
