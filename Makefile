@@ -22,8 +22,7 @@ demo: .venv/with-fuselog
 	@echo "Tables and numbers:  demo/landmarks/tables, demo/landmarks/result.json"
 
 # all tests, in four lanes of like length, and the linters, side by side; what is about one family is in
-# one lane, so that what its kernels share is compiled once, and three long files of the pipeline are in
-# that of the other rooms
+# one lane, so that what its kernels share is compiled once: studies are with the estimators
 test: .venv/with-test
 	$(MAKE) -j5 pipeline-lane estimators-lane inference-lane rooms-lane lint
 
@@ -37,17 +36,19 @@ fast-replay-lane: .venv/with-test
 	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
-	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py
+	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*_stud*.py
 
 inference-lane: .venv/with-test
-	$(BIN)/pytest tests/replay --ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
+	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py \
+		--ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
 
 pipeline-lane: .venv/with-test
-	$(BIN)/pytest tests/pipeline --ignore=tests/pipeline/test_faults.py --ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py
+	$(BIN)/pytest tests/pipeline --ignore-glob='*_stud*.py' --ignore=tests/pipeline/test_faults.py \
+		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py
 
 rooms-lane: .venv/with-test
 	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders \
-		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py tests/pipeline/test_tuning.py
+		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py
 
 lint: .venv/with-test
 	$(BIN)/ruff format --check .

@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from recorders.recording import import_run
+from replay.engine.streams.sources import MemorySource, memory_source
+
 # The same examples in every run: a red test is red for everyone, and stays so until it is mended.
 settings.register_profile("fuselog", deadline=None, derandomize=True)
 settings.load_profile("fuselog")
@@ -39,6 +42,12 @@ def real_data() -> Path:
 def mrclam6(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of MRCLAM data set 6, unpacked once."""
     return _unpacked(real_data / "mrclam6.tar.xz", tmp_path_factory) / "mrclam6"
+
+
+@pytest.fixture(scope="session")
+def mrclam6_log(mrclam6: Path) -> MemorySource:
+    """The log of MRCLAM data set 6, imported once."""
+    return memory_source(*import_run("mrclam", mrclam6, {}))
 
 
 @pytest.fixture(scope="session")

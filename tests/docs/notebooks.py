@@ -11,19 +11,25 @@ FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 
 
-def executed(path: Path) -> Any:
-    """A notebook, run from top to bottom in an empty folder; raises where a cell does.
+def executed(*paths: Path) -> list[Any]:
+    """Notebooks, run from top to bottom, each in an empty folder; raises where a cell does.
 
-    Without the notices of what is compiled, which depend on what is in the cache.
+    One kernel runs all, which forgets every name between two. Without the notices of what is
+    compiled, which depend on what is in the cache.
     """
-    notebook = nbformat.read(path, as_version=4)
+    all_in_one = nbformat.v4.new_notebook()
+    notebooks = [nbformat.read(path, as_version=4) for path in paths]
     with tempfile.TemporaryDirectory() as folder:
-        place = {"metadata": {"path": folder}}
-        nbclient.NotebookClient(notebook, resources=place, record_timing=False).execute()
-    for cell in notebook.cells:
+        for path, notebook in zip(paths, notebooks, strict=True):
+            place = Path(folder, path.stem)
+            place.mkdir()
+            apart = nbformat.v4.new_code_cell(f"%reset -f\nimport os\nos.chdir({str(place)!r})\ndel os")
+            all_in_one.cells += [apart, *notebook.cells]
+        nbclient.NotebookClient(all_in_one, record_timing=False).execute()
+    for cell in (cell for notebook in notebooks for cell in notebook.cells):
         if "outputs" in cell:
             cell.outputs = [output for output in cell.outputs if not _is_notice(output)]
-    return notebook
+    return notebooks
 
 
 def _is_notice(output: Any) -> bool:
@@ -39,5 +45,5 @@ def printed(notebook: Any) -> list[str]:
 
 if __name__ == "__main__":
     for each in NOTEBOOKS:
-        nbformat.write(executed(each), each)
+        nbformat.write(*executed(each), each)
         print(each)

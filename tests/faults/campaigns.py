@@ -52,17 +52,15 @@ def run(seconds: float, rng: np.random.Generator, most: int | None = None) -> Ta
 
 def _prepared(number: int, command: str) -> tuple[Path, Path, dict[str, str]]:
     """The finished cells of a campaign and of another seed, and what the whole campaign leaves."""
-    assert _main(command.replace("SEED", "1"))[0] == 0
-    whole = _state(Path("out"))
-    shutil.rmtree("out")
-    places = []
+    places, whole = [], {}
     finish = Checkpoints.end
     for seed in "12":
         Checkpoints.end = partialmethod(_stopped, finish)  # type: ignore[method-assign, assignment]
         try:
-            _main(command.replace("SEED", seed))
+            assert _main(command.replace("SEED", seed))[0] == 0
         finally:
             Checkpoints.end = finish  # type: ignore[method-assign]
+        whole = whole or _state(Path("out"))
         shutil.rmtree("out")
         places.append(Path(f"kept-{number}-{seed}"))
         Path("out.unfinished").rename(places[-1])

@@ -141,18 +141,18 @@ def _golden_bytes(rng: np.random.Generator) -> tuple[str, Iterator[str]]:
     """An archive that is cut or flipped, holds something else, or unpacks to very much."""
     path = Path("ekf.golden.xz")
     raw, place = path.read_bytes(), int(rng.integers(path.stat().st_size))
-    contents = [
-        raw[:place],
-        raw[:place] + bytes([raw[place] ^ 1 << int(rng.integers(8))]) + raw[place + 1 :],
-        raw + raw,
-        lzma.compress(bytes(1 << 29), preset=0),
-        lzma.compress(b"[" * (1 << 20)),
-        lzma.compress(b"[" + b"[]," * (1 << 24) + b"[]]", preset=0),
-        lzma.compress(b'{"format": 1}'),
-        b"",
+    contents: list[Callable[[], bytes]] = [
+        lambda: raw[:place],
+        lambda: raw[:place] + bytes([raw[place] ^ 1 << int(rng.integers(8))]) + raw[place + 1 :],
+        lambda: raw + raw,
+        lambda: lzma.compress(bytes(1 << 29), preset=0),
+        lambda: lzma.compress(b"[" * (1 << 20)),
+        lambda: lzma.compress(b"[" + b"[]," * (1 << 24) + b"[]]", preset=0),
+        lambda: lzma.compress(b'{"format": 1}'),
+        lambda: b"",
     ]
     kind = int(rng.integers(len(contents)))
-    path.write_bytes(contents[kind])
+    path.write_bytes(contents[kind]())
     update = "check run.mcap -e ekf --update --against ekf.golden.xz"
     return f"golden, bytes of kind {kind}, {place}", _on("", (*CHECK, update))
 

@@ -4,10 +4,11 @@ Where an experiment is large, its recipe shortens it. Where one of its cases, or
 family, reaches code that the first log does not, that is a golden of its own.
 """
 
+import json
 import tarfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,9 @@ import numpy as np
 from pipeline.runs.experiment import Experiment, load_experiment
 from pipeline.runs.inputs import load_scenario, shipped
 from pipeline.studies.optical.moving import unknowns
+from recorders.log import RunMetadata
 from recorders.parameters import merge
-from recorders.recording import import_run, record_run
+from recorders.recording import Recording, import_run, record_run
 from recorders.simulators.moving_optical import MovingOpticalParameters
 from replay.engine.streams.sources import MemorySource, memory_source
 
@@ -97,6 +99,8 @@ def importer_of(experiment: Experiment) -> str:
 
 
 SHORT = {"duration_s": 40.0}
+# of vehicles, whose steps are dear
+SHORTER = {"duration_s": 15.0}
 AUGMENTED = {
     "estimate": ["bias_range_m"],
     "estimate_sigma": {"bias_range_m": 0.5},
@@ -122,13 +126,17 @@ SET_FILTERS = {
     for name, edges in (("filter", 400), ("filter-l8", 4))
 }
 BIASES = {"model": "moving-sights", **unknowns(MovingOpticalParameters())}
+MIXTURES = ("hmm", "ergodic", "density-joint", "density-by-modality")
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
 # a diagnosis is a search, which its own tests hold to what is known
 RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "diagnosis"} | {
     "biometrics-bssr1": Recipe(
         "biometrics-bssr1",
-        estimators={label: {"iterations": 5} for label in ("density-joint", "density-by-modality")},
+        estimators={
+            **{label: {"folds": 2} for label in ("qda", "knn", "logistic")},
+            **{label: {"folds": 2, "iterations": 5} for label in MIXTURES},
+        },
     ),
     "biometrics-sequential": Recipe("biometrics-sequential", estimators={"ratio": {"pairs": "trimmed"}}),
     "biometrics-sequential-simulated": Recipe(
@@ -260,13 +268,13 @@ RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "dia
     "torus-real": Recipe(
         "torus-real", over={"options": {"folds": 2, "most_components": 2, "grid_cells": 24}}
     ),
-    "vehicles-cv": Recipe("vehicles-cv", parameters=SHORT),
+    "vehicles-cv": Recipe("vehicles-cv", parameters=SHORTER),
     "vehicles-cv-losses-10": Recipe(
         "vehicles-cv",
-        parameters={**SHORT, "network": {"detection_probability": 0.9, "clutter_per_scan": 5.0}},
+        parameters={**SHORTER, "network": {"detection_probability": 0.9, "clutter_per_scan": 5.0}},
     ),
-    "vehicles-ctm2": Recipe("vehicles-ctm2", parameters=SHORT),
-    "vehicles-ctm4": Recipe("vehicles-ctm4", parameters=SHORT),
+    "vehicles-ctm2": Recipe("vehicles-ctm2", parameters=SHORTER),
+    "vehicles-ctm4": Recipe("vehicles-ctm4", parameters=SHORTER),
 }
 
 
@@ -293,13 +301,19 @@ def unpack(data: Path, importers: Iterable[str], scratch: Path) -> dict[str, Pat
     return places
 
 
+@cache
+def _imported(source: str, place: Path, parameters: str) -> tuple[Recording, RunMetadata]:
+    """A recording, once for all recipes that it serves; its parameters as JSON."""
+    return import_run(source, place, json.loads(parameters))
+
+
 def first_log(recipe: Recipe, places: Mapping[str, Path]) -> MemorySource:
     """The log of a recipe: recorded from the experiment's seed, or imported from its place."""
     experiment = recipe.loaded
     if experiment.import_:
         given = experiment.import_
         place = places[recipe.importer] / recipe.part
-        recording, run = import_run(given.source, place, given.parameters)
+        recording, run = _imported(given.source, place, json.dumps(given.parameters))
     else:
         assert experiment.record
         [own, *_] = experiment.options.get("scenarios", [experiment.record.scenario])

@@ -85,9 +85,12 @@ def holders() -> dict[str, set[str]]:
 
 
 def prose_of(path: Path) -> Iterator[str]:
-    for token in tokenize.generate_tokens(io.StringIO(text_of(path)).readline):
-        if token.type == tokenize.COMMENT:
-            yield token.string
+    text = text_of(path)
+    behind = "\n".join(line.partition("#")[2] for line in text.splitlines())
+    if DOTTED.search(behind) or PATH.search(behind):  # few files: to take one apart takes long
+        for token in tokenize.generate_tokens(io.StringIO(text).readline):
+            if token.type == tokenize.COMMENT:
+                yield token.string
     for node in nodes_of(path):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
             yield ast.get_docstring(node) or ""
@@ -103,16 +106,25 @@ def is_there(dotted: str) -> bool:
     return True
 
 
-def missing_from(path: Path, text: str) -> list[str]:
-    """The names in a text that lead nowhere."""
+def variables_of(path: Path) -> set[str]:
     variables = {node.id for node in nodes_of(path) if isinstance(node, ast.Name)}
     variables |= {node.arg for node in nodes_of(path) if isinstance(node, ast.arg)}
-    variables -= {node.name for node in nodes_of(path) if isinstance(node, ast.ClassDef | ast.alias)}
-    dotted = [each for each in DOTTED.findall(text) if not is_there(each)]
-    fields = holders()["a variable"]
-    return [
-        each for each in dotted if not (each.split(".")[0] in variables and each.split(".")[1] in fields)
-    ] + [each for each in PATH.findall(text) if not (ROOT / each).exists()]
+    return variables - {
+        node.name for node in nodes_of(path) if isinstance(node, ast.ClassDef | ast.alias)
+    }
+
+
+def missing_from(path: Path, text: str) -> list[str]:
+    """The names in a text that lead nowhere."""
+    missing = [each for each in PATH.findall(text) if not (ROOT / each).exists()]
+    if dotted := [each for each in DOTTED.findall(text) if not is_there(each)]:
+        variables, fields = variables_of(path), holders()["a variable"]
+        missing += [
+            each
+            for each in dotted
+            if not (each.split(".")[0] in variables and each.split(".")[1] in fields)
+        ]
+    return missing
 
 
 @pytest.mark.paper

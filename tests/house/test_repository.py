@@ -66,10 +66,13 @@ def test_the_lanes_run_every_test_once(target: str) -> None:
     ]
 
     def runs(lane: list[str], path: Path) -> bool:
-        left_out = [each.removeprefix("--ignore=") for each in lane if each.startswith("--ignore=")]
+        left_out = re.findall(r"--ignore(?:-glob)?='?([^\s']+)", " ".join(lane))
         taken = [each for each in lane if not each.startswith("-")] or ["tests"]
-        above = {path.as_posix(), *(each.as_posix() for each in path.parents)}
-        return bool(above.intersection(taken)) and not above.intersection(left_out)
+
+        def is_of(patterns: list[str]) -> bool:
+            return any(each.match(pattern) for each in (path, *path.parents) for pattern in patterns)
+
+        return is_of(taken) and not is_of(left_out)
 
     for path in ROOT.glob("tests/**/test_*.py"):
         assert sum(runs(lane, path.relative_to(ROOT)) for lane in lanes) == 1, path

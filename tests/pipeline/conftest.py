@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -48,6 +48,17 @@ def run_here(*arguments: str | Path) -> Said:
 def fuselog() -> Callable[..., Said]:
     """Run a command in this process."""
     return run_here
+
+
+@pytest.fixture(scope="module")
+def blank_figures() -> Iterator[None]:
+    """Figures are written without being drawn, which takes most of a short run's time.
+
+    For modules that look at none; those of studies, experiments, sweeps and the report draw theirs.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.figure.Figure.draw", lambda *_: None)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -222,7 +222,7 @@ def _folder(path: Path) -> None:
     (path / "notes.txt").write_text("mine")
 
 
-def _neighbours(path: Path) -> None:
+def neighbours(path: Path) -> None:
     """Names that were temporary names once, a folder and a link to the user's file among them."""
     for ending in (".old", ".part"):
         path.with_name(path.name + ending).mkdir()
@@ -232,18 +232,13 @@ def _neighbours(path: Path) -> None:
 
 
 class Situation(NamedTuple):
-    """What is in the place: a preparation, whether our own output is there first, and the exit code."""
+    """What no command takes for its own: a preparation, and whether our own output is there first."""
 
     prepare: Callable[[Path], None]
     over_ours: bool = False
-    code: int = 2
 
 
 SITUATIONS = {
-    "nothing": Situation(lambda _: None, code=0),
-    "our own": Situation(lambda _: None, over_ours=True, code=0),
-    "names like temporary ones": Situation(_neighbours, code=0),
-    "the same over our own": Situation(_neighbours, over_ours=True, code=0),
     "a text": Situation(_text),
     "the format, of another program": Situation(foreign),
     "a folder with foreign files": Situation(_folder),

@@ -15,6 +15,8 @@ from recorders.log import Stream, write_log
 from replay.engine.streams.sources import MemorySource
 from tests.pipeline.conftest import Said
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 TRUTH, PRIOR, SIGHTINGS = "/robot1/truth", "/robot1/prior", "/robot1/range_bearing"
 
 

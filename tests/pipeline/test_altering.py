@@ -18,6 +18,8 @@ from recorders.log.streams import concatenate
 from recorders.parameters import parse_settings
 from tests.pipeline.test_python import robot
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 ODOMETRY, PRIOR, SEEN = "/robot1/odometry", "/robot1/prior", "/robot1/range_bearing"
 OPEN = {"gate_probability": 1.0}
@@ -88,6 +90,7 @@ def test_units_signs_axes_and_clocks_are_mended_as_people_write_them(
     assert nis(faulty, **{f"{topic}.{setting}": undoes}) == pytest.approx(nis(run), rel=1e-5)
 
 
+@pytest.mark.paper
 def test_covariances_of_fixes_are_scaled() -> None:
     """Stated 4 times too large, and mended by what the diagnosis says."""
     run = fl.record("landmarks", seed=3, duration_s=120.0, fix={"rate_hz": 5.0})
@@ -172,6 +175,7 @@ def test_every_command_alters_alike_and_says_so(
     assert at["ekf.nis_per_component.robot1"][1] == told["ekf.nis_per_component.robot1"]
 
 
+@pytest.mark.paper
 def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySource) -> None:
     """No command knows its name; and what is set already is counted in."""
     faulty = put.altered(run, SEEN, put.delayed, 0.3)

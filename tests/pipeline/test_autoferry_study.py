@@ -76,6 +76,7 @@ def test_one_scenario_is_as_stored(autoferry: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "timeline.rrd").exists()
 
 
+@pytest.mark.paper
 def test_claims_of_one_scenario_have_no_verdict_on_the_others(autoferry: Path, tmp_path: Path) -> None:
     """A limit that the published tracker itself misses elsewhere; its numbers are those of the study."""
     label = "hungarian-radar-lidar"

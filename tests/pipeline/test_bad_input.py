@@ -12,6 +12,8 @@ from mcap.writer import Writer
 from recorders.log import open_log, read_streams, write_log
 from recorders.recording import record_run
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 REPLAY_EKF = "replay {} -e ekf"
 
 # What is given, and words that the sentence must have: what is wrong, and what to do.

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.paper
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("biometrics") / "result"
-    settings = {"users": 60, "low_galleries": 3, "options": {"seeds": 2, "replicates": 20}}
+    settings = {"users": 40, "low_galleries": 2, "options": {"seeds": 2, "replicates": 20}}
     label, experiment = load_experiment("biometrics-simulated", settings, {"runs": 2})
     return folder, run_experiment(label, experiment, folder, logs=1)
 

@@ -29,9 +29,11 @@ from replay.foreign.naming import Allowed
 from replay.judging.metrics.sums import BinnedSums
 from tests.bench import scaling
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 # Three cells, of which the last is small.
 RUNS = 260
-SETTINGS = {"duration_s": 3}
+SETTINGS = {"duration_s": 1}
 
 
 def run(folder: Path, open_pool=None, runs: int = RUNS, **options) -> dict[str, bytes]:
@@ -409,7 +411,7 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
         "--out",
         str(place),
         "--set",
-        "duration_s=3",
+        f"duration_s={SETTINGS['duration_s']}",
     ]
     fuselog = Path(sys.executable).with_name("fuselog")
     begun = subprocess.Popen([fuselog, *command, "--workers", "2"], stderr=subprocess.PIPE)
@@ -428,7 +430,7 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
 def test_dask_workers_give_the_same_bytes(place, files):
     """Of a cluster of its own, and of one that is there, whose worker shares no files with it."""
     distributed = pytest.importorskip("distributed")
-    assert run(place, pool_for(None, "local:2", RUNS)) == files
+    assert run(place, pool_for(None, "local:1", RUNS)) == files
     shutil.rmtree(place)
     loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **loopback) as cluster:

@@ -17,6 +17,8 @@ from pipeline.checking.golden import Replayed, checksums
 from pipeline.checking.stored import read, write
 from recorders.log import LogWriter
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 POSE = "/estimates/ekf/robot1/pose"
 INNOVATION = "/estimates/ekf/robot1/innovation"

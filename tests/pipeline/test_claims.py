@@ -240,6 +240,7 @@ def _files(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.is_file()]
 
 
+@pytest.mark.paper
 def test_claims_of_shipped_experiments_are_bound_to_the_data_they_were_made_of(
     real_data: Path, tmp_path: Path
 ) -> None:

@@ -20,6 +20,8 @@ import fuselog as fl
 from pipeline.output.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 PLACE = {"components": "y_m,x_m", "kinds": "linear,linear"}
 

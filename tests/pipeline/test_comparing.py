@@ -16,6 +16,8 @@ import fuselog as fl
 from pipeline.comparing.groups import unlike_runs
 from replay.timeline.side_by_side import _alone
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 RUNS = 8
 TIGHT = {"kind": "ekf", "sigma_range_m": 0.05, "sigma_bearing_rad": 0.01}

@@ -16,6 +16,8 @@ from replay.engine.replaying.usage import Usage
 from replay.engine.streams.blocks import gather
 from tests.pipeline.conftest import Said
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SIGHTINGS, MAP, PRIOR, TRUTH = "/robot1/range_bearing", "/landmarks", "/robot1/prior", "/robot1/truth"
 Streams = dict[str, Stream]
 

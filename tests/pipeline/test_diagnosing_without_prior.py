@@ -111,6 +111,7 @@ def test_a_gate_that_is_set_is_no_advice() -> None:
         assert (mend.setting if mend else None) == setting
 
 
+@pytest.mark.paper
 def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     tmp_path: Path, fuselog: Callable[..., Any]
 ) -> None:

@@ -14,6 +14,8 @@ import fuselog as fl
 from pipeline.logs import rewriting
 from recorders.log import LogWriter, read_span
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 ODOMETRY, RANGES, TRUTH = "/robot1/odometry", "/robot1/range_bearing", "/robot1/truth"
 PRIOR, LANDMARKS = "/robot1/prior", "/landmarks"

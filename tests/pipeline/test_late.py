@@ -13,6 +13,8 @@ from pipeline.output.results import read_result
 from recorders.log import Stream, open_log, read_streams
 from replay.engine.streams.failures import sentences_of
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 Streams = dict[str, Stream]
 LATE = """

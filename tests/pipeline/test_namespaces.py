@@ -13,6 +13,8 @@ from recorders.models.geodesy import out_of_tangent_plane
 from tests.pipeline.test_planes import HERE, POSE, SIGMA_M, STAMPS_NS, car, driven
 from tests.recorders.test_ros import Maker, Sent, write_bag
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SIGMA_MPS, SIGMA_RADPS = 0.05, 0.02
 TRUTH = f"""
 [origin]

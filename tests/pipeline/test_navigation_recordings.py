@@ -58,6 +58,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.paper
 def test_what_is_planted_into_a_walk_is_found_without_a_filter(navigation: Path) -> None:
     """Where the course is not the heading, its lag of .58 s is no delay."""
     walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")

@@ -84,9 +84,13 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _run(package: Path, commands: list[str]) -> list[dict[str, str | int]]:
-    """Run commands in one process that has the package: exit code, output and errors of each."""
+    """Run commands in one process that has the package: exit code, output and errors of each.
+
+    Figures are written without being drawn, as by `blank_figures`.
+    """
     code = (
         "import sys, json, io, shlex; from contextlib import *; from pipeline.command_line import main\n"
+        "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "for line in json.load(sys.stdin):\n"
         "    out, err = io.StringIO(), io.StringIO()\n"
         "    with redirect_stdout(out), redirect_stderr(err): code = main(shlex.split(line)[1:])\n"

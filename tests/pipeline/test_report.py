@@ -561,7 +561,7 @@ def test_particles_are_in_the_first_picture_and_their_effective_share_in_a_figur
         'title = "cloud"\nstudy = "localization"\n[record]\nscenario = "landmarks"\n'
         '[estimators."particles:50"]\ncloud = true\n'
     )
-    run = ["run", experiment, "--set", "duration_s=2", "--logs", "1", "--out", folder]
+    run = ["run", experiment, "--set", "duration_s=1", "--logs", "1", "--out", folder]
     assert fuselog(*run).code == 0
     write_report([folder], tmp_path / "page.html")
     charts = Page((tmp_path / "page.html").read_text(encoding="utf-8")).charts

@@ -14,6 +14,7 @@ import fuselog as fl
 from tests.replay.timeline.test_timeline import read
 
 
+@pytest.mark.paper
 def test_a_bag_becomes_a_log_and_info_says_how(
     fuselog: Callable[..., Any], real_data: Path, tmp_path: Path
 ) -> None:
@@ -58,11 +59,8 @@ def test_info_of_a_bag_that_is_no_mcap(
 
 
 @pytest.mark.paper
-def test_from_the_bag_to_a_picture(
-    fuselog: Callable[..., Any], real_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_from_the_bag_to_a_picture(fuselog: Callable[..., Any], real_data: Path, tmp_path: Path) -> None:
     """No line of own code: odometry with the poses of AMCL, and alone; both clocks on the timeline."""
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
     log, rrd, estimates = (tmp_path / name for name in ("nav.mcap", "nav.rrd", "estimates.mcap"))
     bag = str(real_data / "nav2_turtlebot.mcap")
     assert fuselog("import", "ros", bag, "-o", str(log)).code == 0

@@ -36,6 +36,7 @@ def test_bounds_are_those_of_the_other_robots():
     assert float(bearings["bound_rad"]) == pytest.approx(3.29 * np.sqrt(2) * sigma_rad, rel=0.3)
 
 
+@pytest.mark.paper
 def test_the_study_guarantees_and_refuses(tmp_path):
     name, experiment = load_experiment("set-filter", SHORT, {})
     result = run_experiment(name, experiment, tmp_path / "out", logs=1)

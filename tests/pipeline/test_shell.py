@@ -18,7 +18,7 @@ from tests.pipeline.conftest import Said
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-RUN = ["run", "landmarks", "--runs", "3", "--set", "duration_s=2", "--logs", "0"]
+RUN = ["run", "landmarks", "--runs", "1", "--set", "duration_s=1", "--logs", "0"]
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash to complete in")
@@ -42,14 +42,16 @@ def test_the_readmes_line_completes_commands_and_options() -> None:
 
 @pytest.mark.paper
 def test_nothing_is_said_of_progress_where_nobody_watches(
-    tmp_path: Path, start_fuselog: Callable[..., Any]
+    world: Path, tmp_path: Path, start_fuselog: Callable[..., Any]
 ) -> None:
     """Of kernels that are compiled neither: with --json the output is one document and nothing else."""
     fresh = {**os.environ, "FUSELOG_CACHE": str(tmp_path / "cache"), "NUMBA_DISABLE_JIT": "1"}
-    process = start_fuselog(*RUN, "--json", "--out", str(tmp_path / "r"), env=fresh)
+    replay = ("replay", str(world / "log.mcap"), "-e", "ekf", "--json", "-o", str(tmp_path / "est.mcap"))
+    process = start_fuselog(*replay, env=fresh)
     out, err = process.communicate()
     assert err == ""
-    assert json.loads(out)["experiment"] == "landmarks"
+    assert "ekf.position_rmse_m.robot1" in json.loads(out)["metrics"]
+    assert list((tmp_path / "cache").rglob("*.bin"))
 
 
 @pytest.mark.paper

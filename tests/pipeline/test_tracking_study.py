@@ -60,6 +60,7 @@ def test_estimators_are_compared_run_by_run():
     assert len(outcome.metrics) == 2
 
 
+@pytest.mark.paper
 def test_crossing_targets(tmp_path: Path):
     """Two cases of two runs: tables by case, the same ways of the targets in both; claims need all."""
     over = {

@@ -307,6 +307,7 @@ def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
 
 
 @pytest.mark.paper
+@pytest.mark.parametrize("path", [110], indirect=True, ids=["two a chunk"])
 def test_few_bytes_are_read_without_numba(path):
     code = (
         "import sys; from recorders.log import loops, open_log, read_streams\n"

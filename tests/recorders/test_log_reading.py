@@ -34,7 +34,7 @@ def path(tmp_path_factory):
 
 @pytest.mark.paper
 @pytest.mark.parametrize("schema", SCHEMAS.values(), ids=list(SCHEMAS))
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(data=st.data(), compression=st.sampled_from(COMPRESSIONS))
 def test_every_schema_reads_back_bit_for_bit(path, schema, data, compression):
     """Infinities, zeros, NaN where allowed, empty streams and vectors, wide vectors: all are kept."""
@@ -51,7 +51,7 @@ def test_every_schema_reads_back_bit_for_bit(path, schema, data, compression):
 
 
 @pytest.mark.paper
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     data=st.data(),
     chunk_bytes=st.sampled_from([1, 150, 500, 1 << 20]),

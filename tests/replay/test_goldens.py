@@ -1,5 +1,6 @@
 """What the estimators give is what they gave: all experiments' first logs against stored replays."""
 
+import json
 import os
 import subprocess
 import sys
@@ -32,6 +33,20 @@ FRAGILE = (
     "navigation-unknown-heading",
     "set-filter",
 )
+# what a process of its own does, as on another CPU; unless its arithmetic is the given one
+ON_IT = """
+import json, sys
+from pathlib import Path
+from fuselog.testing import assert_same
+from pipeline.checking.golden import arithmetic
+from tests.goldens import store
+_, here, places, *names = sys.argv
+if arithmetic() == here:
+    sys.exit(print("alike"))
+places = {name: Path(place) for name, place in json.loads(places).items()}
+for name in names:
+    assert_same(store.replayed(name, places), store.path_of(name))
+"""
 
 
 def assert_is_golden(name: str, places: dict[str, Path]) -> None:
@@ -58,27 +73,30 @@ def test_simulated(name: str) -> None:
     assert_is_golden(name, {})
 
 
-@pytest.mark.paper
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where real data are unpacked."""
+    return tmp_path_factory.mktemp("goldens")
+
+
 @pytest.mark.parametrize("name", IMPORTED)
-def test_imported(name: str, real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-    scratch = tmp_path_factory.getbasetemp() / "goldens"
+def test_imported(name: str, real_data: Path, scratch: Path) -> None:
     assert_is_golden(name, unpack(real_data, [RECIPES[name].importer], scratch))
 
 
-def test_what_rounding_once_decided_is_the_same_on_an_older_cpu() -> None:
+def test_what_rounding_once_decided_is_the_same_on_an_older_cpu(real_data: Path, scratch: Path) -> None:
     """After the tests above, so that kernels are compiled."""
-
-    def on_it(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command, environment = [sys.executable, *arguments], os.environ | older_cpu()
-        return subprocess.run(command, env=environment, capture_output=True, text=True)
-
-    other = on_it("-c", "from pipeline.checking import golden; print(golden.arithmetic())")
-    assert other.returncode == 0, other.stderr
-    if other.stdout.strip() == arithmetic():
+    places = unpack(real_data, {RECIPES[name].importer for name in FRAGILE} - {""}, scratch)
+    given = json.dumps({name: str(place) for name, place in places.items()})
+    done = subprocess.run(
+        [sys.executable, "-c", ON_IT, arithmetic(), given, *FRAGILE],
+        env=os.environ | older_cpu(),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    if done.stdout.strip() == "alike":
         pytest.skip("without what NumPy can leave out of this CPU, it computes alike")
-    names = " or ".join(f"[{name}]" for name in FRAGILE)
-    replayed = on_it("-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", names)
-    assert replayed.returncode == 0, replayed.stdout
 
 
 def test_every_estimator_has_a_golden() -> None:

@@ -7,7 +7,7 @@ from pipeline.runs.recorded import replay_ensemble
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.models.planar import range_bearing
-from recorders.recording import Recording, import_run
+from recorders.recording import Recording
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import memory_source
@@ -132,12 +132,11 @@ def test_an_anchor_that_is_not_there_is_refused():
 
 
 @pytest.fixture(scope="module")
-def judged(mrclam6):
-    sources = [memory_source(*import_run("mrclam", mrclam6, {}))]
+def judged(mrclam6_log):
     found = {}
     for mode in ("alone", "naive", "ci", "joint"):
         estimators = {mode: {"kind": f"cooperative:{mode}"}}
-        errors = replay_ensemble(sources, estimators, gap_limit_s=0.2).errors
+        errors = replay_ensemble([mrclam6_log], estimators, gap_limit_s=0.2).errors
         rmse = np.array([ACCURACY.of(each)["position_rmse_m"] for each in errors])
         found[mode] = rmse, np.array([CONSISTENCY.of(each)["position_nees"] for each in errors])
     return found

@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose
 from pipeline.runs.recorded import record_ensemble, replay_ensemble
 from replay.engine.streams.sources import MemorySource
 from replay.estimators.models.vehicle_kalman import VEHICLE
-from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 RUNS = 200
@@ -28,10 +27,6 @@ SINGLE = {f"ekf-{mode}": {"kind": "ekf", "mode": mode} for mode in MODES} | {
 @cache
 def sources() -> Sequence[MemorySource]:
     return record_ensemble("manoeuvres", {}, 1, RUNS)
-
-
-def test_the_model_is_what_it_says() -> None:
-    check_model(VEHICLE)
 
 
 def test_the_vehicle_turns_and_stops_as_it_says() -> None:

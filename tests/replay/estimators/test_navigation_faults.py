@@ -181,7 +181,7 @@ def test_several_units_are_told_apart_before_another_model_is_taken():
 @pytest.mark.parametrize(("method", "goes_on"), [("bank", True), ("particles", False)])
 def test_in_a_gap_a_bank_waits_and_particles_end_with_a_sentence(method: str, goes_on: bool):
     """A bank goes on after it as its filters do; a cloud of particles has no such step, and says so."""
-    slow = {"unit": {"rate_hz": 10.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
+    slow = {"unit": {"rate_hz": 5.0}, "gnss": {"rate_hz": 1.0, "velocity_rate_hz": 1.0}}
     count = {} if goes_on else {"particles": 20}
     source = drive(silent, duration_s=26.0, **slow)
     found = outputs(INERTIAL, method, [source], **count)

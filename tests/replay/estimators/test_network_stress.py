@@ -1,4 +1,4 @@
-"""Nodes that send seldom, refuse what they hear, or lie: a room of a few steps, in plain Python."""
+"""Nodes that send seldom, refuse what they hear, or lie: a room of a few steps."""
 
 import numpy as np
 import pytest
@@ -15,11 +15,6 @@ RULE = {"kind": "network:ci-trace"}
 @pytest.fixture(scope="module")
 def room():
     return record_ensemble("ispace", {"steps": 20}, 3, 1)
-
-
-@pytest.fixture(autouse=True)
-def plain(monkeypatch):
-    monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
 
 
 def replayed(room, **estimators):

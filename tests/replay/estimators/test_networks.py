@@ -17,7 +17,7 @@ from replay.estimators.networks.networks import ALONE, CENTRALISED, TRAP, Rule
 
 pytestmark = pytest.mark.paper
 
-RUNS = 120
+RUNS = 60
 
 
 def judged(sources, rule, settle_s=1.0):

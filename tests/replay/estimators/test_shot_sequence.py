@@ -18,7 +18,6 @@ from replay.estimators.models.shot_sequence import (
     find_shooter,
     log_likelihood,
 )
-from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 AIR: dict[str, Any] = {"speed_of_sound_mps": 342.0, "mach_number": 2.0}
@@ -38,10 +37,6 @@ EXACT = {
 def recorded(seed: int = 1, **values: Any) -> MemorySource:
     """A log of the recorder `shot-sequence`."""
     return memory_source(*record_run("shot-sequence", values, seed))
-
-
-def test_the_model_is_what_it_says() -> None:
-    check_model(MOVING_SHOOTER, AIR)
 
 
 def test_reports_are_of_where_a_shot_was_fired() -> None:

@@ -12,7 +12,6 @@ from recorders.log import RunMetadata, Stream, make_stream, schemas
 from recorders.recording import record_run
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.estimators.models.sound_source import SOUND_SOURCE, SoundSourceParameters, find_source
-from replay.inference.model.checking import check_model
 from tests.replay.inference.replays import outputs
 
 SPEED = 343.0
@@ -51,10 +50,6 @@ def found(of: dict[str, Stream], **values: Any) -> Any:
     return find_source(
         {"differences": of["/owl/differences"], "/microphones": of["/microphones"]}, parameters
     )
-
-
-def test_the_model_is_what_it_says() -> None:
-    check_model(SOUND_SOURCE, {"speed_of_sound_mps": SPEED})
 
 
 @pytest.mark.usefixtures("uncompiled")

@@ -109,13 +109,13 @@ ATTITUDE = Model(
 )
 
 
-def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
+def simulate(seed: int, steps: int = 500) -> tuple[MemorySource, Floats, Floats]:
     """The log, the true states after every step, and what the gyro said."""
     rng = np.random.default_rng(seed)
     start = np.array([0.3] * 3 + [0.02] * 3) * rng.standard_normal(6)
     q, bias = Rotation.from_rotvec(start[:3]).as_quat(scalar_first=True), start[3:]
     gyro, force, field, truth = [], [], [], []
-    for k in range(500):
+    for k in range(steps):
         t = k * STEP_S
         rate = np.array([0.5 * np.sin(0.7 * t), 0.4 * np.cos(0.5 * t), 0.3])
         gyro.append(rate + bias + 0.01 / np.sqrt(STEP_S) * rng.standard_normal(3))
@@ -132,8 +132,8 @@ def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
     metadata = {"components": ",".join(STATE), "kinds": ",".join(STATE.values())}
     prior = np.diag([0.3**2] * 3 + [0.02**2] * 3)
 
-    def vectors(topic: str, steps: Any, values: Any) -> Any:
-        stamps = EPOCH_NS + step_ns * np.array(steps)
+    def vectors(topic: str, at: Any, values: Any) -> Any:
+        stamps = EPOCH_NS + step_ns * np.array(at)
         return make_stream(topic, schemas.VECTOR_MEASUREMENT, stamps, value=np.array(values))
 
     streams = [
@@ -145,7 +145,7 @@ def simulate(seed: int) -> tuple[MemorySource, Floats, Floats]:
             mean=[[1.0, 0, 0, 0, 0, 0, 0]],
             covariance=prior.reshape(1, 36),
         ),
-        vectors("/gyro", np.arange(500), gyro),
+        vectors("/gyro", np.arange(steps), gyro),
         vectors("/force", *zip(*force, strict=True)),
         vectors("/field", *zip(*field, strict=True)),
     ]

@@ -33,8 +33,8 @@ SCENARIOS: dict[str, tuple[str, dict[str, Any]]] = {
     "moving-sights": ("moving-los", {"duration_s": 6.0}),
     "ranging-pose": ("ranging", {**FEW_RANGES, "tags_m": [(0.4, 0.0, 0.0), (-0.3, 0.3, 0.0)]}),
     "ranging-position": ("ranging", {**FEW_RANGES, "tags_m": [(0.0, 0.0, 0.0)]}),
-    "robot": ("landmarks", {"duration_s": 10.0, "range_bearing": {"rate_hz": 4.0}}),
-    "vehicle": ("vehicles", {"duration_s": 30.0, "stochastic": True}),
+    "robot": ("landmarks", {"duration_s": 6.0, "range_bearing": {"rate_hz": 4.0}}),
+    "vehicle": ("vehicles", {"duration_s": 20.0, "stochastic": True}),
 }
 # Not the extended target: its pseudo-measurement is quadratic, and its scales are uniform.
 NEAR_LINEAR = ("robot", "vehicle", "batch-reactor")
@@ -106,7 +106,7 @@ def test_every_cell_is_consistent(model: str, method: str, request: pytest.Fixtu
 def test_unscented_and_extended_inertial_filters_agree(request: pytest.FixtureRequest) -> None:
     """One run, in which what both leave out is small: within a fifth of a standard deviation."""
     settings = {"model": "inertial"}
-    log = record_ensemble("navigation", {"duration_s": 11.0, "unit": {"rate_hz": 25.0}}, 3, 1)
+    log = record_ensemble("navigation", {"duration_s": 11.0, "unit": {"rate_hz": 12.5}}, 3, 1)
 
     def errors(method: str) -> Errors:
         replayed = replay_ensemble(log, {method: settings}, gap_limit_s=0.2)

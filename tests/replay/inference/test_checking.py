@@ -20,6 +20,7 @@ from tests.replay.inference.wheel import make_wheel
 PARAMETERS = {
     "moving-shooter": {"speed_of_sound_mps": 342.0, "mach_number": 2.0},
     "inertial": {"origin_latitude_deg": 40.0},
+    "sound-source": {"speed_of_sound_mps": 343.0},
 }
 MODELS = {**registered_models(), "vehicle A": VEHICLE_A, "attitude": ATTITUDE, "wheel": make_wheel()}
 

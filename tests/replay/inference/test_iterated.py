@@ -130,8 +130,8 @@ def test_it_is_least_squares(loss: str, uncompiled: None) -> None:
     A robust loss goes by the length of a message's residual: what scipy gets is that residual, as long
     as its loss is high. There is an outlier.
     """
-    told = vehicle_a.simulate(7)[0][:26]
-    row = max(row for row, each in enumerate(told[:20]) if each[1] == "rb")
+    told = vehicle_a.simulate(7)[0][:16]
+    row = max(row for row, each in enumerate(told[:12]) if each[1] == "rb")
     told[row] = (*told[row][:3], told[row][3] + np.array([4.0, 0.0]))
     settings = {"loss": loss, "loss_scale": 1.5}
     found = outputs(

@@ -97,10 +97,10 @@ def test_as_many_particles_are_effective_as_the_sheet_says() -> None:
 
 @pytest.mark.paper
 def test_the_likelihood_is_unbiased() -> None:
-    _, total = errors(400, 5000)
+    _, total = errors(400, 1250)
     ratio = np.exp(total)
     assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
-    assert 0.004 < ratio.std(ddof=1) / np.sqrt(len(ratio)) < 0.005
+    assert 0.008 < ratio.std(ddof=1) / np.sqrt(len(ratio)) < 0.01  # .004 to .005 of 5000 runs
 
 
 def test_innovations_are_those_of_the_moments() -> None:

