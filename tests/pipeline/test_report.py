@@ -342,6 +342,26 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     assert not re.search(r"\de[-+]\d", " ".join(page.texts["h3"]))
 
 
+def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it(
+    tmp_path: Path, fuselog: Fuselog
+) -> None:
+    """A range noise stated four times too small; kept in the result by `run`, found anew by `report`."""
+    folder = tmp_path / "broken"
+    broken = ["--set", "ekf.sigma_range_m=0.025", "--set", "duration_s=5", "--runs", "2"]
+    done = fuselog("run", "landmarks", *broken, "--diagnose", "--out", folder)
+    assert "likeliest cause of ekf: sigma_range_m: the standard deviation is" in done.out
+    [cause] = read_result(folder).causes
+    key, _, value = cause.setting.partition("=")
+    assert (cause.estimator, key) == ("ekf", "ekf.sigma_range_m")
+    assert float(value) == pytest.approx(0.1, rel=0.15)
+    assert cause.mended.startswith("Mended so, over 2 runs: position error, RMS ")
+    assert f"Likeliest: {cause.short}." in said(read_result(folder), folder)[1]
+    write_report([folder], tmp_path / "page.html")
+    assert f"<code>--set {cause.setting}</code>" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    again = fuselog("run", "landmarks", *broken, "--out", folder)  # which is ours still
+    assert again.code == 0
+
+
 def test_the_lens_is_at_the_second_that_is_most_like_the_run() -> None:
     """Half of the truths are outside over the run: neither where all are nor where none is."""
     time_s = np.arange(0.0, 30.0, 0.1)

@@ -54,7 +54,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
     """A second of the run at one scale for all estimators whose ellipses the scene is too large for.
 
     It is the second whose share of truths outside the ellipses is nearest the whole run's, over all
-    estimators that are shown; the first of several. None where the scene shows all there is.
+    estimators that are shown; of several the one nearest the middle. None where the scene shows all there is.
     """
     sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
     shown = {
@@ -116,7 +116,9 @@ def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
         with np.errstate(invalid="ignore"):
             shares = np.bincount(place[known], is_out[known], count) / total
         away += np.abs(np.where(total > 0, shares, np.inf) - is_out.mean())
-    return begin_s + int(np.argmin(away)) * float(length_s), float(length_s)
+    as_good = np.flatnonzero(away <= away.min() + 1e-9)
+    middle = as_good[np.argmin(np.abs(as_good - 0.5 * (count - 1)))]
+    return begin_s + int(middle) * float(length_s), float(length_s)
 
 
 def _rows_within(each: Followed, begin_s: float, length_s: float) -> NDArray[np.int64]:
