@@ -54,7 +54,7 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
     """A second of the run at one scale for all estimators whose ellipses the scene is too large for.
 
     It is the second whose share of truths outside the ellipses is nearest the whole run's, over all
-    estimators that are shown; of several the one nearest the middle. None where the scene shows all there is.
+    estimators that are shown; of several the one nearest the middle. None where the scene shows all.
     """
     sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
     shown = {
