@@ -196,8 +196,8 @@ class Findings:
         mean = float(np.mean(np.square(values) if squared else values))
         value = math.sqrt(mean) if squared else mean
         each_run = self.by_run(label, self.main).to_numpy(dtype=float)
-        low, high = mean_interval(each_run**2 if squared else each_run)
-        return Spread(value, *(map(math.sqrt, (low, high)) if squared else (low, high)))
+        low, high = (rms_interval if squared else mean_interval)(each_run)
+        return Spread(value, low, high)
 
     def _of_nees(self, label: str) -> Consistency | None:
         for key, name in (("nees", "NEES"), ("position_nees", "NEES of the position")):
@@ -236,19 +236,28 @@ class Findings:
 
 
 def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Where the mean of runs lies with 95 %: the percentile bootstrap of `compare`, NaN of few runs.
-
-    Of many runs the mean is normal, and resamples would take much memory to say the same.
-    """
+    """Where the mean of runs lies with 95 %, by Student's distribution; NaN of few runs."""
     runs = len(values)
     if runs < FEWEST_RUNS:
         return math.nan, math.nan
+    half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
+    return float(values.mean()) - half, float(values.mean()) + half
+
+
+def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
+    """Where the root mean square of runs lies with 95 %: the bootstrap of `compare`, NaN of few runs.
+
+    Of many runs the mean square is normal, and resamples would take much memory to say the same.
+    """
+    runs, squares = len(values), values**2
+    if runs < FEWEST_RUNS:
+        return math.nan, math.nan
     if runs > MANY_RUNS:
-        half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
-        return float(values.mean()) - half, float(values.mean()) + half
+        low, high = mean_interval(squares)
+        return math.sqrt(max(low, 0.0)), math.sqrt(high)
     drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
     tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
-    low, high = np.quantile(values[drawn].mean(axis=1), [tail, 1.0 - tail])
+    low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
     return float(low), float(high)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import NamedTuple
 
-from pipeline.output.report.evidence import MARGIN, MATERIAL, Findings, mean_interval
+from pipeline.output.report.evidence import MARGIN, MATERIAL, Findings, mean_interval, rms_interval
 from pipeline.output.results import Measured, MetricTable
 from pipeline.output.words import (
     ACCURACY,
@@ -161,11 +161,8 @@ def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
     if quantity(key).group not in (ACCURACY, CONSISTENCY) or column not in found.rows:
         return ""
     values = found.by_run(label, column).to_numpy(dtype=float)
-    squared = "rmse" in column
-    low, high = mean_interval(values**2 if squared else values)
-    if not math.isfinite(low):
-        return ""
-    return interval(math.sqrt(low), math.sqrt(high), own) if squared else interval(low, high, own)
+    low, high = (rms_interval if "rmse" in column else mean_interval)(values)
+    return interval(low, high, own) if math.isfinite(low) else ""
 
 
 def _aim(found: Findings, key: str) -> str:
