@@ -105,7 +105,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """The colour of every label; charts that begin with the same labels agree on theirs."""
+        """Return the colour of every label; charts that begin with the same labels agree on theirs."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
@@ -130,7 +130,7 @@ def thinned(count: int) -> slice:
 def curve(
     label: str, x: ArrayLike, y: ArrayLike, style: Style = "line", *, reference: bool = False
 ) -> Series:
-    """A series of numbers y over x, numbers or names."""
+    """Return a series of numbers y over x, numbers or names."""
     return Series(label=label, x=_places(x), y=_numbers(y), style=style, reference=reference)
 
 
@@ -142,7 +142,7 @@ def path(
 
 
 def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference: bool = False) -> Band:
-    """A range over x, numbers or names."""
+    """Return a range over x, numbers or names."""
     return Band(label=label, x=_places(x), low=_numbers(low), high=_numbers(high), reference=reference)
 
 

@@ -29,7 +29,7 @@ from replay.judging.metrics.measuring import find_metrics
 
 
 class Experiment(Parameters):
-    """One experiment as its TOML file says it.
+    """Describes one experiment as its TOML file says it.
 
     The runs are recorded from a scenario, imported, or logs that are there.
 
@@ -111,7 +111,7 @@ class Experiment(Parameters):
 
     @property
     def files(self) -> list[Path]:
-        """The logs that are replayed."""
+        """Return the logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []
 
 
@@ -159,7 +159,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Study:
-    """A registered study does an experiment's work.
+    """Does an experiment's work: a registered study.
 
     `run` writes its logs and timeline into the setting's folder, and returns what it found. Where it
     replays by `pipeline.runs.campaigns` alone, `is_campaign` says so: others may work on parts of the
