@@ -3,8 +3,9 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pipeline.output.claims import Claim
 from pipeline.output.report.verdict import verdict
+
+from pipeline.output.claims import Claim
 from pipeline.output.results import Result
 from replay.judging.diagnostics import LEAST_SHARE
 
