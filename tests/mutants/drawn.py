@@ -93,7 +93,7 @@ DRAWN = [
         "tests/pipeline/test_alarms.py tests/pipeline/test_command_line.py tests/pipeline/test_python.py",
     ),
     Fault(
-        "pipeline/output/report/verdict.py",
+        "pipeline/output/report/kinds.py",
         "if len(estimators) > MOST_NAMED:",
         "if len(estimators) >= MOST_NAMED:",
         "tests/pipeline/test_alarms.py tests/pipeline/test_bad_input.py tests/pipeline/test_python.py",
