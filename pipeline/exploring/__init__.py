@@ -1,5 +1,5 @@
 """Explores a filter by hand: a local page whose sliders replay a log while they are dragged.
 
-`session.py` holds a log and the filters on it, without server or browser: begin there. `page.py` binds
-it to widgets and plots, `serving.py` shows the page to this machine alone.
+Begin with `session`: a log and the filters on it, without server or browser. `page` binds it to widgets
+and plots, `serving` shows the page to this machine alone.
 """

@@ -8,10 +8,11 @@ from typing import Any
 from bokeh.document import Document
 from bokeh.events import MouseMove
 from bokeh.layouts import column, row
-from bokeh.models import Button, Div, Range1d, Select, Span
+from bokeh.models import Div, Range1d, Select, Span
 from bokeh.models import Slider as SliderWidget
 
 from pipeline.exploring.curves import true_path
+from pipeline.exploring.markup import SIDE, label_of, numbers_html, verdict_html
 from pipeline.exploring.newest import NewestFirst
 from pipeline.exploring.plots import (
     COLOURS,
@@ -31,20 +32,15 @@ from pipeline.exploring.plots import (
     whiteness_plot,
 )
 from pipeline.exploring.session import Played, Session
-from pipeline.exploring.sliders import STEPS, Slider, in_words
-from pipeline.exploring.verdict import Verdict, numbers_of
+from pipeline.exploring.sliders import Slider
+from pipeline.exploring.verdict import Verdict
+from pipeline.exploring.widgets import NONE, buttons, filter_choices, widget_of
 from recorders.errors import BadInput
 from recorders.log import schemas
-from replay.inference.all_methods import METHODS
 
-NONE = "none"
-SIDE = 300  # the width of the sliders' column, in pixels
 WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
 GROW = {"flex": "1 1 350px"}
-A_ROW = 2  # buttons
-SPREAD = '<div style="display:flex;justify-content:space-between">'
 SLOW_S = 1.0  # a replay that takes longer is said to
-MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
 
 
 class Page:
@@ -120,16 +116,7 @@ class Page:
         """All that is to the left: filters, buttons, sliders."""
         session = self.session
         heading = Div(text=f"<b>fuselog</b> explore<br>{escape(session.source.name)}", width=SIDE)
-        width = (SIDE - 20) // 2
-        names = list(dict.fromkeys([*session.filters, *(each for each in METHODS if each != "bound")]))
-        chosen = [*session.filters, NONE][:2]
-        choices = [
-            Select(title=title, name=title, options=options, value=value, width=width)
-            for title, options, value in (
-                ("Filter", names, chosen[0]),
-                ("Second", [NONE, *names], chosen[1]),
-            )
-        ]
+        choices = filter_choices(session.filters)
         for choice in choices:
             choice.on_change("value", partial(self._choose_filters, choices))
         acts: dict[str, Callable[[], None]] = {
@@ -147,7 +134,7 @@ class Page:
             heading,
             row(*choices),
             row(self._case_choice, self._component),
-            *self._buttons(acts),
+            *buttons(acts),
         ]
         group = ""
         for slider in session.sliders:
@@ -155,19 +142,7 @@ class Page:
                 group = slider.group
                 shown.append(Div(text=f"<b>{escape(group)}</b>", width=SIDE, styles={"color": QUIET}))
             label = Div(width=SIDE, name=f"label-{slider.name}", margin=(0, 5, 0, 5))
-            widget = SliderWidget(
-                start=0.0,
-                end=1.0,
-                step=1.0 / STEPS,
-                value=slider.place(self.values.get(slider.name, slider.own)),
-                title="",
-                show_value=False,
-                tooltips=False,
-                width=SIDE - 20,
-                margin=(0, 5, 0, 5),
-                name=slider.name,
-                bar_color=COLOURS[0],
-            )
+            widget = widget_of(slider, self.values.get(slider.name, slider.own))
             widget.on_change("value", partial(self._dragged, slider))
             self._widgets[slider.name] = slider, widget, label
             shown += [label, widget]
@@ -175,30 +150,10 @@ class Page:
         shown.append(self._saved)
         self._side.children = shown
 
-    def _buttons(self, acts: Mapping[str, Callable[[], None]]) -> list[Any]:
-        """Buttons in rows of `A_ROW`."""
-        made = []
-        for label, act in acts.items():
-            button = Button(label=label, name=label, width=(SIDE - 10 * A_ROW) // A_ROW)
-            button.on_click(act)
-            made.append(button)
-        return [row(*made[first : first + A_ROW]) for first in range(0, len(made), A_ROW)]
-
     def _label(self, slider: Slider) -> None:
         """The name of a slider, its value, its ends and the log's own value."""
         value = self.values.get(slider.name, slider.own)
-        changed = "" if value == slider.own else f" color:{COLOURS[0]};"
-        mark = 100.0 * min(max(slider.place(slider.own), 0.0), 1.0)
-        self._widgets[slider.name][2].text = (
-            f'<div title="{escape(f"{slider.name}: {slider.meaning}")}" style="width:{SIDE - 20}px">'
-            f"{SPREAD}<span>{escape(slider.title)}</span>"
-            f'<b style="{changed}">{escape(slider.words(value))}</b></div>'
-            f'<div style="display:flex;justify-content:space-between;font-size:11px;color:{QUIET};'
-            f'position:relative"><span>{escape(slider.words(slider.low))}</span>'
-            f'<span style="position:absolute;left:{mark:.1f}%" title="the log\'s own, '
-            f'{escape(slider.words(slider.own))}">▾</span>'
-            f"<span>{escape(slider.words(slider.high))}</span></div></div>"
-        )
+        self._widgets[slider.name][2].text = label_of(slider, value)
 
     # What a person does.
 
@@ -417,9 +372,9 @@ class Page:
         for place, label in enumerate(self.session.filters):
             played = self.played[place]
             verdict = played.verdicts.get(case, Verdict("failed", "It estimated nothing.", ""))
-            parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
+            parts.append(verdict_html(label, verdict, COLOURS[min(place, 1)]))
             if case in played.cases:
-                parts.append(_numbers_html(played, self.played.get(PINNED), case))
+                parts.append(numbers_html(played, self.played.get(PINNED), case))
             if played.seconds > SLOW_S:
                 parts.append(f"<p>One replay takes {played.seconds:.1f} s.</p>")
         self._head.text = "".join(parts)
@@ -440,30 +395,3 @@ class Page:
     def _later(self, act: Callable[[], object]) -> None:
         """Change the page from the thread that may."""
         self._document.add_next_tick_callback(act)
-
-
-def _verdict_html(label: str, verdict: Verdict, colour: str) -> str:
-    mark = MARKS[verdict.level]
-    red = "" if verdict.level == "good" else "color:#b3123f;"
-    return (
-        f'<h2 style="margin:4px 0;font-weight:400"><b style="color:{colour}">{escape(label)}</b> '
-        f'<b class="headline" style="{red}">{mark} {escape(verdict.headline)}</b> '
-        f"{escape(verdict.detail)}</h2>"
-    )
-
-
-def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
-    cells = []
-    before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
-    for name, (value, unit) in numbers_of(played.cases[case]).items():
-        was = before.get(name)
-        ghost = f'<br><small style="color:{QUIET}">pinned {_number(name, *was)}</small>' if was else ""
-        cells.append(
-            f'<div style="margin-right:32px"><small style="color:{QUIET}">{escape(name)}</small><br>'
-            f'<b style="font-size:18px">{_number(name, value, unit)}</b>{ghost}</div>'
-        )
-    return f'<div class="numbers" style="display:flex">{"".join(cells)}</div>'
-
-
-def _number(name: str, value: float, unit: str) -> str:
-    return f"{value:,.0f}" if name == "log-likelihood" else escape(in_words(value, unit))
