@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from pipeline.deploying.c_names import CFilter, filled, identifier
 from recorders.parameters import meanings, unit_of
 from replay.engine.vectors.tangent import tangent_components
+from replay.inference.formulas import reference_names
 from replay.inference.model.model import Sensor
 
 
@@ -126,7 +127,7 @@ def update_signature(name: str) -> str:
 def data_of(sensor: Sensor) -> list[str]:
     """Name the numbers of a sensor's message: measured, what it refers to, its own noise."""
     names = [*sensor.measured]
-    names += [f"reference {index}" for index in range(sensor.reference_size)]
+    names += reference_names(sensor)
     measured = list(sensor.measured)
     if sensor.covariance:
         names += [

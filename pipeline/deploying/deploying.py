@@ -118,10 +118,4 @@ def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, F
             f"estimator {label}: a message was measured before its stamp (delay); subtract that on the "
             "robot, and set the delay to 0"
         )
-    if any(each.control is not None for each in filtering.stage.sensors):
-        topic = next(each.topic for each in filtering.stage.sensors if each.control is not None)
-        raise BadInput(
-            f"estimator {label}: sensor {topic} needs the control at its stamp, which C does not get; "
-            f"leave it out with --set topics.{topic}="
-        )
     return first, filtering, kind
