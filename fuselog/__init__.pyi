@@ -21,6 +21,7 @@ from pipeline.api.trajectories import Evaluation as Evaluation
 from pipeline.api.trajectories import evaluate as evaluate
 from pipeline.comparing.comparing import Differences as Differences
 from pipeline.comparing.comparing import compare as compare
+from pipeline.deploying.deploying import deploy as deploy
 from pipeline.diagnosing.diagnosis import Diagnosis as Diagnosis
 from pipeline.diagnosing.diagnosis import diagnose as diagnose
 from pipeline.exploring.explore import explore as explore

@@ -231,3 +231,32 @@ def check(path: Path, golden: Path, **options: Any) -> None:
 
     if not check_path(path, golden, **options):
         click.get_current_context().exit(1)
+
+
+@command(
+    "Write a filter as C99 for a robot, with a log as its test.",
+    "fuselog deploy run.mcap -e ekf --model robot -o robot_ekf",
+    "fuselog deploy run.mcap -e ekf --settings tuned.toml --single -o robot_ekf",
+)
+@click.argument("log", type=ANY_PATH)
+@click.option("-e", "--estimator", "name", required=True, help="The filter: ekf, or ukf.")
+@click.option("--model", help="The model to estimate, where several fit the log.")
+@click.option(
+    "-o",
+    "--out",
+    required=True,
+    type=RESULT,
+    help="The folder to write, new or empty; its name is the filter's in C.",
+)
+@click.option("--single", is_flag=True, help="In single precision, float.")
+@settings_option
+@set_option("estimators")
+def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **options: Any) -> None:
+    """Write a filter as C99, with what stands in LOG: its sensors, what its channels state, a test.
+
+    The C does what the filter does, operation by operation, so that its estimates are the same to the
+    last bit; README.md in the folder says how to build it, to test it and to replay it.
+    """
+    from pipeline.deploying.command import deploy_filter
+
+    deploy_filter(name, settings_file, list(settings), **options)

@@ -87,7 +87,7 @@ def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
     state, axes, measured = list(model.state), _axes(model), list(sensor.measured)
     noise = [f"noise{number}" for number in range(1, sensor.noises + 1)]
     entering = {"noise": noise} if noise else {}
-    reference: Given = {"reference": _reference(sensor), "parameters": None}
+    reference: Given = {"reference": reference_names(sensor), "parameters": None}
     told = [f"measured_{each}" if each in model.state else each for each in measured]
     yield "measure", _lines(sensor.measure, {"state": state, **entering, **reference}, told)
     spread = [f"variance of {each}" for each in noise] or _spread(measured)
@@ -113,7 +113,7 @@ def _axes(model: Model) -> list[str]:
     return [name for name, _ in tangent_components(list(model.state), model.kinds)]
 
 
-def _reference(sensor: Sensor) -> list[str]:
+def reference_names(sensor: Sensor) -> list[str]:
     """Return what the entries of `reference` are, see `Sensor.reference_size`."""
     names = [f"{_topic(each.topic)}_{name}" for each in sensor.maps for name in each.components]
     names += sensor.control.components if sensor.control else ()

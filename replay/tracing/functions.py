@@ -7,7 +7,7 @@ arrays that it changes; it returns a tuple of numbers, or one number. What it is
 
 import re
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
@@ -23,8 +23,15 @@ from replay.engine.compiling.kernels.values import Array, Record, entries, load,
 from replay.tracing.derivatives import slopes_of
 from replay.tracing.emission import emit, python_of
 from replay.tracing.graph import INPUT, Graph, Node, described, needed
+from replay.tracing.inlining import Parameters, inlined, trace_of
 from replay.tracing.reads import Reads, reads_of
-from replay.tracing.traced import MOST_WAYS, CannotTrace, Trace, refused, too_many_ways
+from replay.tracing.traced import (
+    MOST_WAYS,
+    CannotTrace,
+    Trace,
+    refused,
+    too_many_ways,
+)
 
 # Files in whose lines nobody looks for a model's mistake.
 _NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
@@ -60,8 +67,12 @@ class TracedFunction:
         self.__name__ = getattr(function, "__name__", "function")
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call the function itself."""
-        return self.function(*arguments)
+        """Call the function itself; of traced numbers its graph becomes a part of theirs."""
+        found = trace_of(arguments)
+        if found is None or self.result.written:
+            return self.function(*arguments)
+        numbers = inlined(found, self.result.returned, lambda place: _at(arguments, place))
+        return numbers[0] if self.result.is_number else numbers
 
     @cached_property
     def graph(self) -> Graph:
@@ -148,8 +159,14 @@ class Derivative:
         """Write a call of it."""
         return tuple(_called(program, emitter, self.function, self.outputs, arguments))
 
-    def __call__(self, *arguments: Any) -> tuple[float, ...]:
-        """The values as the function itself gives them, and the derivatives by the graph."""
+    def __call__(self, *arguments: Any) -> tuple[Any, ...]:
+        """The values as the function itself gives them, and the derivatives by the graph.
+
+        Of traced numbers both by the graph, as a part of theirs.
+        """
+        found = trace_of(arguments)
+        if found is not None:
+            return inlined(found, self.outputs, lambda place: _at(arguments, place))
         places, compute = self._computed
         return (*self.function(*arguments), *compute([_at(arguments, place) for place in places]))
 
@@ -225,21 +242,6 @@ def _at(arguments: Sequence[Any], place: Any) -> float:
 # --- tracing ----------------------------------------------------------------------------------------
 
 
-class _Parameters:
-    """The parameters of a function that is traced."""
-
-    def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
-        self._trace, self._argument, self._names = trace, argument, names
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name not in self._names:
-            raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._names)}")
-        return self._trace.number(self._trace.graph.input((self._argument, name)))
-
-    def __iter__(self) -> Iterator[Any]:
-        return (getattr(self, name) for name in self._names)
-
-
 def _given(trace: Trace, argument: int, kind: Argument) -> Any:
     graph = trace.graph
     if kind is None:
@@ -251,7 +253,7 @@ def _given(trace: Trace, argument: int, kind: Argument) -> Any:
         return array
     if isinstance(kind, int):
         return tuple(trace.number(graph.input((argument, entry))) for entry in range(kind))
-    return _Parameters(trace, argument, kind)
+    return Parameters(trace, argument, kind)
 
 
 def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argument]) -> Result:

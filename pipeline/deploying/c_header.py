@@ -1,0 +1,146 @@
+"""The header of a filter in C99: types, names of components, functions."""
+
+from collections.abc import Iterator, Sequence
+
+from pipeline.deploying.c_names import CFilter, filled, identifier
+from recorders.parameters import meanings, unit_of
+from replay.engine.vectors.tangent import tangent_components
+from replay.inference.formulas import reference_names
+from replay.inference.model.model import Sensor
+
+
+def header(made: CFilter) -> str:
+    """Write NAME.h."""
+    model, upper = made.filtering.stage.model, made.name.upper()
+    state = [(identifier(name), kind) for name, kind in model.state.items()]
+    axes = [identifier(name) for name, _ in tangent_components(list(model.state), model.kinds)]
+    lines = [
+        f"/* {made.origin}",
+        f" * Made by fuselog deploy; graphs and numbers {made.digest}. Licence: Apache-2.0, or yours.",
+        " *",
+        " * No heap, no recursion, no arrays of varying length. Times are in nanoseconds. The",
+        " * covariance is in the tangent space: of a quaternion's four components it has three. */",
+        f"#ifndef {upper}_H\n#define {upper}_H\n",
+        "#include <stdint.h>\n",
+        f'#define {upper}_DIGEST "{made.digest}"\n',
+        *_enum(made, "", [name for name, _ in state], "STATES"),
+        *(_enum(made, "AXIS_", axes, "TANGENT")),
+        *_enum(made, "CONTROL_", [identifier(name) for name in made.controls], "CONTROLS"),
+        *_enum(made, "SENSOR_", [name for name, _ in made.sensors], "SENSORS"),
+        *_enum(made, "INNOVATION_", [identifier(name) for name in made.innovation], "INNOVATION"),
+        f"enum {{ {upper}_MOST = {made.most} }}; /* components of the widest sensor */",
+        f"enum {{ {upper}_WELL, {upper}_NOTHING_MEASURED, {upper}_NOT_POSITIVE_DEFINITE }};\n",
+        filled(
+            made,
+            """/* A measurement with a larger NIS than nis[its components] is not used, unless the last
+ * one that was used is more than reopens_s ago; the others make what is used count less. NAN: off. */
+typedef struct {
+    REAL nis[NAME_MOST + 1];
+    double reopens_s;
+    REAL inflate_nis, student_freedom, switch_nis;
+} NAME_gate;
+""",
+        ),
+        "typedef struct {",
+        *_struct(made),
+        f"}} {made.name}_parameters;\n",
+        f"extern const {made.name}_parameters {made.name}_as_tuned;\n",
+        filled(
+            made,
+            """typedef struct {
+    int64_t time_ns;
+    REAL mean[NAME_STATES];
+    REAL covariance[NAME_TANGENT][NAME_TANGENT];
+    REAL control[NAME_CONTROLS + 1];
+    int64_t accepted_ns[NAME_SENSORS + 1]; /* when a measurement was last used */
+} NAME;
+
+/* Measured minus predicted, and its covariance before the update; NAN where a component is missing. */
+typedef struct {
+    REAL difference[NAME_INNOVATION];
+    REAL covariance[NAME_INNOVATION][NAME_INNOVATION];
+    REAL nis;
+    int is_accepted;
+} NAME_innovation;
+
+/* Starts at a prior, undriven. */
+void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance);
+
+""",
+        ),
+        _predict_comment(made),
+        filled(made, f"{predict_signature(made)};\n"),
+    ]
+    for name, sensor in made.sensors:
+        lines.append(_update_comment(sensor))
+        lines.append(filled(made, f"{update_signature(name)};\n"))
+    return "\n".join([*lines, f"#endif /* {upper}_H */"]) + "\n"
+
+
+def _enum(made: CFilter, part: str, names: Sequence[str], count: str) -> Iterator[str]:
+    upper = made.name.upper()
+    listed = [f"{upper}_{part}{name.upper()}" for name in names]
+    yield "enum {" + "".join(f"\n    {each}," for each in listed) + f"\n    {upper}_{count}\n}};\n"
+
+
+def _struct(made: CFilter) -> Iterator[str]:
+    meaning = meanings(made.filtering.stage.model.parameters)
+    for part, values in made.values.items():
+        yield "    struct {"
+        for name in values:
+            told = " ".join(meaning.get(name, "").split()).replace("*/", "")
+            unit = unit_of(name)
+            comment = ", ".join(
+                filter(None, (told.rstrip("."), f"in {unit}" if unit and unit not in told else ""))
+            )
+            yield f"        {made.precision.real} {identifier(name)};" + (
+                f" /* {comment} */" if comment else ""
+            )
+        if part != "motion":
+            yield f"        {made.name}_gate gate;"
+        elif not values:
+            yield "        char unused; /* it has no parameters */"
+        yield f"    }} {part};"
+
+
+def predict_signature(made: CFilter) -> str:
+    """Write how a prediction is called."""
+    control = ", const REAL *control" if made.is_interpolated else ""
+    return f"int NAME_predict(NAME *filter, int64_t time_ns{control}, const NAME_parameters *parameters)"
+
+
+def _predict_comment(made: CFilter) -> str:
+    if made.is_interpolated:
+        return "/* Predicts to a time, driven by the mean of the last control and that at this time. */"
+    driven = "; filter->control holds until it is changed" if made.controls else ""
+    return f"/* Predicts to a time{driven}. */"
+
+
+def update_signature(name: str) -> str:
+    """Write how an update by a sensor is called."""
+    return (
+        f"int NAME_update_{name}(NAME *filter, const REAL *data, const NAME_parameters *parameters,\n"
+        "    NAME_innovation *innovation)"
+    )
+
+
+def data_of(sensor: Sensor) -> list[str]:
+    """Name the numbers of a sensor's message: measured, what it refers to, its own noise."""
+    names = [*sensor.measured]
+    names += reference_names(sensor)
+    measured = list(sensor.measured)
+    if sensor.covariance:
+        names += [
+            f"covariance of {measured[row]} and {measured[column]}"
+            if row > column
+            else f"variance of {measured[row]}"
+            for row in range(len(measured))
+            for column in range(row + 1)
+        ]
+    return names
+
+
+def _update_comment(sensor: Sensor) -> str:
+    return (
+        f"/* Updates by {sensor.topic}, at the filter's time: data is {', '.join(data_of(sensor))}. */"
+    )

@@ -1,0 +1,141 @@
+"""What is written of a filter in C99: its names, sizes and numbers, and the text that they fill in."""
+
+import re
+from hashlib import sha256
+from typing import NamedTuple
+
+from replay.inference.kalman.update import innovation_components
+from replay.inference.model.model import Sensor
+from replay.inference.model.parameters import number_fields
+from replay.inference.run.filtering import Filter
+from replay.inference.whole_steps import Step, WholeSteps
+from replay.tracing.c_text import Precision
+from replay.tracing.graph import INPUT, described, needed
+
+_NAMES_OF_C = """auto break case char const continue default do double else enum extern float for goto if
+inline int long register restrict return short signed sizeof static struct switch typedef union unsigned
+void volatile while filter parameters P S C v data time_ns duration_s step innovation"""
+
+
+class CFilter(NamedTuple):
+    """Holds what is written of a filter.
+
+    Attributes:
+        name: what its names in C begin with.
+        filtering: the filter, bound to a log.
+        steps: its steps.
+        precision: of its numbers.
+        origin: what it was made of, in words.
+    """
+
+    name: str
+    filtering: Filter
+    steps: WholeSteps
+    precision: Precision
+    origin: str
+
+    @property
+    def states(self) -> int:
+        """Count the components of the state."""
+        return self.filtering.stage.model.size
+
+    @property
+    def tangent(self) -> int:
+        """Count those of its tangent space."""
+        return self.filtering.stage.model.tangent
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """Return the names of what drives it."""
+        control = self.filtering.stage.model.control
+        return control.components if control else ()
+
+    @property
+    def is_interpolated(self) -> bool:
+        """Tell whether the motion gets the mean of the controls at both ends of a step."""
+        control = self.filtering.stage.model.control
+        return control is not None and control.interpolated
+
+    @property
+    def sensors(self) -> list[tuple[str, Sensor]]:
+        """List the sensors with their names in C."""
+        found: dict[str, Sensor] = {}
+        for sensor in self.filtering.stage.sensors:
+            name = identifier(sensor.topic)
+            found[name if name not in found else f"{name}_{'_'.join(sensor.measured)}"] = sensor
+        return list(found.items())
+
+    @property
+    def most(self) -> int:
+        """Count the components of the widest sensor."""
+        return max((len(sensor.measured) for _, sensor in self.sensors), default=1)
+
+    @property
+    def innovation(self) -> list[str]:
+        """List the components of innovations."""
+        return list(innovation_components(self.filtering.stage.sensors)) or ["none"]
+
+    @property
+    def values(self) -> dict[str, dict[str, float]]:
+        """Return the parameters that motion and sensors read, by part, with their values."""
+        names = number_fields(self.filtering.stage.model.parameters)
+        parts = [
+            ("motion", self.steps.predict),
+            *zip(dict(self.sensors), self.steps.innovate, strict=True),
+        ]
+        return {
+            part: {
+                name: float(self.filtering.settings[row, names.index(name)])
+                for name in names
+                if name in _read(step)
+            }
+            for row, (part, step) in enumerate(parts)
+        }
+
+    def robustness(self, row: int) -> dict[str, float]:
+        """Return the options of the gate and of robust updates, NaN where they are off."""
+        names = number_fields(self.filtering.stage.model.parameters)
+        options = ("gate_reopens_s", "inflate_nis", "student_freedom", "switch_nis")
+        return {
+            name.removeprefix("gate_"): float(self.filtering.settings[row, names.index(name)])
+            for name in options
+        }
+
+    @property
+    def digest(self) -> str:
+        """Return what is the same for the same graphs and numbers."""
+        steps = [self.steps.predict, *self.steps.innovate, self.steps.correct]
+        words = [
+            word for step in steps for word in described([*step.outputs.values(), *step.conditions])
+        ]
+        numbers = [repr(self.values), repr(self.filtering.gates.tolist()), self.precision.real]
+        return sha256("\n".join([*words, *numbers]).encode()).hexdigest()[:16]
+
+
+def identifier(name: str) -> str:
+    """Make a name that C takes: lower case, without the slashes of topics."""
+    text = re.sub(r"\W+", "_", name.strip("/")).lower()
+    return (
+        f"{text}_"
+        if text in _NAMES_OF_C.split()
+        else f"n{text}"
+        if text[:1].isdigit()
+        else text or "filter"
+    )
+
+
+def _read(step: Step) -> set[str]:
+    nodes = needed([*step.outputs.values(), *step.conditions])
+    return {
+        each.value[1] for each in nodes if each.operation is INPUT and isinstance(each.value[1], str)
+    }
+
+
+def filled(made: CFilter, template: str) -> str:
+    """Fill the names and sizes of a filter into a template."""
+    text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", template)
+    text = re.sub(r"\bNAME(?=_|\b)", made.name, text)
+    upper = made.name.upper()
+    text = re.sub(r"\[T\]|< T\b", lambda found: found[0].replace("T", f"{upper}_TANGENT"), text)
+    text = re.sub(r"\[M\]", f"[{upper}_MOST]", text)
+    return made.precision.text(text)

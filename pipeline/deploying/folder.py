@@ -1,0 +1,88 @@
+"""What stands beside a filter in C: how to build it, and what it is."""
+
+from pipeline.deploying.c_header import data_of
+from pipeline.deploying.c_names import CFilter
+from pipeline.deploying.c_replay import why_no_replay
+
+
+def cmake_text(made: CFilter) -> str:
+    """Write CMakeLists.txt."""
+    name = made.name
+    lines = [
+        "cmake_minimum_required(VERSION 3.13)",
+        f"project({name} C)",
+        "set(CMAKE_C_STANDARD 99)",
+        "set(CMAKE_C_STANDARD_REQUIRED ON)",
+        "set(CMAKE_C_EXTENSIONS OFF)",
+        "if(NOT CMAKE_BUILD_TYPE)",
+        "  set(CMAKE_BUILD_TYPE Release)",
+        "endif()",
+        "add_compile_options(-ffp-contract=off)  # a fused multiply-add rounds otherwise than fuselog",
+        f"add_library({name} STATIC {name}.c)",
+        f"target_link_libraries({name} m)",
+        f"add_executable(test_{name} test_{name}.c)",
+        f"target_link_libraries(test_{name} {name})",
+        "enable_testing()",
+        f"add_test(NAME recorded_log COMMAND test_{name}{' 0.01' if made.precision.ending else ''})",
+    ]
+    if not why_no_replay(made):
+        lines += [
+            f"add_library({name}_replay MODULE {name}_replay.c {name}.c)",
+            f"target_link_libraries({name}_replay m)",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def readme_text(made: CFilter, log: str) -> str:
+    """Write README.md."""
+    name, upper = made.name, made.name.upper()
+    control = ", control" if made.is_interpolated else ""
+    updates = [
+        f"| `{name}_update_{each}` | {sensor.topic} | {', '.join(data_of(sensor))} |"
+        for each, sensor in made.sensors
+    ]
+    why_not = why_no_replay(made)
+    back = (
+        f"fuselog cannot replay it: {why_not}."
+        if why_not
+        else f"""fuselog replays it, beside its own filter (`fuselog_filter.h` is the interface):
+
+```
+cc -std=c99 -O2 -ffp-contract=off -shared -fPIC {name}_replay.c {name}.c -lm -o {name}.so
+fuselog replay {log} -e lib:./{name}.so
+```"""
+    )
+    return f"""# {name}
+
+{made.origin} Made by `fuselog deploy` from {log}; graphs and numbers `{made.digest}`.
+
+C99 and libm: no heap, no recursion, no arrays of varying length. The filter is a struct that you own.
+
+```c
+{name} filter;
+{name}_innovation innovation;
+{name}_init(&filter, time_ns, mean, covariance);
+{name}_predict(&filter, time_ns{control}, &{name}_as_tuned);
+```
+
+| function | message | `data`, NAN where a component is missing |
+|---|---|---|
+{chr(10).join(updates)}
+
+An update is at the filter's time, so predict to a message's stamp first. They return `{upper}_WELL`,
+`{upper}_NOTHING_MEASURED`, or `{upper}_NOT_POSITIVE_DEFINITE`: then start again. Angles of the state
+are not wrapped. The numbers that it was tuned with are in `{name}_as_tuned`; copy it to change them.
+
+## Test
+
+```
+cc -std=c99 -O2 -ffp-contract=off test_{name}.c {name}.c -lm -o test_{name}
+./test_{name}{" 0.01" if made.precision.ending else ""}
+```
+
+It runs over the first messages of {log}, and prints how far it is from fuselog's own filter: nothing at
+all with the same libm, in double precision and without fused multiply-adds, which
+`-ffp-contract=off` forbids.
+
+{back}
+"""

@@ -1,0 +1,247 @@
+"""A graph as C99 that a person can read: a line for what is used more than once.
+
+Sums and products stand in the order in which kernels compute them, so that a compiler that contracts and
+reorders nothing (`-ffp-contract=off`, no `-ffast-math`) gives the same bits.
+"""
+
+import math
+import operator
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+
+SHORTEST, LONGEST = 16, 90  # characters: what is shorter is repeated, what is longer gets a line
+
+_CHOICE, _OR, _AND, _EQUAL, _COMPARISON, _SUM, _PRODUCT, _SIGN, _WHOLE = range(9)
+_OPERATORS: dict[Any, tuple[str, int]] = {
+    operator.or_: ("||", _OR),
+    operator.and_: ("&&", _AND),
+    operator.xor: ("!=", _EQUAL),
+    operator.eq: ("==", _EQUAL),
+    operator.ne: ("!=", _EQUAL),
+    operator.lt: ("<", _COMPARISON),
+    operator.le: ("<=", _COMPARISON),
+    operator.gt: (">", _COMPARISON),
+    operator.ge: (">=", _COMPARISON),
+    operator.add: ("+", _SUM),
+    operator.sub: ("-", _SUM),
+    operator.mul: ("*", _PRODUCT),
+    operator.truediv: ("/", _PRODUCT),
+}
+_LIBM = {
+    np.absolute: "fabs",
+    np.arcsin: "asin",
+    np.arccos: "acos",
+    np.arctan: "atan",
+    np.arctan2: "atan2",
+    np.arcsinh: "asinh",
+    np.arccosh: "acosh",
+    np.arctanh: "atanh",
+    np.power: "pow",
+}
+_TESTS = (np.isnan, np.isfinite, np.isinf, np.signbit)
+# What C lacks; REAL is the type of numbers, and S ends libm's functions of it.
+HELPERS: Mapping[Any, tuple[str, str]] = {
+    operator.mod: (
+        "modulo",
+        """/* The remainder of x / y, which has the sign of y. */
+static REAL modulo(REAL x, REAL y)
+{
+    const REAL rest = fmod_S(x, y);
+    if (rest != 0.0_S)
+        return (y < 0.0_S) != (rest < 0.0_S) ? rest + y : rest;
+    return y < 0.0_S ? -0.0_S : 0.0_S;
+}
+""",
+    ),
+    operator.floordiv: (
+        "floor_of_quotient",
+        """/* The largest whole number that is not above x / y. */
+static REAL floor_of_quotient(REAL x, REAL y)
+{
+    const REAL rest = fmod_S(x, y);
+    REAL quotient = (x - rest) / y, whole;
+    if (y == 0.0_S)
+        return x / y;
+    if (rest != 0.0_S && (y < 0.0_S) != (rest < 0.0_S))
+        quotient -= 1.0_S;
+    if (quotient == 0.0_S)
+        return copysign_S(0.0_S, x / y);
+    whole = floor_S(quotient);
+    return quotient - whole > 0.5_S ? whole + 1.0_S : whole;
+}
+""",
+    ),
+    np.sinc: (
+        "sinc",
+        """/* sin(pi x) / (pi x), 1 at zero. */
+static REAL sinc(REAL x)
+{
+    const REAL angle = x * 3.141592653589793_S;
+    return x == 0.0_S ? 1.0_S : sin_S(angle) / angle;
+}
+""",
+    ),
+    np.sign: (
+        "sign_of",
+        """/* -1, 0 or 1; NaN of NaN. */
+static REAL sign_of(REAL x)
+{
+    return x > 0.0_S ? 1.0_S : x < 0.0_S ? -1.0_S : isnan(x) ? x : 0.0_S;
+}
+""",
+    ),
+}
+
+
+class Precision(NamedTuple):
+    """Holds how numbers are written: their type, and how constants and libm's functions of it end."""
+
+    real: str = "double"
+    ending: str = ""
+
+    def number(self, value: float) -> str:
+        """Write a number, so that it is read as the same one."""
+        if math.isnan(value):
+            return "NAN"
+        if math.isinf(value):
+            return "INFINITY" if value > 0.0 else "-INFINITY"
+        text = repr(float(value))
+        return f"{text}{'' if '.' in text or 'e' in text else '.0'}{self.ending}"
+
+    def text(self, template: str) -> str:
+        """Fill in REAL, and what ends constants and functions (_S)."""
+        return re.sub(r"(?<=[0-9a-z])_S\b", self.ending, re.sub(r"\bREAL\b", self.real, template))
+
+
+DOUBLE, SINGLE = Precision(), Precision("float", "f")
+
+
+class _Text(NamedTuple):
+    """An expression, and how tightly its last operation binds."""
+
+    text: str
+    binds: int
+
+    def within(self, binds: int) -> str:
+        return self.text if self.binds >= binds else f"({self.text})"
+
+
+def c_lines(named: Mapping[str, Node], inputs: Mapping[Any, str], precision: Precision) -> Iterator[str]:
+    """Write every named node as `const double name = ...;`, each behind the lines that it needs.
+
+    Args:
+        named: the nodes; a name that is no identifier is assigned to, as `P[0][0]`.
+        inputs: names of what the graph is given, by place.
+        precision: of the numbers.
+    """
+    everything = needed(named.values())
+    uses = Counter(argument for node in everything for argument in node.arguments)
+    uses.update(named.values())
+    squared = {node.arguments[0] for node in everything if node.operation is POWER}
+    taken = {*inputs.values(), *named}
+    free = (name for name in map("v{}".format, range(1, len(everything) + 1)) if name not in taken)
+    found: dict[Node, _Text] = {}
+    for name, output in named.items():
+        for node in needed([output]):
+            if node in found:
+                continue
+            text = _text_of(node, [found[each] for each in node.arguments], inputs, precision)
+            is_call = text.binds == _WHOLE and text.text.endswith(")")
+            longest = 0 if uses[node] > 1 and is_call else SHORTEST if uses[node] > 1 else LONGEST
+            is_own = node is output and (name.isidentifier() or uses[node] == 1)
+            is_single = text.binds == _WHOLE and node.operation in (INPUT, CONSTANT)
+            if not is_own and not is_single and (len(text.text) > longest or node in squared):
+                own = next(free)
+                kind = "int" if node.is_truth else precision.real
+                yield f"const {kind} {own} = {text.text};"
+                text = _Text(own, _WHOLE)
+            found[node] = text
+        if name.isidentifier():
+            yield f"const {precision.real} {name} = {_real(output, found[output], precision).text};"
+            found[output] = _Text(name, _WHOLE) if not output.is_truth else found[output]
+        else:
+            yield f"{name} = {_real(output, found[output], precision).text};"
+
+
+def truth_text(node: Node, inputs: Mapping[Any, str], precision: Precision) -> str:
+    """Write a condition in one expression."""
+    found: dict[Node, _Text] = {}
+    for each in needed([node]):
+        found[each] = _text_of(each, [found[one] for one in each.arguments], inputs, precision)
+    return found[node].text
+
+
+def _real(node: Node, text: _Text, precision: Precision) -> _Text:
+    """A truth as a number."""
+    return _Text(f"({precision.real}){text.within(_WHOLE)}", _SIGN) if node.is_truth else text
+
+
+def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str], precision: Precision) -> _Text:
+    operation = node.operation
+    if operation is INPUT:
+        return _Text(inputs[node.value], _WHOLE)
+    if operation is CONSTANT:
+        if isinstance(node.value, bool):
+            return _Text(str(int(node.value)), _WHOLE)
+        text = precision.number(node.value)
+        return _Text(text, _SIGN if text.startswith("-") else _WHOLE)
+    if operation is SELECT:
+        condition, yes, no = given
+        sides = [
+            text if node.is_truth else _real(side, text, precision)
+            for side, text in zip(node.arguments[1:], (yes, no), strict=True)
+        ]
+        return _Text(
+            f"{condition.within(_OR)} ? {sides[0].within(_OR)} : {sides[1].within(_CHOICE)}", _CHOICE
+        )
+    if operation in (operator.and_, operator.or_, operator.xor):
+        sign, binds = _OPERATORS[operation]
+        return _Text(f" {sign} ".join(each.within(_COMPARISON) for each in given), binds)
+    if operation is operator.not_:
+        return _Text(f"!{given[0].within(_WHOLE)}", _SIGN)
+    numbers = [_real(*each, precision) for each in zip(node.arguments, given, strict=True)]
+    if operation is POWER:
+        return _power(numbers[0].within(_WHOLE), node.value, precision)
+    if operation is operator.neg:
+        return _Text(f"-{numbers[0].within(_WHOLE)}", _SIGN)
+    if operation in _OPERATORS:
+        sign, binds = _OPERATORS[operation]
+        first, last = numbers
+        lowest = _SUM if binds in (_EQUAL, _COMPARISON) else binds
+        return _Text(f"{first.within(lowest)} {sign} {last.within(max(lowest, binds + 1))}", binds)
+    listed = ", ".join(each.text for each in numbers)
+    if operation in HELPERS:
+        return _Text(f"{HELPERS[operation][0]}({listed})", _WHOLE)
+    if operation in _TESTS:
+        return _Text(f"({operation.__name__}({listed}) != 0)", _WHOLE)
+    return _Text(f"{_LIBM.get(operation, operation.__name__)}{precision.ending}({listed})", _WHOLE)
+
+
+def _power(base: str, exponent: int, precision: Precision) -> _Text:
+    """By squaring, as kernels do."""
+    found, square, rest = "", base, abs(exponent)
+    while rest:
+        if rest & 1:
+            found = f"{found} * {square}" if found else square
+        rest >>= 1
+        if rest:
+            square = f"({square} * {square})"
+    if exponent < 0:
+        return _Text(f"{precision.number(1.0)} / ({found})", _PRODUCT)
+    return (
+        _Text(found.removeprefix("(").removesuffix(")"), _PRODUCT)
+        if exponent == 2
+        else _Text(found, _PRODUCT if " * " in found else _WHOLE)
+    )
+
+
+def helpers_of(nodes: Collection[Node], precision: Precision) -> list[str]:
+    """Write the functions that these nodes need and C lacks."""
+    used = {node.operation for node in nodes}
+    return [precision.text(text) for operation, (_, text) in HELPERS.items() if operation in used]

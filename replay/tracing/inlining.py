@@ -1,0 +1,56 @@
+"""Graphs as parts of others: what a traced function gives when it is called with traced numbers."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
+from replay.tracing.traced import Trace, Traced
+
+
+class Parameters:
+    """The parameters of a function that is traced."""
+
+    def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
+        self.trace, self._argument, self._names = trace, argument, names
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name not in self._names:
+            raise AttributeError(f"no parameter '{name}'; the model has {', '.join(self._names)}")
+        return self.trace.number(self.trace.graph.input((self._argument, name)))
+
+    def __iter__(self) -> Iterator[Any]:
+        return (getattr(self, name) for name in self._names)
+
+
+def trace_of(arguments: Sequence[Any]) -> Trace | None:
+    """Return the trace that numbers among these are of; None where all are known."""
+    for each in arguments:
+        if isinstance(each, Traced):
+            return each.trace
+        if isinstance(each, Parameters):
+            return each.trace
+        if isinstance(each, tuple):
+            found = trace_of(each)
+            if found is not None:
+                return found
+    return None
+
+
+def inlined(
+    trace: Trace, outputs: Sequence[Node], number_at: Callable[[Any], Any]
+) -> tuple[Traced, ...]:
+    """Copy nodes of one graph into another one, of the numbers there in the places of its inputs."""
+    graph, found = trace.graph, dict[Node, Node]()
+    for node in needed(outputs):
+        given = [found[each] for each in node.arguments]
+        if node.operation is INPUT:
+            found[node] = trace.node_of(number_at(node.value))
+        elif node.operation is CONSTANT:
+            found[node] = graph.constant(node.value)
+        elif node.operation is SELECT:
+            found[node] = graph.select(*given)
+        elif node.operation is POWER:
+            found[node] = graph.power(given[0], node.value)
+        else:
+            found[node] = graph.apply(node.operation, *given)
+    return tuple(trace.number(found[each]) for each in outputs)

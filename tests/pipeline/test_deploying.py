@@ -1,0 +1,92 @@
+"""A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from recorders.errors import BadInput
+
+COMPILER = shutil.which("gcc") or shutil.which("clang")
+WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
+STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
+
+
+def recorded(tmp_path: Path, scenario: str, **parameters: object) -> Path:
+    log = tmp_path / f"{scenario}.mcap"
+    fl.write(log, fl.record(scenario, seed=7, **parameters))
+    return log
+
+
+def compiled(folder: Path, *options: str) -> Path:
+    """Build the test program, or with `-shared` the library."""
+    assert COMPILER is not None
+    name = folder.name
+    is_library = "-shared" in options
+    out = folder.parent / (f"{name}.so" if is_library else f"test_{name}")
+    first = f"{name}_replay.c" if is_library else f"test_{name}.c"
+    files = [str(folder / each) for each in (first, f"{name}.c")]
+    subprocess.run([COMPILER, *STRICT, *options, *files, "-lm", "-o", str(out)], check=True)
+    return out
+
+
+def furthest(program: Path) -> float:
+    """How far the program finds its estimates from fuselog's."""
+    said = subprocess.run([program, "1e300"], capture_output=True, text=True, check=True)
+    assert not said.stderr
+    return float(said.stdout.partition("furthest ")[2].partition(",")[0])
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("scenario", "label", "options"),
+    [
+        ("landmarks", "ekf", {"model": "robot"}),
+        ("batch-reactor", "ekf", {}),
+        ("batch-reactor", "ukf", {}),
+    ],
+)
+def test_estimates_are_equal_to_the_last_bit(
+    tmp_path: Path, scenario: str, label: str, options: dict[str, str]
+) -> None:
+    log = recorded(tmp_path, scenario, **({"duration_s": 10.0} if scenario == "landmarks" else {}))
+    folder = fl.deploy(log, label, tmp_path / "filter_c", **options)
+    assert furthest(compiled(folder)) == 0.0
+    if sys.platform == "win32":
+        return
+    assert furthest(compiled(folder, "-fsanitize=address,undefined")) == 0.0
+    library = compiled(folder, "-shared", "-fPIC")
+    kinds = {"kind": label, **options}, {"kind": "lib", "path": str(library), "in_process": True}
+    replays = [fl.replay(log, {"it": each}) for each in kinds]
+    own, foreign = (each.estimates[0] for each in replays)
+    topics = [each for each in own if each.endswith(("/innovation", "/state", "/pose"))]
+    assert len(topics) == 2
+    for topic in topics:
+        for name in ("mean", "covariance", "innovation", "normalised_innovation_squared", "accepted"):
+            if name in own[topic].columns:
+                both = own[topic][name], foreign[topic][name]
+                np.testing.assert_array_equal(*both, err_msg=f"{topic} {name}")
+
+
+def test_refusals_write_nothing(tmp_path: Path) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=2.0)
+    out = tmp_path / "robot_ekf"
+    for label, options, sentence in (
+        ("smoother:ekf", {"model": "robot"}, "smoother:ekf: is no filter that can be written as C"),
+        ("iekf", {"model": "robot"}, "iekf cannot be written as C yet; give -e ekf"),
+        ("ukf", {"model": "robot"}, "the prediction cannot be written as C: samples of an angle"),
+        ("ekf", {"model": "robot", "sigma_range_m": -1.0}, "sigma_range_m"),
+    ):
+        with pytest.raises(BadInput, match=sentence):
+            fl.deploy(log, label, out, **options)
+        assert not out.exists()
+    out.mkdir()
+    (out / "mine.c").write_text("mine")
+    with pytest.raises(BadInput, match="robot_ekf: is not empty; give another folder with -o"):
+        fl.deploy(log, "ekf", out, model="robot")
+    assert [each.name for each in out.iterdir()] == ["mine.c"]
