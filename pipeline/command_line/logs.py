@@ -48,7 +48,7 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
 @command(
     "Say what noise sensors at rest have, with intervals.",
     "fuselog noise rest.mcap",
-    "fuselog noise rest.mcap --sheet turn_rate_radps='0.007 deg/s/sqrt(Hz)' --out noise",
+    "fuselog noise rest.mcap --topic /imu --out noise",
 )
 @click.argument("log", type=ANY_PATH)
 @click.option(
