@@ -15,7 +15,7 @@ class BadInput(Exception):
 
 
 class UnknownName(BadInput, KeyError):
-    """A name that is asked of a mapping and is not there; `in` and `get` take it as any KeyError."""
+    """Says that a name is not in a mapping; `in` and `get` take it as any KeyError."""
 
     __str__ = Exception.__str__  # the sentence, which KeyError would put in quotes
 

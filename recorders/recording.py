@@ -87,7 +87,7 @@ class Blocks:
     notes: dict[str, str] = field(default_factory=dict)
 
     def together(self) -> Recording:
-        """All of it in memory."""
+        """Read all of it into memory."""
         parts: dict[str, list[Stream]] = {}
         for block in self.blocks:
             for stream in block:
@@ -105,7 +105,7 @@ class Recorder(Generic[ParametersType]):
 
 @dataclass(frozen=True)
 class Simulator(Recorder[ParametersType]):
-    """A scenario that can be recorded any number of times, each run from its own random stream."""
+    """Describes a scenario that can be recorded often, each run from its own random stream."""
 
     simulate: Callable[[ParametersType, np.random.Generator], Recording]
 

@@ -65,7 +65,7 @@ class Trajectory:
         return len(self.position_m)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Trajectory":
-        """The poses of these rows."""
+        """Return the poses of these rows."""
         return Trajectory(
             self.name,
             self.position_m[rows],

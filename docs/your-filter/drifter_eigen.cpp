@@ -79,15 +79,15 @@ int32_t fuselog_filter_take(void *filter, int32_t, int64_t time_ns, const double
 
 int32_t fuselog_filter_state(const void *filter, double *mean, double *covariance)
 {
-    Eigen::Map<Vector>(mean) = own(filter).mean;
-    Eigen::Map<Matrix>(covariance) = own(filter).covariance;
+    Eigen::Map<Vector>{mean} = own(filter).mean;
+    Eigen::Map<Matrix>{covariance} = own(filter).covariance;
     return FUSELOG_FILTER_WELL;
 }
 
 int32_t fuselog_filter_innovation(const void *filter, double *innovation, double *covariance)
 {
-    Eigen::Map<Vector>(innovation) = own(filter).difference;
-    Eigen::Map<Matrix>(covariance) = own(filter).spread;
+    Eigen::Map<Vector>{innovation} = own(filter).difference;
+    Eigen::Map<Matrix>{covariance} = own(filter).spread;
     return FUSELOG_FILTER_WELL;
 }
 

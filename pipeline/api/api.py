@@ -83,24 +83,24 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """A result folder, and what its result.json says."""
+    """Represents a result folder, and what its result.json says."""
 
     folder: Path
     result: Result
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric: estimator, quantity, case, value."""
+        """Return a row per metric: estimator, quantity, case, value."""
         return summary_table(self.result.metrics)
 
     @property
     def claims(self) -> pd.DataFrame:
-        """A row per statement of a paper: what is printed, what we measured, our verdict, and why."""
+        """Return a row per statement of a paper: the print, what we measured, our verdict, and why."""
         return pd.DataFrame([vars(claim) for claim in self.result.claims])
 
     @cached_property
     def tables(self) -> dict[str, pd.DataFrame]:
-        """All tables by name."""
+        """Return all tables by name."""
         paths = sorted((self.folder / "tables").glob("*.parquet"))
         return {path.stem: read_table(path) for path in paths}
 

@@ -146,7 +146,7 @@ class Replay:
 
     @cached_property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric, in the order of the estimators: estimator, quantity, case, value, low, high.
+        """Return a row per metric, by estimators: estimator, quantity, case, value, low, high.
 
         From `low` to `high` lie 95 % of the values of a consistent estimator; NaN where that is unknown.
         """
@@ -156,22 +156,22 @@ class Replay:
 
     @property
     def runs(self) -> pd.DataFrame:
-        """A row per estimator, case and run: how many estimates, RMSE of each quantity, mean NEES."""
+        """Return a row per estimator, case and run: estimates, RMSE of each quantity, mean NEES."""
         return self.judge.runs_table
 
     @property
     def steps(self) -> pd.DataFrame:
-        """A row per estimator, case and step, over the runs: RMSE, mean NEES and its 95 % interval."""
+        """Return a row per estimator, case and step, over runs: RMSE, mean NEES, its 95 % interval."""
         return joined(self.judge.steps.values())
 
     @property
     def times(self) -> pd.DataFrame:
-        """A row per estimator, case, run and span of time."""
+        """Return a row per estimator, case, run and span of time."""
         return self.judge.times
 
     @cached_property
     def errors(self) -> pd.DataFrame:
-        """A row per estimate that has truth: error and sigma of every component, NEES."""
+        """Return a row per estimate that has truth: error and sigma of every component, NEES."""
         tables: list[pd.DataFrame] = []
 
         def keep(errors: Errors) -> None:
@@ -182,7 +182,7 @@ class Replay:
 
     @cached_property
     def innovations(self) -> pd.DataFrame:
-        """A row per measurement that was predicted: its NIS, its components, whether it was let in."""
+        """Return a row per predicted measurement: its NIS, its components, whether it was let in."""
         found = [
             innovations_of(gather([log[topic]]), run)
             for run, log in enumerate(self.estimates)
@@ -194,17 +194,17 @@ class Replay:
 
     @property
     def failures(self) -> list[str]:
-        """A sentence for every run that an estimator could not follow to the end, or not at all."""
+        """Return a sentence for every run that an estimator could not follow to the end, or at all."""
         return self.judge.failures
 
     @property
     def losses(self) -> list[str]:
-        """A sentence for what was not estimated throughout, and for measurements that were not used."""
+        """Return a sentence for what was not estimated throughout, and for measurements not used."""
         return [*self.judge.notes_of_coverage, *sentences(self.done.coverage)]
 
     @cached_property
     def alarms(self) -> list[Alarm]:
-        """What makes the numbers doubtful, the worst first: each has a sentence, `words`."""
+        """Return what makes the numbers doubtful, the worst first: each has a sentence, `words`."""
         return alarms_of(self.judge, self.done.parameters, self.done.coverage)
 
     @property
@@ -281,7 +281,7 @@ class Replay:
 
     @property
     def paths(self) -> list[Path]:
-        """The files that were replayed."""
+        """Return the files that were replayed."""
         return [log.log.path for log in self.logs if isinstance(log, LogSource)]
 
     @property

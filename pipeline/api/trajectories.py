@@ -45,7 +45,7 @@ AXES = "xyz"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Evaluation:
-    """An estimated trajectory against the true one.
+    """Holds an estimated trajectory against the true one.
 
     Attributes:
         estimate, truth: the trajectories, as they were given.
@@ -76,7 +76,7 @@ class Evaluation:
 
     @property
     def notes(self) -> list[str]:
-        """A sentence for what was mended in a trajectory, and where no time offset helps."""
+        """Return a sentence for what was mended in a trajectory, and where no time offset helps."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
         told = [in_vain] if sought and not self.compared.time_offset_s else []
@@ -84,7 +84,7 @@ class Evaluation:
 
     @property
     def poses(self) -> pd.DataFrame:
-        """A row per pose that has truth: stamp, aligned and true position, APE."""
+        """Return a row per pose that has truth: stamp, aligned and true position, APE."""
         done = self.compared
         columns: dict[str, Any] = {}
         if done.estimate.time_ns is not None:
@@ -98,7 +98,7 @@ class Evaluation:
 
     @property
     def pairs(self) -> pd.DataFrame:
-        """A row per pair of poses: the pose that it ends at, RPE."""
+        """Return a row per pair of poses: the pose that it ends at, RPE."""
         done = self.compared
         columns = {"last_pose": done.last, "rpe_translation_m": done.relative_m}
         if done.relative_deg is not None:
@@ -111,7 +111,7 @@ class Evaluation:
         return "\n".join([name, *self.notes, *values])
 
     def figure(self) -> "Figure":
-        """The path, its errors as colours, by matplotlib."""
+        """Return the path, its errors as colours, by matplotlib."""
         return error_along_path(self.compared)
 
     def save(self, folder: str | Path) -> ResultFolder:

@@ -13,7 +13,7 @@ import pandas as pd
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Kind
 from pipeline.comparing.candidates import Candidate
-from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, unlike_runs
+from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, table_of_runs, unlike_runs
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -105,7 +105,7 @@ class Differences:
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row per pair, metric and case."""
+        """Return a row per pair, metric and case."""
         rows = []
         for each in self.paired:
             found = each.found._asdict()
@@ -119,7 +119,7 @@ class Differences:
 
     @property
     def sentences(self) -> list[str]:
-        """The verdicts in words, those on differences first."""
+        """Return the verdicts in words, those on differences first."""
         order = ("worse", "better", "higher", "lower", "unclear", "no difference")
         return [
             each.sentence for each in sorted(self.paired, key=lambda p: order.index(p.found.verdict))
@@ -129,7 +129,7 @@ class Differences:
         return "\n".join([*self.notes, *self.sentences])
 
     def charts(self) -> dict[str, Chart]:
-        """The differences over time, a chart for each pair and case."""
+        """Return the differences over time, a chart for each pair and case."""
         if self.times.empty:
             return {}
         groups = self.times.groupby(["first", "second", "case"], sort=False)
@@ -171,7 +171,8 @@ class Differences:
         inputs = self.inputs
         check_folder(place, {"input": inputs})
         names = [[candidate.name for candidate in candidates] for candidates in self.groups]
-        outcome = Outcome(tables={"differences": self.table}, figures=dict(self.charts()))
+        tables = {"differences": self.table, "runs": table_of_runs(self.groups)}
+        outcome = Outcome(tables=tables, figures=dict(self.charts()))
         if self.coverage:
             outcome.tables["coverage"] = coverage_table(self.coverage)
         if len(self.times):
@@ -200,13 +201,13 @@ class Differences:
 
     @property
     def drawable(self) -> list[str]:
-        """The runs of which all candidates of the first group have estimates."""
+        """Return the runs of which all candidates of the first group have estimates."""
         first, *others = self.groups[0]
         return [run for run in first.pairs if all(run in each.pairs for each in others)]
 
     @property
     def inputs(self) -> list[Path]:
-        """The files that went in."""
+        """Return the files that went in."""
         sources = [
             each for candidate in self.groups[0] for pair in candidate.pairs.values() for each in pair
         ]

@@ -23,6 +23,15 @@ class Advice(NamedTuple):
     otherwise: str = ""
     more: tuple[tuple[str, float | str], ...] = ()
 
+    @classmethod
+    def of(cls, setting: str) -> "Advice":
+        """A setting as `--set` takes it."""
+        key, _, text = setting.partition("=")
+        try:
+            return cls(key, float(text))
+        except ValueError:
+            return cls(key, text)
+
     @property
     def settings(self) -> dict[str, float | str]:
         """What is set, by its key."""

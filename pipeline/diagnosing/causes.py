@@ -1,25 +1,31 @@
 """The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pipeline.diagnosing.advice import number
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
+from pipeline.diagnosing.hypotheses.hypothesis import (
+    GainsOf,
+    Hypothesis,
+    Number,
+    gains_over,
+)
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import DROP_95, Gains, Peak, interval, peak
+from pipeline.diagnosing.search import DROP_95, Peak, end, peak, rival, side_by_side
 from replay.distributions import chi2
 from replay.engine.replaying.estimator import bind
 from replay.engine.streams.sources import MemorySource
 
 FALSE_ALARMS = 0.01  # of logs without a fault, where something is found all the same
 RIVAL = 3.0  # less gained than by the likeliest: odds of 20 to 1, not enough to leave it out
-
-
 SAME_SIZE, SAME_GAIN = 0.1, 0.8  # of a delay and what it gains: early and late by as much
+NOISES = ("measurement noise", "process noise")
+GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign of something else
+LEADING = 10  # of the likeliest faults: each is tried beside all others
 
 
 class Told(NamedTuple):
@@ -59,14 +65,17 @@ class Cause(NamedTuple):
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
             return [Told(of.part, *(of.told(each) for each in (self.value, low, high)))]
-        names = [of.topic, *of.part.split(", ")]
+        names = [of.topic, *of.part.split(", ")][-of.size :]
         return [Told(*each) for each in zip(names, self.value, low, high, strict=True)]
 
     @property
     def words(self) -> str:
         """What is wrong, by how much, and what that is known by."""
         or_else = "".join(
-            f"; or else, which this log does not tell from it, {each.said}" for each in self.others
+            f"; this log does not determine it: as likely, {each.said}"
+            if each.hypothesis is self.hypothesis
+            else f"; or else, which this log does not tell from it, {each.said}"
+            for each in self.others
         )
         return f"{self.said}{or_else}; without this the log-likelihood gains {number(self.gain, 4)}"
 
@@ -111,30 +120,90 @@ def find_causes(
     found, listed = list[Cause](), list[Tried]()
     candidates, now = list(tried), base
     while candidates and len(found) < most:
-        peaks, gains = _peaks(likelihood, now, candidates, len(tried))
+        gains_of = gains_over(likelihood, now)
+        peaks = _peaks(gains_of, candidates, len(tried))
         listed = listed or [Tried(each, at) for each, at in zip(candidates, peaks, strict=True)]
-        ranked = sorted(
-            (
-                (at, each)
-                for at, each in zip(peaks, candidates, strict=True)
-                if _is_named(at, each, len(tried)) and not _is_at_end(gains(each), at, each)
-            ),
-            key=lambda pair: -pair[0].score(pair[1]),
-        )
-        if not ranked:
+        alike = _likeliest(gains_of, peaks, candidates, len(tried))
+        if alike and _is_gross(*alike[0]):
+            beside = _companion(likelihood, now, peaks, candidates)
+            if beside is not None:
+                gains_of = gains_over(likelihood, beside.without(now))
+                others = [each for each in candidates if each is not beside.of]
+                peaks = _peaks(gains_of, others, len(tried))
+                alike = _likeliest(gains_of, peaks, others, len(tried)) or alike
+        if not alike:
             break
-        first = ranked[0]
-        least = first[0].score(first[1]) - RIVAL
-        alike = [
-            pair for pair in ranked if pair[0].score(pair[1]) > least or _is_other_name(pair, first)
-        ]
-        alike.sort(key=_is_early)
-        causes = [_cause(gains(each), at, each) for at, each in alike]
+        alike[1:1] = _rivals(gains_of, alike[0], least_gain(len(tried)))
+        causes = _causes(gains_of, alike)
         found.append(causes[0]._replace(others=tuple(causes[1:])))
         now = causes[0].hypothesis.without(now, causes[0].value)
         gone = {id(each) for _, each in alike}
         candidates = [each for each in candidates if id(each) not in gone]
     return found, listed
+
+
+def _likeliest(
+    gains_of: GainsOf, peaks: Sequence[Peak], candidates: Sequence[Hypothesis], count: int
+) -> list[tuple[Peak, Hypothesis]]:
+    """The hypothesis that gains most, and those that the log does not tell from it; none by chance."""
+    ranked = sorted(
+        ((at, each) for at, each in zip(peaks, candidates, strict=True) if _is_named(at, each, count)),
+        key=lambda pair: -pair[0].score(pair[1]),
+    )
+    first = next((pair for pair in ranked if not _is_at_end(gains_of, *pair)), None)
+    if first is None:
+        return []
+    least = first[0].score(first[1]) - RIVAL
+    near = [
+        pair
+        for pair in ranked
+        if pair is not first and (pair[0].score(pair[1]) > least or _is_other_name(pair, first))
+    ]
+    alike = [first, *(pair for pair in near if not _is_at_end(gains_of, *pair))]
+    return sorted(alike, key=_is_early)
+
+
+class _Supposed(NamedTuple):
+    """A fault with a number."""
+
+    of: Hypothesis
+    value: Number
+
+    def without(self, trial: Trial) -> Trial:
+        """The trial without it."""
+        return self.of.without(trial, self.value)
+
+
+def _is_gross(at: Peak, of: Hypothesis) -> bool:
+    """Whether it is a noise that is stated far too small."""
+    return of.kind in NOISES and at.value > GROSS
+
+
+def _companion(
+    likelihood: Likelihood, now: Trial, peaks: Sequence[Peak], candidates: Sequence[Hypothesis]
+) -> _Supposed | None:
+    """One of two gross faults, which gain more together than any noise does; None where no two do.
+
+    Beside the numbers that gain most by themselves, all special ones are tried: of two gross faults
+    none may gain by itself what it is worth.
+    """
+    supposed, most = list[_Supposed](), 0.0
+    for at, of in zip(peaks, candidates, strict=True):
+        if of.kind in NOISES:
+            most = max(most, at.gain)
+        elif of.kind != "outliers":
+            values = dict.fromkeys([at.value, *of.specials] if at.gain > 0.0 else of.specials)
+            supposed += [_Supposed(of, value) for value in values]
+    alone = np.array(gains_over(likelihood, now)(supposed))
+    best, found = most, None
+    for place in np.argsort(-alone, kind="stable")[:LEADING]:
+        leading = supposed[place]
+        others = [each for each in supposed if each.of is not leading.of]
+        gains = gains_over(likelihood, leading.without(now))(others)
+        together = alone[place] + max(gains, default=-np.inf)
+        if together > best:
+            best, found = float(together), leading
+    return found
 
 
 def _is_other_name(pair: tuple[Peak, Hypothesis], first: tuple[Peak, Hypothesis]) -> bool:
@@ -154,33 +223,18 @@ def _is_early(pair: tuple[Peak, Hypothesis]) -> bool:
     return of.kind in ("delay", "clock drift") and isinstance(at.value, float) and at.value < 0.0
 
 
-def _peaks(
-    likelihood: Likelihood, now: Trial, candidates: Sequence[Hypothesis], count: int
-) -> tuple[list[Peak], Callable[[Hypothesis], Gains]]:
-    """The greatest gain of each over a trial, and the gains of any; all are searched side by side."""
-    [before] = likelihood([now])
+def _peaks(gains_of: GainsOf, candidates: Sequence[Hypothesis], count: int) -> list[Peak]:
+    """The greatest gain of each; all are searched side by side."""
     greatest = 0.0
 
-    def gains_of(asked: Sequence[tuple[Hypothesis, Number]]) -> list[float]:
-        return [found - before for found in likelihood([each.without(now, at) for each, at in asked])]
-
-    def of(each: Hypothesis) -> Gains:
-        return lambda values: gains_of([(each, value) for value in values])
+    def noting(asked: Sequence[tuple[int, Number]]) -> Sequence[float]:
+        nonlocal greatest
+        found = gains_of([(candidates[place], at) for place, at in asked])
+        greatest = max([greatest, *found])
+        return found
 
     searches = [peak(each, least_gain(count, each.size), lambda: greatest) for each in candidates]
-    asked = {place: list(next(search)) for place, search in enumerate(searches)}
-    peaks: dict[int, Peak] = {}
-    while asked:
-        found = iter(gains_of([(candidates[place], at) for place, each in asked.items() for at in each]))
-        answers = {place: [next(found) for _ in each] for place, each in asked.items()}
-        greatest = max([greatest, *(gain for each in answers.values() for gain in each)])
-        asked = {}
-        for place, answer in answers.items():
-            try:
-                asked[place] = list(searches[place].send(answer))
-            except StopIteration as end:
-                peaks[place] = end.value
-    return [peaks[place] for place in range(len(candidates))], of
+    return side_by_side(searches, noting)
 
 
 def _is_named(at: Peak, of: Hypothesis, count: int) -> bool:
@@ -189,26 +243,51 @@ def _is_named(at: Peak, of: Hypothesis, count: int) -> bool:
     return at.gain > least_gain(count, of.size) and at.score(of) > 0.0 and not is_small
 
 
-def _is_at_end(gains: Gains, at: Peak, of: Hypothesis) -> bool:
+def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
     """Whether the number may as well be the last that is searched: its 95 % go on beyond."""
     if not of.has_end or at.is_special:
         return False
-    [last] = gains([float(np.copysign(of.limit, at.value))])
+    [last] = gains_of([(of, float(np.copysign(of.limit, at.value)))])
     return last > at.gain - DROP_95
 
 
-def _cause(gains: Gains, at: Peak, of: Hypothesis) -> Cause:
-    """The cause with the interval of its number."""
-    if not of.tried:  # it is, or is not
-        return Cause(of, at.value, (at.value, at.value), at.gain)
-    if of.size > 1:
-        return Cause(of, at.value, _intervals(gains, at, of), at.gain)
-    # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
-    scale = abs(float(np.max(at.value))) * min(1.0, (2.0 / at.gain) ** 0.5)
-    return Cause(of, at.value, interval(gains, at, scale), at.gain)
+def _rivals(
+    gains_of: GainsOf, pair: tuple[Peak, Hypothesis], apart: float
+) -> list[tuple[Peak, Hypothesis]]:
+    """Another number of a delay or angle, if it gains so little less that chance may explain it."""
+    at, of = pair
+    may_come_again = of.limit == np.pi or of.kind == "delay"
+    if not of.tried or of.size > 1 or not may_come_again:
+        return []
+    [found] = side_by_side(
+        [rival(of, at, at.gain - apart)], lambda asked: gains_of([(of, value) for _, value in asked])
+    )
+    return [] if found is None else [(found, of)]
 
 
-def _intervals(gains: Gains, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
+def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list[Cause]:
+    """The causes with the intervals of their numbers."""
+    asking = [(at, of) for at, of in pairs if of.tried and of.size == 1]  # others are, or are not
+    searches = []
+    for at, _ in asking:
+        # the gain falls by DROP_95 at about sqrt(DROP_95 / gain) of the way to zero
+        scale = abs(at.value) * min(1.0, (DROP_95 / at.gain) ** 0.5)
+        searches += [end(at, -scale), end(at, scale)]
+    ends = side_by_side(
+        searches, lambda asked: gains_of([(asking[place // 2][1], value) for place, value in asked])
+    )
+    of_one = iter(zip(ends[::2], ends[1::2], strict=True))
+    found = []
+    for at, of in pairs:
+        if of.size > 1:
+            between = _intervals(gains_of, at, of)
+        else:
+            between = next(of_one) if of.tried else (at.value, at.value)
+        found.append(Cause(of, at.value, between, at.gain))
+    return found
+
+
+def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
     """The 95 % intervals of several numbers, by the curvature of the gain at its greatest."""
     values, steps = np.array(at.value), np.array(of.tried[0])
     units = np.diag(steps)
@@ -219,7 +298,7 @@ def _intervals(gains: Gains, at: Peak, of: Hypothesis) -> tuple[Number, Number]:
         for a in (1, -1)
         for b in (1, -1)
     ]
-    found = np.array(gains([tuple(map(float, each)) for each in asked])).reshape(-1, 4)
+    found = np.array(gains_of([(of, tuple(map(float, each))) for each in asked])).reshape(-1, 4)
     bend = np.zeros((of.size, of.size))
     for (row, column), (both, one, other, none) in zip(pairs, found, strict=True):
         bend[row, column] = bend[column, row] = 0.25 * (both - one - other + none)

@@ -6,19 +6,20 @@ noise is stated too small makes the range's innovations too large as well.
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from pipeline.altering.sources import alterations_of, setting_of, split_settings
+from pipeline.altering.sources import alter, alterations_of, setting_of, split_settings
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
-from pipeline.diagnosing.advice import Trying
+from pipeline.diagnosing.advice import Advice, Trying
 from pipeline.diagnosing.causes import Cause, Told, Tried, least_gain, seek, tried_table
 from pipeline.diagnosing.consistency import judged_by_itself, unnamed, unseen_errors
 from pipeline.diagnosing.findings import (
@@ -29,8 +30,7 @@ from pipeline.diagnosing.findings import (
     of_plausibility,
     without_filter,
 )
-from pipeline.diagnosing.outputs import Outputs
-from pipeline.diagnosing.portion import first_part, on_the_rest
+from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest
 from pipeline.diagnosing.sentences import Sentence, ranked
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -259,12 +259,8 @@ def diagnose(
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
     settings = merge(own, allowed(given))
+    source, done, mended, why = _followed(source, label, settings, gap_limit_s)
     bound = bind(label, [source], {"kind": label, **settings})
-    source = until_last_measured(source, bound)
-    done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
-    if done.failures:
-        why = next((f": {each.words}" for each in of_plausibility(source, source.topics)), "")
-        raise BadInput(f"{done.failures[0]}; solve that first{why}")
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
         raise BadInput(
@@ -273,7 +269,7 @@ def diagnose(
         )
     gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
-    notes = []
+    notes = [*why]
     causes: Sequence[Cause] = []
     tried: Sequence[Tried] = []
     least, likely, end_ns = np.inf, np.nan, None
@@ -292,7 +288,8 @@ def diagnose(
         )
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
-    sentences = ranked(causes, without_filter(source, streamed), trying, rest)
+    sentences = [Sentence.of(each) for each in mended]
+    sentences += ranked(causes, without_filter(source, streamed), trying, rest)
     no_judges = judged_by_itself(source, streamed)
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
@@ -317,6 +314,47 @@ def diagnose(
         [*notes, *no_judges.values(), *_notes(done, sentences)],
         likely,
     )
+
+
+class _Followed(NamedTuple):
+    """A log that an estimator can follow, how it did, what had to be mended first, and a note on it."""
+
+    source: LogSource | MemorySource
+    done: Replay
+    mended: Sequence[Finding] = ()
+    notes: Sequence[str] = ()
+
+
+def _followed(
+    source: LogSource | MemorySource, label: str, settings: Mapping[str, Any], gap_limit_s: float
+) -> _Followed:
+    """Replay a log; one that cannot be followed without what it says itself is wrong with it.
+
+    Raises BadInput where it cannot be followed even so, with why it cannot as it is.
+    """
+
+    def replayed(source: LogSource | MemorySource) -> _Followed:
+        source = until_last_measured(source, bind(label, [source], {"kind": label, **settings}))
+        done = replay(source, {label: settings}, gap_limit_s=gap_limit_s)
+        if done.failures:
+            why = next((f": {each.words}" for each in of_plausibility(source, source.topics)), "")
+            raise BadInput(f"{done.failures[0]}; solve that first{why}")
+        return _Followed(source, done)
+
+    try:
+        return replayed(source)
+    except BadInput as error:
+        mended = [each for each in of_plausibility(source, source.topics) if each.setting]
+        if not mended:
+            raise
+        trying = Trying(label, alterations_of(source), is_own=False)
+        mends = [trying.over(Advice.of(each.setting)) for each in mended]
+        said = " ".join(f"--set {each.setting}" for each in mends)
+        note = f"all else is said of the log with {said}, since as it is: {error}"
+        with suppress(BadInput):
+            other = alter(source, {each.key: each.value for each in mends})
+            return replayed(other)._replace(mended=mended, notes=[note])
+        raise
 
 
 def _asked(

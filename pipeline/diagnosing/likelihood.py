@@ -231,11 +231,12 @@ class Likelihood:
                 return {}
             is_in = stream["accepted"] != 0
             total = float(np.sum(stream["log_likelihood"][is_in]))
-            missing = np.isnan(stream["innovation"][~is_in])
-            total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
-            share = len(missing) / len(stream) if len(stream) else 0.0
-            if 0.0 < share < 1.0:
-                total += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
+            if not is_in.all():
+                missing = np.isnan(stream["innovation"][~is_in])
+                total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
+                share = len(missing) / len(stream)
+                if share < 1.0:
+                    total += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
             if name in self.readings:
                 own = [self.broad[each] for each in self.readings[name].kinds if each in self.broad]
                 total += lacking * float(np.mean(own)) if lacking else 0.0

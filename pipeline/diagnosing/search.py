@@ -5,22 +5,27 @@ has the next values of all faults.
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.optimize import brentq
 
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Number
 
 Gains = Callable[[Sequence[Number]], Sequence[float]]  # of the values of one number
 Search = Generator[Sequence[Number], Sequence[float], "Peak"]
+Result = TypeVar("Result")
 DROP_95 = 1.92  # of the log-likelihood, from its greatest to where 95 % of a parameter end
+ROOT_95 = DROP_95**0.5
+END = 1e-3  # of how far an end is: what it need not be known better by
+SHARES = 0.05, 0.95  # of a bracket, between which its next value is
 ROUNDS = 14  # of a refinement at most
 DOUBLINGS = 12  # of the way to an end
 LARGEST = 1e12  # a loss, of what cannot be used
 NEAR = 1e-5  # of log-likelihood: a peak that is known this well is known
 CLEAR = 0.05  # of the same, where a peak is of several numbers
 FAR = 0.02  # of what a peak lacks to the greatest: one that is far from it need not be known better
+GRID = 49  # numbers, over all that are searched, among which another greatest gain is looked for
+WIDE = 4.0  # times what a parabola promises: more is not hoped for
 NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
 
 
@@ -186,25 +191,84 @@ def _of_several(of: Hypothesis, floor: float, greatest: Callable[[], float]) -> 
     return Peak(tuple(map(float, at)), gain) if gain > 0.0 else Peak((0.0,) * size, 0.0)
 
 
-def interval(gains: Gains, at: Peak, scale: float) -> tuple[float, float]:
-    """The 95 % interval of a number: where the gain is less than its greatest by DROP_95.
+def rival(
+    of: Hypothesis, at: Peak, least: float
+) -> Generator[Sequence[Number], Sequence[float], Peak | None]:
+    """Search for another number of a fault that gains at least so much; None where there is none.
 
-    `scale` is a length that is not too long; an end that is not found is infinite.
+    It is another greatest gain, with a valley to the first: as of a delay on laps of equal length.
+    """
+    values = np.linspace(-of.limit, of.limit, GRID).tolist()
+    known = dict(zip(values, (yield values), strict=True)) | {at.value: at.gain}
+    values = sorted(known)
+    tops = [
+        (low, best, high)
+        for low, best, high in zip(values, values[1:], values[2:], strict=False)
+        if known[best] >= max(known[low], known[high]) and at.value not in (low, best, high)
+    ]
+    if not tops:
+        return None
+    top = {value: known[value] for value in max(tops, key=lambda each: known[each[1]])}
+    before = -np.inf
+    for _ in range(ROUNDS):
+        now, promised = max(top.values()), _promised(top)
+        if now + WIDE * promised < least or (now - before < NEAR and promised < NEAR):
+            break
+        before, asked = now, _next(top, of.limit)
+        if not asked:
+            break
+        top.update(zip(asked, (yield asked), strict=True))
+    value = max(top, key=lambda each: top[each])
+    return Peak(value, top[value]) if top[value] >= least else None
+
+
+def end(at: Peak, scale: float) -> Generator[Sequence[Number], Sequence[float], float]:
+    """Search for an end of the 95 % interval of a number: where the gain is DROP_95 below its greatest.
+
+    `scale` is how far off it is about, with its side. An end that is not found is infinite. The gain is
+    about a parabola, so that the root of what it falls by is about a line.
     """
     assert isinstance(at.value, float)
-    middle = at.value
+    inner, outer = at.value, at.value + scale
+    least, fallen = 0.0, 0.0
+    for _ in range(DOUBLINGS):
+        fallen = _root_of_fall(at, (yield [outer]))
+        if fallen > ROOT_95:
+            break
+        inner, outer, least = outer, outer + (outer - at.value), fallen
+    else:
+        return float(np.copysign(np.inf, scale))
+    value, most = outer, fallen
+    while abs(fallen / ROOT_95 - 1.0) > END and abs(outer - inner) > END * abs(outer - at.value):
+        share = float(np.clip((ROOT_95 - least) / (most - least), *SHARES))
+        value = inner + share * (outer - inner)
+        fallen = _root_of_fall(at, (yield [value]))
+        if fallen > ROOT_95:
+            outer, most = value, fallen
+        else:
+            inner, least = value, fallen
+    return value
 
-    def rest(value: float) -> float:
-        [gain] = gains([value])
-        return max(gain, -LARGEST) - (at.gain - DROP_95)
 
-    def end(sign: float) -> float:
-        inner, step = middle, sign * scale
-        for _ in range(DOUBLINGS):
-            outer = middle + step
-            if rest(outer) < 0.0:
-                return float(brentq(rest, inner, outer, xtol=1e-3 * abs(outer - middle)))
-            inner, step = outer, 2.0 * step
-        return sign * np.inf
+def _root_of_fall(at: Peak, gains: Sequence[float]) -> float:
+    [gain] = gains
+    return float(np.sqrt(np.clip(at.gain - gain, 0.0, LARGEST)))
 
-    return end(-1.0), end(1.0)
+
+def side_by_side(
+    searches: Sequence[Generator[Sequence[Number], Sequence[float], Result]],
+    gains_of: Callable[[Sequence[tuple[int, Number]]], Sequence[float]],
+) -> list[Result]:
+    """Let searches go on together, by the gains of what all of them ask for: places and values."""
+    asked = {place: list(next(search)) for place, search in enumerate(searches)}
+    results: dict[int, Result] = {}
+    while asked:
+        found = iter(gains_of([(place, at) for place, each in asked.items() for at in each]))
+        answers = {place: [next(found) for _ in each] for place, each in asked.items()}
+        asked = {}
+        for place, answer in answers.items():
+            try:
+                asked[place] = list(searches[place].send(answer))
+            except StopIteration as stop:
+                results[place] = stop.value
+    return [results[place] for place in range(len(searches))]

@@ -295,9 +295,9 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     first = setting.options.battery_seed
     seeds = range(first, first + setting.options.battery_runs)
     if seeds:
-        planted = battery.planted(seeds, setting.progress)
-        outcome.tables |= {"battery": battery.summary(planted), "battery_runs": planted}
-        outcome.metrics |= battery.metrics_of(planted)
+        tables, metrics = battery.results(seeds, setting.progress)
+        outcome.tables |= tables
+        outcome.metrics |= metrics
     outcome.input_sha256 = hash_streams(clean)
     return outcome
 

@@ -37,7 +37,7 @@ ANY = "any"
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of a paper: what it prints, what we measured, our verdict and its reason.
+    """Represents a statement of a paper: what it prints, what we measured, our verdict and its reason.
 
     There is no verdict on a claim that is made of another recording.
     """
@@ -50,7 +50,7 @@ class Claim:
 
 
 def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str = "") -> Claim:
-    """A claim that a measured condition confirms or refutes.
+    """Return a claim that a measured condition confirms or refutes.
 
     >>> judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict
     'confirmed'

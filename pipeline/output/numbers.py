@@ -203,8 +203,10 @@ def _chi_square(share: Number, size: Number) -> Number:
 
 
 def _count(values: list[Any]) -> Number:
-    """How many comparisons are true."""
-    return exactly(sum(each is True for each in _flat(values)))
+    """How many comparisons are true; where one is missing, how many are is not known."""
+    flat = _flat(values)
+    count = float(sum(each is True for each in flat))
+    return Number(count, math.nan, math.nan) if "missing" in flat else exactly(count)
 
 
 def _falls(values: list[Number]) -> Truth:
@@ -213,9 +215,14 @@ def _falls(values: list[Number]) -> Truth:
 
 
 def _consistent(size: Number, count: Number) -> Number:
-    """The interval of a mean NEES of so many components, over so many independent estimates."""
+    """The interval of a mean NEES of so many components, over so many independent estimates.
+
+    NaN where one of these is missing.
+    """
     from replay.judging.errors.evaluation import chi_square_interval
 
+    if not (size.is_known and count.is_known):
+        return exactly(None)
     low, high = chi_square_interval(int(size.value), int(count.value))
     return Number(size.value, float(low), float(high))
 

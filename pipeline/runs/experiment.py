@@ -29,12 +29,12 @@ from replay.judging.metrics.measuring import find_metrics
 
 
 class Experiment(Parameters):
-    """One experiment as its TOML file says it.
+    """Describes one experiment as its TOML file says it.
 
     The runs are recorded from a scenario, imported, or logs that are there.
 
     Attributes:
-        title: what it is, in a line.
+        title: what it is, in a line; text: more of it for the report, in Markdown.
         study: name of the study that does its work.
         seed: seed of the recorded runs.
         runs: number of recorded runs.
@@ -55,6 +55,7 @@ class Experiment(Parameters):
     """
 
     title: str
+    text: str | None = None
     study: str = "localization"
     seed: Annotated[int, Field(ge=0)] = 0
     runs: PositiveInt = 1
@@ -110,7 +111,7 @@ class Experiment(Parameters):
 
     @property
     def files(self) -> list[Path]:
-        """The logs that are replayed."""
+        """Return the logs that are replayed."""
         return [Path(file) for file in self.logs.files] if self.logs else []
 
 
@@ -158,7 +159,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Study:
-    """A registered study does an experiment's work.
+    """Does an experiment's work: a registered study.
 
     `run` writes its logs and timeline into the setting's folder, and returns what it found. Where it
     replays by `pipeline.runs.campaigns` alone, `is_campaign` says so: others may work on parts of the

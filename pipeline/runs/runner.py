@@ -29,7 +29,7 @@ from replay.judging.judge import Judge
 
 @dataclass(frozen=True)
 class Runner:
-    """The runs of an experiment, in its setting."""
+    """Holds the runs of an experiment, in its setting."""
 
     experiment: Experiment
     setting: Setting
@@ -121,13 +121,13 @@ class Runner:
         show(sources[0], of_run, judged.errors, save=place / "timeline.rrd")
 
     def run(self) -> Replayed:
-        """All of it: the experiment's runs, replayed in memory, and the first ones kept."""
+        """Replay all of the experiment's runs in memory, and keep the first ones."""
         replayed = self.replay(self.obtain())
         self.keep(replayed.sources, replayed.outputs)
         return replayed
 
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
-        """The same for every case, given by name and what differs in the scenario's parameters.
+        """Do the same for every case, given by name and what differs in the scenario's parameters.
 
         What is kept goes to a folder of the case, but the first case's timeline is the experiment's.
         """
@@ -137,7 +137,7 @@ class Runner:
             yield name, replayed
 
     def judge(self, now: slice) -> Pass:
-        """Some of the runs in one streamed pass; the first ones' logs and timeline go to the folder."""
+        """Judge some runs in one streamed pass; the first ones' logs and timeline go to the folder."""
         experiment, setting = self.experiment, self.setting
         order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
         places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 PER_DECADE = 8
 _BLOCK = 1 << 16
-_FULL = 1 << 18  # samples, from which on degrees of freedom are those of a coarser grid
+_FULL = 1 << 17  # samples, from which on degrees of freedom are those of a grid of 1000 a window
 
 
 class Curve(NamedTuple):
@@ -66,7 +66,7 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
 
 def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -> float:
     """Return the degrees of freedom of an Allan variance of `pairs` differences, by its terms."""
-    coarser = max(1, (pairs + 2 * multiple) // _FULL) if multiple > 1000 else 1
+    coarser = max(1, multiple // 1000) if pairs + 2 * multiple > _FULL else 1
     multiple, pairs, step_s = multiple // coarser, max(1, pairs // coarser), step_s * coarser
     g = terms.autocovariance(multiple, step_s, pairs)
     weights = 2.0 * (pairs - np.arange(len(g)))

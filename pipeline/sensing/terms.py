@@ -59,7 +59,7 @@ class Terms(NamedTuple):
         """What has the autocovariance of the samples, times step_s^2, as second differences."""
         lag = np.asarray(lag, dtype=float)
         white = self.white**2 / step_s * lag / 2
-        walk = -(self.walk**2) * step_s * (lag**3 - lag) / 12
+        walk = -(self.walk**2) * step_s * (lag * lag * lag - lag) / 12
         quantised = -((self.quantisation / step_s) ** 2) * (lag == 0)
         found = (white + walk + quantised) * step_s**2
         if self.markov:

@@ -11,12 +11,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp
 
 from recorders.log import Clock
 from replay.engine.replaying.estimator import Bound, Initialization, Initialized, Recursive
 from replay.engine.replaying.replaying import replay
-from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.blocks import Ragged, gather, side_by_side
 from replay.engine.streams.sources import Ensemble, MemorySource
 
 Starts = Mapping[str, Sequence[Initialized]]  # by the name of what is estimated; parts of one number
@@ -36,7 +35,7 @@ def broad_starts(source: MemorySource, bound: Sequence[Bound]) -> Starts:
         if initialization.find_broad is None:
             found[bound.name] = [initialization.find(first, static, clock)]
         else:
-            found[bound.name] = initialization.find_broad(first, static, clock, first_ns)
+            found[bound.name] = initialization.find_broad(first, static, clock, [first_ns])
         return found[bound.name][0]
 
     if any(map(initialization_of, bound)):
@@ -86,25 +85,23 @@ def _own_parts(
     static: Mapping[str, Ragged],
     clock: Clock,
 ) -> Initialized:
-    parts: list[Initialized] = []
-    for trial, begin_ns in enumerate(begins_ns):
-        own, about = (
-            {name: gather([ragged.of_run(trial * count)]) for name, ragged in given.items()}
-            for given in (first, static)
-        )
-        found = find_broad(own, about, clock, begin_ns)
-        parts += (found * count)[:count]
-    topics = parts[0].static
-    return Initialized(
-        {name: gather([each.static[name].stream for each in parts]) for name in topics}, []
+    trials = range(0, len(begins_ns) * count, count)
+    own, about = (
+        {name: gather([ragged.of_run(run) for run in trials]) for name, ragged in given.items()}
+        for given in (first, static)
     )
+    found = find_broad(own, about, clock, begins_ns)
+    parts = [found[number % len(found)].static for number in range(count)]
+    return Initialized({name: side_by_side([each[name] for each in parts]) for name in parts[0]}, [])
 
 
 def mean_likelihood(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Compute the log of the mean of likelihoods, by what is estimated; a part that failed has none."""
     names = dict.fromkeys(name for part in parts for name in part)
     return {
-        name: float(logsumexp([part.get(name, -np.inf) for part in parts]) - np.log(len(parts)))
+        name: float(
+            np.logaddexp.reduce([part.get(name, -np.inf) for part in parts]) - np.log(len(parts))
+        )
         for name in names
     }
 

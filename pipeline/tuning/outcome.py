@@ -93,7 +93,7 @@ class Tuning:
 
     @property
     def parameters(self) -> pd.DataFrame:
-        """A row per parameter: its start, its value, its 95 % interval (NaN where there is none)."""
+        """Return a row per parameter: start, value, 95 % interval (NaN where there is none)."""
         free = self.found.coordinates.free
         point, reach = self.found.coordinates.of(self.found.optimum), QUANTILE * self.standard_errors
         low, high = map(self.found.coordinates.unbounded, (point - reach, point + reach))
@@ -147,7 +147,7 @@ class Tuning:
 
     @cached_property
     def whiteness(self) -> pd.DataFrame:
-        """A row per measured component with either values.
+        """Return a row per measured component with either values.
 
         How many innovations there are, the mean square of the normalised ones, their correlation with
         the next, Ljung and Box's Q, and how probable a larger one is if they are white.
@@ -179,12 +179,12 @@ class Tuning:
 
     @cached_property
     def replay(self) -> Replay:
-        """The logs replayed with either values: the estimators `start` and `tuned`."""
+        """Return the logs replayed with either values: the estimators `start` and `tuned`."""
         return replay(self.logs, self.settings, gap_limit_s=self.objective.gap_limit_s)
 
     @cached_property
     def held_out(self) -> Replay | None:
-        """The logs held out, likewise; None where there are none."""
+        """Return the logs held out, likewise; None where there are none."""
         if not self.held_out_logs:
             return None
         named = {f"{label}-held-out": values for label, values in self.settings.items()}
@@ -197,12 +197,12 @@ class Tuning:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric of all logs with either values: estimator, quantity, case, value."""
+        """Return a row per metric of all logs with either values: estimator, quantity, case, value."""
         return joined(each.metrics for each in self.replays)
 
     @cached_property
     def notes(self) -> list[str]:
-        """A sentence for everything that one has to know of the values."""
+        """Return a sentence for everything that one has to know of the values."""
         return [
             *self.notes_of_search,
             *(each for each in self.replay.judge.notes_of_coverage if each.startswith(TUNED)),
@@ -322,7 +322,7 @@ class Tuning:
 
     @property
     def toml(self) -> str:
-        """The tuned settings, as --settings takes them."""
+        """Return the tuned settings, as --settings takes them."""
         values = {name: each for name, each in self.settings[TUNED].items() if _is_toml(each)}
         if values.get("kind") == self.label:
             del values["kind"]
@@ -373,7 +373,7 @@ class Tuning:
 
     @property
     def profile_chart(self) -> Chart:
-        """The log-likelihood along each parameter, and where 95 % of it ends."""
+        """Return the log-likelihood along each parameter, and where 95 % of it ends."""
         positive = {each.name: each.is_positive for each in self.found.coordinates.free}
         panels = [
             Panel(

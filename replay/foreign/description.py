@@ -167,10 +167,10 @@ class Description(_Part):
                 "gt": each.exclusiveMinimum,
                 "lt": each.exclusiveMaximum,
             }
-            told: dict[str, Any] = {key: value for key, value in bounds.items() if value is not None}
+            stated: dict[str, Any] = {key: value for key, value in bounds.items() if value is not None}
             unit = "" if not each.unit or unit_of(name) else f"in {each.unit}"
             meaning = ", ".join(filter(None, (each.meaning, unit)))
-            kind: Any = Annotated[float, Field(**told)] if told else float
+            kind: Any = Annotated[float, Field(**stated)] if stated else float
             kind = kind | None if each.default is None else kind
             fields[name] = (kind, Field(each.default, description=meaning))
         return create_model("FilterParameters", __base__=base, __doc__=base.__doc__, **fields)

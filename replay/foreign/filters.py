@@ -6,8 +6,8 @@ a run's messages at once, when all are there: so a run that ends its process cos
 
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,18 +17,17 @@ from recorders.errors import BadInput
 from recorders.log import Topic
 from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
-from replay.engine.streams.blocks import Block, Ragged, copied
+from replay.engine.streams.blocks import Block, Ragged
 from replay.engine.streams.channels import given_or_stated, resolved
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.priors import gaussians
-from replay.engine.streams.results import ALL_WELL
 from replay.foreign.description import Description, ForeignParameters, read_description
 from replay.foreign.messages import events_of, joined, of_run, static_of, static_of_run, streams_of
 from replay.foreign.naming import what_runs
 from replay.foreign.native.following import (
-    NOT_COPIED,
     Filters,
     Static,
+    copies_of,
     filters_of,
     follow_all,
     followed,
@@ -36,8 +35,15 @@ from replay.foreign.native.following import (
     reason_of_code,
 )
 from replay.foreign.native.library import Library
-from replay.foreign.processes.isolation import Limits, Ran, describe_apart, follow_runs_apart
-from replay.foreign.processes.tasks import RunGiven, sizes_of
+from replay.foreign.native.out_of_sequence import gone_back
+from replay.foreign.processes.isolation import (
+    Limits,
+    Ran,
+    describe_apart,
+    follow_here,
+    follow_runs_apart,
+)
+from replay.foreign.processes.tasks import IN_ORDER, RunGiven, sizes_of
 from replay.foreign.results import begun, results
 from replay.inference.run.recursion import FilterEvents
 from replay.inference.run.timing import add_output_times
@@ -171,7 +177,7 @@ def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
 
     def run(state: _Running | None, block: Block) -> tuple[_Running, list[Ragged]]:
         before = state or started({}, len(block.events.offsets) - 1)
-        filters = _copied(library, before.filters)
+        filters = copies_of(library, before.filters)  # the block may have to be processed again
         own_start = np.where(filters.has_prior == 1, before.start_ns, _first_ns(block))
         start_ns = np.where(filters.begun == 1, before.start_ns, own_start)
         events, next_output = found.events(block, start_ns, before.next_output)
@@ -186,9 +192,9 @@ def bind_in_process(found: FoundFilter, library: Library) -> Recursive:
             )
             for each in failed
         }
-        told = followed(made, due, recorded)
+        results_of_runs = followed(made, due, recorded)
         after = _Running(filters, before.static, start_ns, next_output, _Owner(library, filters.handle))
-        return after, streams_of(found.name, description, found.truth, told, failures)
+        return after, streams_of(found.name, description, found.truth, results_of_runs, failures)
 
     return found.bound(start, run, None)
 
@@ -197,14 +203,6 @@ def _first_ns(block: Block) -> Integers:
     """Return the stamp of every run's first message (runs,); 0 where it has none."""
     offsets, times_ns = block.events.offsets, np.append(block.events.time_ns, 0)
     return np.where(np.diff(offsets) > 0, times_ns[offsets[:-1]], 0)
-
-
-def _copied(library: Library, filters: Filters) -> Filters:
-    """Copy filters: those of a block's beginning stay, since it may have to be processed again."""
-    copies = np.array([library.copy(handle) for handle in filters.handle.tolist()], np.int64)
-    found = copied(filters)._replace(handle=copies)
-    found.failure[(copies == 0) & (found.failure == ALL_WELL)] = NOT_COPIED
-    return found
 
 
 # --- in processes of their own ----------------------------------------------------------------------
@@ -220,8 +218,14 @@ class _Waiting(NamedTuple):
     next_output: Integers
 
 
-def bind_apart(found: FoundFilter, follow_runs: FollowRuns) -> Recursive:
-    """Bind a filter that is given a run's messages at once, in a process of its own."""
+def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_ORDER) -> Recursive:
+    """Bind a filter that is given a run's messages at once.
+
+    Args:
+        found: the filter.
+        follow_runs: takes runs through their filters.
+        window_ns: how late messages may be, which are given as they arrive; IN_ORDER for none.
+    """
     description, numbers = found.description, found.numbers
 
     def started(given: Mapping[str, Ragged], runs: int) -> _Waiting:
@@ -245,27 +249,31 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns) -> Recursive:
         if state.prior is not None:
             time_ns, mean, covariance = (column[run] for column in state.prior)
             if not np.isfinite(mean.sum()):
-                return None  # why is told
+                return None  # without a prior that can be used it takes no part
             prior = int(time_ns), mean, covariance
         static = static_of_run(state.static, run)
         events = of_run(state.events, run)
-        given = RunGiven(static, events, prior, numbers, found.parameters.seed)
-        return given if len(events.time_ns) else None
+        given = RunGiven(static, events, prior, numbers, found.parameters.seed, window_ns)
+        if window_ns != IN_ORDER and prior is not None:  # what is older says nothing
+            given = given.from_time(prior[0])
+        return given if len(given.events.time_ns) else None
 
     def finish(state: _Waiting | None) -> list[Ragged]:
         if state is None or not state.events:
             return []
         runs = len(state.events[0].offsets) - 1
-        ran = follow_runs([given_of(state, each) for each in range(runs)], Limits.of(found.parameters))
+        given = [given_of(state, each) for each in range(runs)]
+        ran = follow_runs(given, Limits.of(found.parameters))
         due = recorded = np.zeros(2, np.int64)
         nothing = followed(results(due, recorded, sizes_of(description)), due, recorded)
-        told = joined([nothing if each is None else each.followed for each in ran])
+        results_of_runs = joined([nothing if each is None else each.followed for each in ran])
         failures = {
             number: each.failure
             for number, each in enumerate(ran)
             if each is not None and each.failure is not None
         }
-        return streams_of(found.name, description, found.truth, told, failures)
+        made = streams_of(found.name, description, found.truth, results_of_runs, failures)
+        return made if window_ns == IN_ORDER else [*made, gone_back(found.name, state.events)]
 
     return found.bound(start, run, finish)
 
@@ -287,18 +295,33 @@ class _OfLibraries(Estimator[Any]):
         def bind(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:
             bound: list[Bound] = []
             for found in bind_all(label, description, topics, parameters):
-                if in_process:
-                    bound.append(bind_in_process(found, _loaded(file)))
-                    continue
-
-                def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
-                    return follow_runs_apart(str(file.path), runs, description, limits)
-
-                bound.append(bind_apart(found, follow_runs))
+                made = (
+                    bind_in_process(found, _loaded(file))
+                    if in_process
+                    else bind_apart(found, follow_runs)
+                )
+                bound.append(replace(made, out_of_sequence=partial(_going_back, found, follow_runs)))
             return bound
+
+        def follow_runs(runs: Sequence[RunGiven | None], limits: Limits) -> list[Ran | None]:
+            if not in_process:
+                return follow_runs_apart(str(file.path), runs, description, limits)
+            return [
+                None if each is None else follow_here(_loaded(file), each, description) for each in runs
+            ]
 
         parameters = description.parameters_over(LibraryParameters)
         return Estimator(description.summary, description.requirements, parameters, bind)
+
+
+def _going_back(found: FoundFilter, follow_runs: FollowRuns, window_ns: int) -> Recursive:
+    """Bind a filter whose messages are given as they arrive; raises BadInput where it has to wait."""
+    if found.parameters.every_s is not None:
+        raise BadInput(
+            f"estimator {found.name}: --late rewind: there are no estimates between messages (every_s, "
+            "--every) then; give --late drop or --late wait:SECONDS"
+        )
+    return bind_apart(found, follow_runs, window_ns)
 
 
 class _File(NamedTuple):

@@ -1,6 +1,7 @@
 """Turns messages into the rows of numbers that a foreign filter takes, and what it says into streams."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -103,7 +104,7 @@ def events_of(description: Description, found: Mapping[str, Topic], block: Block
         np.ascontiguousarray(np.concatenate(tables)[merged.source]),
         wanted,
         np.concatenate(targets)[merged.source],
-        np.empty((len(source), 0), np.int64),
+        np.empty((len(source), 0), np.int64) if block.arrival is None else block.arrival,
     )
 
 
@@ -125,7 +126,7 @@ def streams_of(
     failures: Mapping[int, Failure],
 ) -> list[Ragged]:
     """Make the output topics of what filters said."""
-    topic, (estimates, offsets, innovations, recorded) = f"/estimates/{name}", followed
+    topic, (issued_ns, estimates, offsets, innovations, recorded) = f"/estimates/{name}", followed
     state = state_stream(
         f"{topic}/{description.output}",
         estimates.time_ns,
@@ -134,6 +135,7 @@ def streams_of(
         estimates.mean,
         estimates.covariance,
     )
+    state = replace(state, log_time_ns=issued_ns)
     made = [Ragged(state, offsets), failures_by_run(topic, failures, len(offsets) - 1)]
     if description.innovation:
         made.append(recorded_innovations(topic, description.innovation, truth, innovations, recorded))
@@ -156,6 +158,7 @@ def joined(of_runs: Sequence[Followed]) -> Followed:
     estimates = zip(*(run.estimates for run in of_runs), strict=True)
     innovations = zip(*(run.innovations for run in of_runs), strict=True)
     return Followed(
+        np.concatenate([run.issued_ns for run in of_runs]),
         Estimates(*map(np.concatenate, estimates)),
         _offsets([len(run.estimates.time_ns) for run in of_runs]),
         Innovations(*map(np.concatenate, innovations)),

@@ -3,8 +3,8 @@
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import RunMetadata, Stream, Topic, schemas, write_log
 from replay.engine.compiling.compile import core_count
-from replay.engine.replaying.estimator import Batch, Bound, Estimator
+from replay.engine.replaying.estimator import Batch, Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import Failure
 from replay.engine.streams.results import failures_by_run
@@ -92,12 +92,20 @@ def _of_stream(words: tuple[str, ...]) -> Estimator[Any]:
         return follow_runs_streaming(words, runs, description, limits)
 
     def bind(label: str, topics: Mapping[str, Topic], parameters: Any) -> list[Bound]:
-        return [
-            bind_apart(found, follow_runs) for found in bind_all(label, description, topics, parameters)
-        ]
+        found = bind_all(label, description, topics, parameters)
+        bound = [bind_apart(each, follow_runs) for each in found]
+        return [replace(each, out_of_sequence=partial(_cannot_go_back, label)) for each in bound]
 
     parameters = description.parameters_over(StreamParameters)
     return Estimator(description.summary, description.requirements, parameters, bind)
+
+
+def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
+    """Refuse to go back."""
+    raise BadInput(
+        f"estimator {label}: --late rewind: a program cannot be copied, as a filter of a library (lib:) "
+        "can; give --late drop or --late wait:SECONDS"
+    )
 
 
 def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
@@ -220,11 +228,11 @@ def _solve(
     failures = {run: each for run, each in enumerate(made) if isinstance(each, Failure)}
     if len(failures) == runs == 1:
         raise BadInput(f"estimator {label}: {failures[0].reason}")
-    told = [{} if isinstance(each, Failure) else each for each in made]
-    nothing = {topic: stream.take(slice(0, 0)) for each in told for topic, stream in each.items()}
+    written = [{} if isinstance(each, Failure) else each for each in made]
+    nothing = {topic: stream.take(slice(0, 0)) for each in written for topic, stream in each.items()}
     return [
         failures_by_run(f"/estimates/{label}", failures, runs),
-        *(gather([each.get(topic, empty) for each in told]) for topic, empty in nothing.items()),
+        *(gather([each.get(topic, empty) for each in written]) for topic, empty in nothing.items()),
     ]
 
 

@@ -28,11 +28,14 @@ class Results(NamedTuple):
     """Holds what is filled in.
 
     Attributes:
-        progress: (runs,) the message at work; see `following.follow`.
+        progress: (runs,) the message at work, which another process sees.
+        issued_ns: of every estimate, when the message arrived that called for it; its stamp where
+            messages are taken in the order of their stamps.
         estimates, innovations: run r has the rows from the offsets' r-th on.
     """
 
     progress: Integers
+    issued_ns: Integers
     estimates: Estimates
     innovations: Innovations
 
@@ -51,12 +54,12 @@ def results(
     runs, (n, t, m) = len(due) - 1, sizes
     shapes = [
         *((runs,) for _ in range(3)),
-        *((int(due[-1]), *shape) for shape in ((), (n,), (t, t))),
+        *((int(due[-1]), *shape) for shape in ((), (), (n,), (t, t))),
         *((int(recorded[-1]), *shape) for shape in ((), (), (m,), (m, m), (3,))),
     ]
     ends = list(accumulate(map(math.prod, shapes), initial=0))
     whole = memory(max(ends[-1], 1))
-    progress, due_end, recorded_end, time_ns, mean, covariance, noted_ns, target, *others = (
+    progress, due_end, recorded_end, issued_ns, time_ns, mean, covariance, noted_ns, target, *others = (
         whole[begin:end].reshape(shape)
         for (begin, end), shape in zip(pairwise(ends), shapes, strict=True)
     )
@@ -66,7 +69,7 @@ def results(
     innovations = Innovations(
         recorded_end.view(np.int64), noted_ns.view(np.int64), target_id, difference, spread, numbers
     )
-    return Results(progress.view(np.int64), estimates, innovations)
+    return Results(progress.view(np.int64), issued_ns.view(np.int64), estimates, innovations)
 
 
 def begun(made: Results, due: Integers, recorded: Integers) -> Results:

@@ -14,10 +14,22 @@ from pipeline.altering.sources import alter
 from pipeline.diagnosing import portion
 from pipeline.diagnosing.battery import battery
 from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
-from pipeline.diagnosing.battery.car import FAULTS, drive, faulty, recorded, stamps_ns
+from pipeline.diagnosing.battery.car import (
+    FAULTS,
+    Truth,
+    arcs,
+    drive,
+    faulty,
+    late,
+    recorded,
+    stamps_ns,
+)
+from pipeline.diagnosing.causes import seek
 from pipeline.diagnosing.consistency import judged_by_itself
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.tuning.measured import until_last_measured
+from recorders.log.planes import Origin
+from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.orientation import heading
 from replay.engine.replaying.estimator import bind
 
@@ -31,30 +43,93 @@ def test_the_likelihood_with_a_compass_is_that_of_the_sheet() -> None:
     assert likelihood([base]) == pytest.approx([653.081316], abs=1e-3)
 
 
+# Of the number that is found, by the sheet: its standard deviation over runs. Without one it is special,
+# and comes out as it was planted.
+SPREADS = {
+    "fixes .3 s late": 0.0113,
+    "lever (2, .6) m": 0.133,
+    "fix variance x 4": 0.0726,
+    "fix variance / 16": 0.0726,
+    "sd written as variance": 0.0726,
+    "gyro bias .02": 0.00112,
+    "gyro bias .0004 t": 4.49e-5,
+    "odometry clock 6 % fast": 0.000175,
+    "gyro density / 5": 0.451,
+    "compass + 4.5 deg": 0.00165,
+}
+CELLS = [battery.Cell(fault, fault.startswith("compass"), True) for fault in FAULTS]
+
+
 @pytest.mark.parametrize(
-    ("fault", "has_compass", "has_prior"),
-    [
-        ("nothing", False, False),
-        ("fixes .3 s late", False, False),
-        ("turn rate's sign", False, True),
-        ("speed x 3.6", False, True),
-        ("lever (2, .6) m", False, False),
-        ("E, N exchanged", False, True),
-        ("degrees as radians", False, True),
-        ("gyro bias .0004 t", False, True),
-        ("odometry clock 6 % fast", False, True),
-        ("fixes 18 s late", False, True),
-        ("half of the odometry lost", False, True),
-        ("compass + 4.5 deg", True, True),
-        ("compass clockwise from north", True, True),
-    ],
+    "cell", [*CELLS, battery.Cell("nothing", False, False)], ids=lambda cell: cell.name
 )
-def test_the_fault_is_named_first(fault: str, has_compass: bool, has_prior: bool) -> None:
-    found = battery.tried(battery.Cell(fault, has_compass, has_prior), SEED)
+def test_the_fault_is_named_first(cell: battery.Cell) -> None:
+    found = battery.tried(cell, SEED)
     assert found["is_first"], found["first"]
-    right = battery.RIGHT[fault]
+    right = battery.RIGHT[cell.fault]
     if right and right[0].value is not None:
-        assert found["value"] == pytest.approx(right[0].value, rel=0.15)
+        assert abs(found["value"] - right[0].value) < 4.0 * SPREADS.get(cell.fault, 1e-6)
+
+
+@pytest.mark.parametrize("faults", battery.PAIRS[:1], ids=" + ".join)
+def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
+    """With one undone the other is still so large that a noise thousands of times larger fits."""
+    assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
+
+
+def test_a_delay_on_equal_laps_is_not_determined() -> None:
+    """On laps of 20 s fixes 7 s late, or all else early, may as well be 27 s, the start unknown."""
+    clean = drive(SEED)
+    count, steps = 600, slice(600)
+    since_s = clean.odometry_s[steps] + 0.05
+    turn = 0.1 * np.pi * (1.0 + 0.8 * np.sin(0.1 * np.pi * since_s))
+    before = np.concatenate([[0.0], np.cumsum(0.1 * turn)])
+    driven = arcs(before[:-1], np.full(count, 5.0), turn, np.full(count, 0.1))
+    pose = np.concatenate([np.zeros((1, 3)), np.cumsum(driven, axis=0)])
+    truth = Truth(0.1, np.full(count, 5.0), turn, pose)
+    fixes = slice(70, 110)
+    noise_m = clean.fix_m - clean.truth.at(clean.fix_s)[:, :2]
+    car = clean._replace(
+        truth=truth,
+        odometry_s=clean.odometry_s[steps],
+        speed_mps=(clean.speed_mps - clean.truth.speed_mps)[steps] + 5.0,
+        turn_radps=(clean.turn_radps - clean.truth.turn_radps)[steps] + turn,
+        fix_s=clean.fix_s[fixes],
+        fix_m=truth.at(clean.fix_s[fixes])[:, :2] + noise_m[fixes],
+    )
+    log = recorded(late(7.0)(car), has_compass=False)
+    cause = seek(log, "ekf", OPEN, 1).causes[0]
+    values = [cause.value, *(each.value for each in cause.others if each.hypothesis is cause.hypothesis)]
+    assert sorted(map(abs, values)) == pytest.approx([7.0, 27.0], abs=0.3)
+    assert "this log does not determine it: as likely, /car/" in cause.words
+
+
+def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
+    """The origin is stated 40 m too far west and 25 m too far north: fixes are east and south."""
+    car = drive(SEED)
+    log = recorded(car, has_compass=False, has_prior=True)
+    right = Origin(52.5, 13.4, 40.0)
+    latitude, longitude, _ = out_of_tangent_plane((car.fix_m[:, 0], car.fix_m[:, 1]), right)
+    wrong = out_of_tangent_plane((-40.0, 25.0), right)
+    fixes = fl.make_stream(
+        FIX,
+        fl.schemas.GEODETIC_FIX,
+        stamps_ns(car.fix_s),
+        metadata=Origin(float(wrong[0]), float(wrong[1]), 40.0).metadata,
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=np.full(len(latitude), 40.0),
+        covariance_m2=np.tile(np.diag([0.25, 0.25, 1.0]).ravel(), (len(latitude), 1)),
+    )
+    shifted = replace(log, streams={**log.streams, FIX: fixes})
+    [found] = fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0}).sentences
+    assert found.cause is not None
+    assert "the origin of the plane is another one" in found.words
+    for told, planted in zip(found.cause.numbers, (40.0, -25.0), strict=True):
+        assert told.low < planted < told.high
+        assert told.value == pytest.approx(planted, abs=3.0)
+    setting = dict([found.setting.split("=")])
+    assert fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0, **setting}).sentences == []
 
 
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:

@@ -64,6 +64,20 @@ def test_a_run_is_recorded_again_from_its_log_and_from_its_estimates(
 
 
 @pytest.mark.usefixtures("here")
+def test_another_run_of_a_recorded_one_has_its_parameters_and_its_seed(fuselog: Fuselog) -> None:
+    """What is stated for the new one comes first."""
+    one = ["landmarks", "--seed", 5, "--set", "duration_s=1", "--set", "landmarks=3"]
+    assert fuselog("record", *one, "--run", 1, "-o", "1.mcap").code == 0
+    for options in (["--run", 3], ["--run", 0], ["--run", 3, "--set", "landmarks=4"]):
+        assert fuselog("record", *one, *options, "-o", "anew.mcap").code == 0
+        assert fuselog("record", "--again", "1.mcap", *options, "-o", "again.mcap").code == 0
+        assert Path("again.mcap").read_bytes() == Path("anew.mcap").read_bytes()
+        run = open_log("again.mcap").run
+        assert run is not None
+        assert (run.seed, run.run) == (5, options[1])
+
+
+@pytest.mark.usefixtures("here")
 def test_a_shipped_scenario_sets_its_parameters(fuselog: Fuselog) -> None:
     """Late messages and outages come with `landmarks-adverse`, and --set still wins."""
     said = fuselog("record", "landmarks-adverse", "--set", "duration_s=5", "--set", "robots=1")
@@ -539,7 +553,7 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     assert said.startswith("Estimates by ekf of log.mcap; what can be done with them: fuselog evaluate ")
     said = fuselog("info", str(result)).out
     assert "a result of landmarks (" in said
-    assert "dead-reckoning, ekf, ukf over 2 runs of landmarks" in said
+    assert "dead-reckoning, ekf and ukf over 2 simulated runs of landmarks of 2 s" in said
     assert fuselog("info", str(result), "--json").json["experiment"] == "landmarks"
     timeline = result / "timeline.rrd"
     assert "a timeline of fuselog-landmarks" in fuselog("info", str(timeline)).out

@@ -20,7 +20,7 @@ from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messag
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.search import Gains, Peak, interval, peak
+from pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
 
@@ -82,7 +82,9 @@ def test_a_peak_far_from_where_the_search_begins_has_its_interval() -> None:
 
     found = found_by(parabola(-1.0, 1.0), gain, 5.0)
     assert found[:2] == pytest.approx((30.0, 45000.0), rel=1e-6)
-    assert interval(gain, found, 1.0) == pytest.approx((29.804, 30.196), abs=2e-3)
+    searches = [end(found, -1.0), end(found, 1.0)]
+    ends = side_by_side(searches, lambda asked: gain([value for _, value in asked]))
+    assert ends == pytest.approx((29.804, 30.196), abs=2e-3)
     assert found_by(parabola(-1.0, 1.0, limit=10.0), gain, 5.0).value == pytest.approx(10.0, abs=0.02)
     assert found_by(parabola(-1.0, 1.0), little, 5.0)[:2] == (0.0, 0.0)
 

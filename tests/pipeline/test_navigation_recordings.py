@@ -6,10 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import fuselog as fl
 from pipeline.altering.sources import alter
+from pipeline.diagnosing import diagnosis
+from pipeline.diagnosing.causes import Sought
 from recorders.plausibility.checks import BLOCK, findings_in
 
 CORRECTIONS = 2
@@ -66,3 +69,28 @@ def test_what_is_planted_into_a_walk_is_found_without_a_filter(navigation: Path)
     for planted, wanted in PLANTED.values():
         blocks = alter(walk, planted).blocks(topics, "publish_time", BLOCK)
         assert [f"{each.key}={each.setting}" for each in findings_in(blocks)] == wanted
+
+
+def test_a_walk_that_no_filter_follows_is_diagnosed(
+    navigation: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fault that the log says itself stands first; what else there is, is sought without it."""
+    sought = list[fl.MemorySource]()
+
+    def seek(source: fl.MemorySource, *_: Any) -> Sought:
+        sought.append(source)
+        return Sought([], [], np.nan)
+
+    monkeypatch.setattr(diagnosis, "seek", seek)
+    walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
+    for name in ("degrees", "18 s, fixes"):
+        planted, [setting] = PLANTED[name]
+        found = fl.diagnose(walk, "ekf", set=planted)
+        assert found.sentences[0].setting == setting
+        assert found.replay.failures == []
+        assert found.notes[0].startswith("all else is said of the log with --set /")
+    for mended in sought:
+        assert mended.streams["/fix"].publish_time_ns[0] == walk.streams["/fix"].publish_time_ns[0]
+        rates, right = (each.streams["/inertial"]["turn_rate_radps"] for each in (mended, walk))
+        assert np.allclose(rates[:1000], right[:1000], rtol=1e-3)
+    assert len(sought) == 2

@@ -53,6 +53,17 @@ RIGHT: dict[str, Sequence[Right]] = {
 }
 
 
+# Two at once, each of which hides how large the other is.
+PAIRS = (
+    ("speed x 3.6", "fixes 18 s late"),
+    ("E, N exchanged", "speed / 3.6"),
+    ("turn rate's sign", "fix variance / 16"),
+    ("degrees as radians", "lever (2, .6) m"),
+    ("speed x .3048", "compass clockwise from north"),
+    ("compass + 4.5 deg", "fixes .3 s late"),
+)
+
+
 class Cell(NamedTuple):
     """A fault, and what the log has beside wheels and fixes."""
 
@@ -104,6 +115,20 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
     }
 
 
+def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False) -> dict[str, Any]:
+    """Plant faults at once into a log with a compass, and see whether three causes name all."""
+    log = recorded(faulty(seed, *faults), has_prior=has_prior)
+    found = seek(log, "ekf", {"kind": "ekf", "gate_probability": 1.0}, 3)
+    named = {one[:3] for cause in found.causes for one in _named(cause)}
+    return {
+        "faults": " + ".join(faults),
+        "has_prior": has_prior,
+        "seed": seed,
+        "are_named": all(any(one[:3] in named for one in RIGHT[fault]) for fault in faults),
+        "first": " ".join(filter(None, next(_named(found.causes[0]))[:3])) if found.causes else "",
+    }
+
+
 def _named(cause: Cause) -> Iterator[Right]:
     """What a cause names, and what the log does not tell from it."""
     for each in (cause, *cause.others):
@@ -111,12 +136,21 @@ def _named(cause: Cause) -> Iterator[Right]:
             yield Right(each.hypothesis.kind, each.hypothesis.topic, told.part, told.value)
 
 
-def planted(seeds: Sequence[int], progress: Progress) -> pd.DataFrame:
-    """Try all cells, with and without a prior, with these seeds: a row for each run."""
+def results(
+    seeds: Sequence[int], progress: Progress
+) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
+    """Try all cells, with and without a prior, and all pairs, with these seeds: tables and metrics."""
     rows = []
     for cell in [*cells(), *cells(has_prior=True)]:
         rows += [tried(cell, seed) for seed in progress(seeds, cell.name, len(seeds))]
-    return pd.DataFrame(rows)
+    together = []
+    for pair in PAIRS:
+        for seed in progress(seeds, " + ".join(pair), len(seeds)):
+            together.append(tried_together(pair, seed, has_prior=True))
+    planted, pairs = pd.DataFrame(rows), pd.DataFrame(together)
+    tables = {"battery": summary(planted), "battery_runs": planted, "battery_pairs": pairs}
+    share = float(pairs["are_named"].mean())
+    return tables, {**metrics_of(planted), "diagnosis.battery_pairs_share": share}
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:

@@ -5,6 +5,7 @@ put into the columns themselves, not by what a diagnosis undoes them with.
 """
 
 from collections.abc import Callable
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -154,9 +155,9 @@ FAULTS: dict[str, Callable[[Car], Car]] = {
 }
 
 
-def faulty(seed: int, name: str) -> Car:
-    """The car with one of the `FAULTS`."""
-    return FAULTS[name](drive(seed))
+def faulty(seed: int, *names: str) -> Car:
+    """The car with one of the `FAULTS`, or with several, put one after the other."""
+    return reduce(lambda car, name: FAULTS[name](car), names, drive(seed))
 
 
 def stamps_ns(times_s: Floats) -> NDArray[np.int64]:

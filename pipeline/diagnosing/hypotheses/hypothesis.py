@@ -1,6 +1,6 @@
 """One thing that may be wrong, and how it is undone."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number
-from pipeline.diagnosing.likelihood import Trial
+from pipeline.diagnosing.likelihood import Likelihood, Trial
 from recorders.parameters import Parameters
 
 Kind = Literal[
@@ -82,6 +82,7 @@ class Hypothesis:
         return " ".join(filter(None, (self.kind, self.topic, self.part)))
 
 
+GainsOf = Callable[[Sequence[tuple[Hypothesis, Number]]], Sequence[float]]
 IS_SO: Mapping[float, str] = {1.0: ""}  # the numbers of what is so, or is not
 
 
@@ -122,3 +123,24 @@ def times(at: float, low: float, high: float) -> str:
 def size_of(at: float) -> str:
     """Whether it is too small or too large by so much."""
     return "small" if at > 0.0 else "large"
+
+
+def in_sense(
+    at: float, low: float, high: float, words: tuple[str, str] = ("too large", "too small")
+) -> tuple[str, float, float, float]:
+    """The word for a number's sign, the number's size, and its interval in that sense.
+
+    >>> in_sense(-0.3, -0.4, -0.2)
+    ('too small', 0.3, 0.2, 0.4)
+    """
+    if at < 0.0:
+        return words[1], -at, min(-low, -high), max(-low, -high)
+    return words[0], at, low, high
+
+
+def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
+    """What undoing faults of these numbers, each by itself, gains over a trial."""
+    [before] = likelihood([now])
+    return lambda asked: [
+        found - before for found in likelihood([each.without(now, at) for each, at in asked])
+    ]

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pipeline.diagnosing.hypotheses.components import of_components
 from pipeline.diagnosing.hypotheses.exchanges import of_numbers
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from pipeline.diagnosing.hypotheses.origins import of_origin
 from pipeline.diagnosing.hypotheses.parameters import (
     of_augmentable,
     of_covariances,
@@ -46,6 +47,7 @@ def hypotheses(
         if len(stream) < FEWEST:
             continue
         found += of_covariances(stream)
+        found += of_origin(stream)
         found += of_components(stream, reading, parameters, first_ns)
         if len(streamed) > 1:
             controls = reading.controls if reading else ()

@@ -3,18 +3,22 @@
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic
 from recorders.log import Stream
 from replay.engine.replaying.estimator import Reading
 
+Floats = NDArray[np.float64]
 DELAYS_S = (-0.02, 0.02, -0.1, 0.1, -0.4, 0.4, -2.0, 2.0, -8.0, 8.0)
 SPECIAL_S = {18.0: "the leap seconds between GPS and UTC", -18.0: "the leap seconds from UTC to GPS"}
 RATES = (-1e-4, 1e-4, -1e-3, 1e-3, -0.01, 0.01, -0.03, 0.03, -0.1, 0.1)
 LONGEST_DELAY_S, LARGEST_RATE = 30.0, 0.2
 LAGS_S = np.arange(-30.0, 30.05, 0.1)
+FEWEST = 20  # speeds that tell a lag
+MOST_CELLS = 1_000_000  # of lags and speeds that are held at once
 
 
 def of_stamps(
@@ -34,18 +38,20 @@ def of_stamps(
 
     def late(at: float, low: float, high: float) -> str:
         about = f", {SPECIAL_S[at]}" if at in SPECIAL_S else ""
+        sense, at, low, high = in_sense(at, low, high, ("late", "early"))
         size, least, most = (f"{number(1e3 * each)} ms" for each in (at, low, high))
-        if abs(at) >= 1.0:
+        if at >= 1.0:
             size, least, most = (f"{number(each)} s" for each in (at, low, high))
-        if at < 0.0:
-            return f"{topic}: its stamps are {size[1:]} early ({least} to {most}){about}"
+        if sense == "early":
+            return f"{topic}: its stamps are {size} early ({least} to {most}){about}"
         return f"{topic}: comes {size} late ({least} to {most}) by its stamps{about}"
 
     def mend_late(at: float) -> Advice:
         return Advice(own or f"{topic}.delay_s", precise(at))
 
     def gaining(at: float, low: float, high: float) -> str:
-        return f"{topic}: its clock gains {at:.3g} s a second ({low:.3g} to {high:.3g})"
+        does, at, low, high = in_sense(at, low, high, ("gains", "loses"))
+        return f"{topic}: its clock {does} {at:.3g} s a second ({low:.3g} to {high:.3g})"
 
     def mend_gaining(at: float) -> Advice:
         return Advice(f"{topic}.clock_gain", precise(at))
@@ -81,26 +87,35 @@ def lag_of(stream: Stream, controls: list[Stream]) -> tuple[float, ...]:
 
     By the best correlation over a grid; a tenth of a second is near enough to begin a search at.
     """
-    if "position_m" not in stream.columns or len(stream) < 20:
+    if "position_m" not in stream.columns or len(stream) < FEWEST:
         return ()
     times_s = 1e-9 * stream.publish_time_ns
-    steps = np.diff(times_s)
     with np.errstate(divide="ignore", invalid="ignore"):
-        speed = np.linalg.norm(np.diff(stream["position_m"], axis=0), axis=1) / steps
-    middle = 0.5 * (times_s[1:] + times_s[:-1])
+        speed = np.linalg.norm(np.diff(stream["position_m"], axis=0), axis=1) / np.diff(times_s)
     known = np.isfinite(speed)
+    middle_s, speed = 0.5 * (times_s[1:] + times_s[:-1])[known], speed[known]
     best = 0.0, 0.0
     for control in controls:
         for name, column in control.columns.items():
             if column.ndim != 1 or column.dtype.kind != "f" or name == "sensor_time_ns":
                 continue
             driven_s = 1e-9 * control.publish_time_ns
-            for lag_s in LAGS_S:
-                at = middle - lag_s
-                both = known & (at >= driven_s[0]) & (at <= driven_s[-1])
-                if both.sum() < 20:
-                    continue
-                driven = np.abs(np.interp(at[both], driven_s, column))
-                if driven.std() > 0.0 and speed[both].std() > 0.0:
-                    best = max(best, (float(np.corrcoef(driven, speed[both])[0, 1]), float(lag_s)))
-    return (round(best[1], 1),) if best[0] > 0.5 and best[1] else ()
+            for lags_s in np.array_split(LAGS_S, 1 + len(LAGS_S) * len(speed) // MOST_CELLS):
+                at_s = middle_s - lags_s[:, None]
+                is_in = (at_s >= driven_s[0]) & (at_s <= driven_s[-1])
+                alike = _correlations(np.abs(np.interp(at_s, driven_s, column)), speed, is_in)
+                best = max([best, *zip(alike.tolist(), lags_s.tolist(), strict=True)])
+    lag_s = round(best[1], 1)
+    return (lag_s,) if best[0] > 0.5 and lag_s else ()
+
+
+def _correlations(rows: Floats, column: Floats, is_in: NDArray[np.bool_]) -> Floats:
+    """The correlation of each row (k, n) with a column (n,) where both count; -1 where unknown."""
+    count = np.maximum(is_in.sum(axis=1, keepdims=True), 1)
+    rows, columns = (
+        np.where(is_in, each - np.where(is_in, each, 0.0).sum(axis=1, keepdims=True) / count, 0.0)
+        for each in (rows, column)
+    )
+    size = np.sqrt((rows**2).sum(axis=1) * (columns**2).sum(axis=1))
+    is_known = (count[:, 0] >= FEWEST) & (size > 0.0)  # false where one is NaN
+    return np.where(is_known, (rows * columns).sum(axis=1) / np.where(is_known, size, 1.0), -1.0)

@@ -41,15 +41,17 @@ class Initialization:
         topics: those whose first messages it is handed.
         find: (first messages, the static topics, clock) -> what there is to start
             from; by the clock by which the replay stamps estimates.
-        find_broad: (first messages, the static topics, clock, stamp) -> the equally likely starts at a
-            stamp of a single run, so broad that no parameter counts: likelihoods with other parameters,
-            or of the log without a fault, are compared over these. None for what `find` finds.
+        find_broad: (first messages, the static topics, clock, a stamp for each run) -> the equally
+            likely starts of all runs there, so broad that no parameter counts: likelihoods with other
+            parameters, or of the log without a fault, are compared over these. None for what `find`
+            finds.
     """
 
     topics: tuple[str, ...]
     find: Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock], Initialized]
     find_broad: (
-        Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock, int], list[Initialized]] | None
+        Callable[[Mapping[str, Ragged], Mapping[str, Ragged], Clock, Sequence[int]], list[Initialized]]
+        | None
     ) = None
 
 
@@ -151,7 +153,7 @@ Bound = Recursive | Batch
 @renamed(needs="requirements")
 @dataclass(frozen=True)
 class Estimator(Generic[ParametersType]):
-    """A registered estimator: what it is, its parameters, and how it binds to the topics of a log.
+    """Describes an estimator: what it is, its parameters, and how it binds to the topics of a log.
 
     `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
     for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
@@ -170,16 +172,16 @@ class Estimator(Generic[ParametersType]):
         return self.summary
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> "Estimator[Any]":  # noqa: ARG002
-        """The estimator that settings make of it: another where they name a foreign filter."""
+        """Return the estimator that settings make of it: another where they name a foreign filter."""
         return self
 
     # one of any model has these by what the name says: `_OfAnyModel`
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:  # noqa: ARG002
-        """The parameters that count under a name with this variant, such as `smoother:iterated`."""
+        """Return the parameters that count under a name with a variant, such as `smoother:iterated`."""
         return self.parameters
 
     def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:  # noqa: ARG002
-        """The parameters for each model that it may estimate; none where it is of no model."""
+        """Return the parameters for each model that it may estimate; none where it is of no model."""
         return {}
 
 
@@ -230,11 +232,18 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
 def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], dict[str, Any]]:
     """Return the estimator of a label and the values of its parameters, which are not checked yet.
 
-    Raises BadInput where the name is unknown, or a foreign filter may not be run or does not answer.
+    Raises BadInput where the name is unknown or sets what a setting sets otherwise, or a foreign filter
+    may not be run or does not answer.
     """
     values = dict(settings)
     kind = values.pop("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
+    for name, value in variant.items():
+        if str(values.get(name, value)) != value:
+            raise BadInput(
+                f"estimator {label}: {kind} says {name} = {value}, and a setting {values[name]}; "
+                "give one of them"
+            )
     return estimator.specified(label, values), {**values, **variant}
 
 

@@ -10,7 +10,8 @@ arrive and does one of three things about it:
 
 What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
 was waited for on `waited`, as a `schemas.WAITED`; what was gone back for by the estimator itself
-(`Recursive.out_of_sequence`; for filters of models, `replay.inference.run.out_of_sequence`).
+(`Recursive.out_of_sequence`; for filters of models, `replay.inference.run.out_of_sequence`,
+for those of libraries `replay.foreign.native.out_of_sequence`).
 """
 
 from collections.abc import Mapping
@@ -93,8 +94,8 @@ def taking_late(bound: Bound, late: Late) -> Recursive:
     if late.policy == "rewind":
         if bound.out_of_sequence is None:
             raise BadInput(
-                f"estimator {bound.name}: only an estimator made of a model and a method can go "
-                "back to a late message; give --late drop or --late wait:SECONDS"
+                f"estimator {bound.name}: cannot go back to a late message, as those made of a model "
+                "and a method, and filters of libraries, can; give --late drop or --late wait:SECONDS"
             )
         bound = bound.out_of_sequence(late.window_ns)
     return replace(

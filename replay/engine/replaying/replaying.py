@@ -227,8 +227,9 @@ def _initialized(
     if not isinstance(bound, Recursive) or bound.initialization is None:
         return Initialized({}, [])
     topics = bound.initialization.topics
-    nothing = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
-    first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), nothing)
+    first = next(ensemble.blocks(topics, order, FIRST_MESSAGES), None)
+    if first is None:
+        first = {topic: gather([source.empty(topic) for source in ensemble]) for topic in topics}
     with code_of(bound.name):
         return bound.initialization.find(first, static, stamps)
 

@@ -190,6 +190,16 @@ def join(parts: Sequence[Ragged]) -> Ragged:
     return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
 
 
+def side_by_side(parts: Sequence[Ragged]) -> Ragged:
+    """Lay the first runs of all parts end to end, then all second ones, and so on."""
+    counts = np.stack([np.diff(part.offsets) for part in parts], axis=1)
+    places = np.arange(counts.size).reshape(counts.shape)
+    run = np.concatenate([np.repeat(*of_part) for of_part in zip(places.T, counts.T, strict=True)])
+    stream = join_streams([part.stream for part in parts if len(part)] or [parts[0].stream])
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    return Ragged(stream.take(np.argsort(run, kind="stable")), offsets)
+
+
 def merge_events(streams: Mapping[str, Ragged], order: Clock) -> Events:
     """Merge messages of the topics in time order, run by run; equal stamps keep the file's order.
 

@@ -195,7 +195,7 @@ class MemorySource(_Readable):
         return self.epoch_ns
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """The first and the last stamp in ns by one of the two clocks; zeros where there are none."""
+        """Return the first and the last stamp in ns by one of the clocks; zeros where there are none."""
         times = [stream.times(clock) for stream in self.streams.values() if len(stream)]
         first_ns = min((int(each.min()) for each in times), default=0)
         return first_ns, max((int(each.max()) for each in times), default=0)

@@ -10,20 +10,25 @@ from replay.engine.compiling.kernels.numbers import REAL, WHOLE, Emitter, Number
 from replay.engine.compiling.kernels.program import Program
 from replay.engine.compiling.kernels.values import Array
 
-_LLVM = {"i32": "i32", "i64": "i64", "pointer": "ptr"}
-_C: dict[str, Any] = {"i32": ctypes.c_int32, "i64": ctypes.c_int64, "pointer": ctypes.c_void_p}
+_LLVM = {"i32": "i32", "i64": "i64", "pointer": "ptr", "void": "void"}
+_C: dict[str, Any] = {
+    "i32": ctypes.c_int32,
+    "i64": ctypes.c_int64,
+    "pointer": ctypes.c_void_p,
+    "void": None,
+}
 
 
 class Call:
     """Calls a C function at an address: `call(address, *arguments)`, in a kernel as in Python.
 
-    A pointer is an array, or an address; the function returns an int32_t.
+    A pointer is an array, or an address; what returns nothing gives 0.
     """
 
-    def __init__(self, name: str, *kinds: str) -> None:
+    def __init__(self, name: str, *kinds: str, returns: str = "i32") -> None:
         self.__name__ = name
-        self._kinds = kinds
-        self._prototype = ctypes.CFUNCTYPE(ctypes.c_int32, *(_C[kind] for kind in kinds))
+        self._kinds, self._returns = kinds, returns
+        self._prototype = ctypes.CFUNCTYPE(_C[returns], *(_C[kind] for kind in kinds))
 
     def __call__(self, address: int, *arguments: Any) -> int:
         """Call it from Python."""
@@ -33,11 +38,11 @@ class Call:
             else int(each) or (None if kind == "pointer" else 0)
             for each, kind in zip(arguments, self._kinds, strict=True)
         )
-        return int(self._prototype(int(address))(*given))
+        return int(self._prototype(int(address))(*given) or 0)
 
     def kernel_identity(self) -> str:
         """Return what is part of a kernel's key."""
-        return f"call of {self.__name__}: {' '.join(self._kinds)}"
+        return f"call of {self.__name__}: {' '.join(self._kinds)} -> {self._returns}"
 
     def lowered(self, program: Program, emitter: Emitter, arguments: Sequence[Any]) -> Number:  # noqa: ARG002
         """Write a call; see `replay.engine.compiling.kernels.expressions`."""
@@ -47,8 +52,12 @@ class Call:
             for each, kind in zip(others, self._kinds, strict=True)
         )
         function = _passed(emitter, address, "pointer")
-        status = emitter.number(WHOLE, f"call i32 {function}({given})")
-        return emitter.number(WHOLE, f"sext i32 {status.code} to i64")
+        call = f"call {_LLVM[self._returns]} {function}({given})"
+        if self._returns == "void":
+            emitter.add(call)
+            return emitter.as_kind(0, WHOLE)
+        wider = "ptrtoint ptr" if self._returns == "pointer" else "sext i32"
+        return emitter.number(WHOLE, f"{wider} {emitter.number(WHOLE, call).code} to i64")
 
 
 def _passed(emitter: Emitter, value: Any, kind: str) -> str:
@@ -71,3 +80,5 @@ TAKE = Call("take", "pointer", "i32", "i64", "pointer")
 PREDICT = Call("predict", "pointer", "i64")
 STATE = Call("state", "pointer", "pointer", "pointer")
 INNOVATION = Call("innovation", "pointer", "pointer", "pointer")
+COPY = Call("copy", "pointer", returns="pointer")
+DESTROY = Call("destroy", "pointer", returns="void")

@@ -8,6 +8,7 @@ import numpy as np
 
 from replay.engine.arrays import Floats, Function, Integers, varying
 from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.blocks import copied, filled_rows
 from replay.engine.streams.results import ALL_WELL
 from replay.foreign.description import Description
 from replay.foreign.native.calls import INNOVATION, PREDICT, START, STATE, TAKE
@@ -24,6 +25,7 @@ from replay.inference.run.recursion import Estimates, FilterEvents, Innovations,
 
 # What fails whatever the filter is; a status s of the filter's own counts on from there.
 NOT_CREATED, NOT_COPIED, INNOVATION_UNSOUND, OWN = 5, 6, 7, 7
+NOBODY = -1  # calls for no estimate
 FAILURES = {
     0: "a variance of the filter's covariance is negative",
     1: "the filter's estimate or covariance is not finite",
@@ -64,25 +66,40 @@ class Static(NamedTuple):
     data: Floats
 
 
+class Given(NamedTuple):
+    """Holds what the filters of all runs are given, and by which functions."""
+
+    addresses: Addresses
+    static: Static
+    events: FilterEvents
+
+
 def follow(
+    run: int, given: Given, carried: Filters, made: Results, work: tuple[Innovation, Innovation]
+) -> None:
+    """Hand one run's messages to its filter in order, and note what it says, until the run fails."""
+    events = given.events
+    for event in range(events.offsets[run], events.offsets[run + 1]):
+        caller = event if events.wants_estimate[event] else NOBODY
+        advance(run, event, caller, given, carried, made, work)
+
+
+def advance(
     run: int,
-    addresses: Addresses,
-    static: Static,
-    events: FilterEvents,
+    event: int,
+    caller: int,
+    given: Given,
     carried: Filters,
-    estimates: Estimates,
-    innovations: Innovations,
-    progress: Integers,
+    made: Results,
     work: tuple[Innovation, Innovation],
 ) -> None:
-    """Hand one run's messages to its filter, and note what it says, until the run fails.
+    """Have a filter that has not failed take a message, and note its innovation.
 
-    `progress` (runs,) is the message at work; another process sees it.
+    `caller` is the message that calls for the estimate after it, NOBODY if none does.
     """
-    for event in range(events.offsets[run], events.offsets[run + 1]):
-        if carried.failure[run] != ALL_WELL:
-            break
-        progress[run] = event
+    if carried.failure[run] == ALL_WELL:
+        addresses, static, events = given
+        made.progress[run] = event
         time_ns = events.time_ns[event]
         status = WELL
         if carried.begun[run] == 0:
@@ -90,9 +107,9 @@ def follow(
             status = begin(run, addresses, static, time_ns, carried)
         if status == WELL and time_ns >= carried.time_ns[run]:
             carried.time_ns[run] = time_ns
-            status = take(run, event, addresses, events, carried, innovations, work)
-            if status == WELL and events.wants_estimate[event]:
-                status = tell(run, event, addresses, events, carried, estimates)
+            status = take(run, event, addresses, events, carried, made.innovations, work)
+            if status == WELL and caller != NOBODY:
+                status = tell(run, event, caller, given, carried, made)
         if status != WELL:
             carried.failure[run] = OWN + status if status > 0 else -status - 10
             carried.time_ns[run] = time_ns
@@ -160,23 +177,20 @@ def take(
     return WELL
 
 
-def tell(
-    run: int,
-    event: int,
-    addresses: Addresses,
-    events: FilterEvents,
-    carried: Filters,
-    estimates: Estimates,
-) -> int:
+def tell(run: int, event: int, caller: int, given: Given, carried: Filters, made: Results) -> int:
     """Note the filter's estimate; returns WELL or what failed."""
-    row = estimates.end[run]
-    status = STATE(addresses.state, carried.handle[run], estimates.mean[row], estimates.covariance[row])
+    estimates, events = made.estimates, given.events
+    row, state = estimates.end[run], given.addresses.state
+    status = STATE(state, carried.handle[run], estimates.mean[row], estimates.covariance[row])
     if status > 0 or status == NOTHING:
         return max(status, WELL)
     fault = fault_of(estimates.mean[row], estimates.covariance[row])
     if fault != ALL_WELL:
         return -10 - fault
     estimates.time_ns[row] = events.time_ns[event]
+    made.issued_ns[row] = events.time_ns[event]
+    if events.arrival.shape[1] > 0:
+        made.issued_ns[row] = events.arrival[caller, 0]
     estimates.end[run] = row + 1
     return WELL
 
@@ -191,13 +205,14 @@ def reason_of_code(code: int, description: Description) -> str:
     if code in FAILURES:
         return FAILURES[code]
     number = code - OWN
-    told = description.failures
-    return told[number - 1] if number <= len(told) else f"the filter returned {number}"
+    sentences = description.failures
+    return sentences[number - 1] if number <= len(sentences) else f"the filter returned {number}"
 
 
 class Followed(NamedTuple):
-    """Holds what filters said: estimates and innovations, and the offsets of their runs."""
+    """Holds what filters said: estimates, when they were issued, innovations, and the runs' offsets."""
 
+    issued_ns: Integers
     estimates: Estimates
     estimate_offsets: Integers
     innovations: Innovations
@@ -222,27 +237,37 @@ def follow_all(
     made: Results,
 ) -> None:
     """Hand the messages of all runs to their filters, which are changed, and fill results."""
-    m = len(description.innovation)
-    _loop()(
-        len(carried.handle),
-        library.addresses if m else library.addresses._replace(innovation=0),
-        static,
-        events,
-        carried,
-        made.estimates,
-        made.innovations,
-        made.progress,
-        scratch=partial(_work, m),
-    )
+    given = Given(addresses_of(library, description), static, events)
+    _loop()(len(carried.handle), given, carried, made, scratch=work_of(description))
+
+
+def addresses_of(library: Library, description: Description) -> Addresses:
+    """Return what is called of a library; no innovations where its description has none."""
+    addresses = library.addresses
+    return addresses if description.innovation else addresses._replace(innovation=0)
 
 
 def followed(made: Results, due: Integers, recorded: Integers) -> Followed:
     """Cut results down to what was filled in."""
-    return Followed(*filled(made.estimates, due), *filled(made.innovations, recorded))
+    issued_ns = made.issued_ns[filled_rows(due, made.estimates.end)[0]]
+    return Followed(issued_ns, *filled(made.estimates, due), *filled(made.innovations, recorded))
+
+
+def copies_of(library: Library, filters: Filters) -> Filters:
+    """Copy filters; one that cannot be copied has failed."""
+    handles = np.array([library.copy(handle) for handle in filters.handle.tolist()], np.int64)
+    found = copied(filters)._replace(handle=handles)
+    found.failure[(handles == 0) & (found.failure == ALL_WELL)] = NOT_COPIED
+    return found
+
+
+def work_of(description: Description) -> Function:
+    """Return what makes the kernels' working memory."""
+    return partial(_work, max(len(description.innovation), 1))
 
 
 def _work(components: int) -> tuple[Innovation, Innovation]:
-    given, kept = (no_innovation(1, max(components, 1)) for _ in range(2))
+    given, kept = (no_innovation(1, components) for _ in range(2))
     for each in given:
         each[:] = np.nan
     return given, kept

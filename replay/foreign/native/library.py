@@ -23,6 +23,8 @@ class Addresses(NamedTuple):
     take: int
     predict: int
     state: int
+    copy: int
+    destroy: int
     innovation: int
 
 
@@ -54,7 +56,7 @@ class Library:
                 f"{path}: was compiled with version {version} of fuselog_filter.h; this fuselog has "
                 f"version {VERSION}, so compile it again with {HEADER.name} of this one"
             )
-        names = (*Addresses._fields[:-1], "describe", "create", "copy", "destroy")
+        names = (*Addresses._fields[:-1], "describe", "create")
         functions = {name: self._function(name, None) for name in names}
         optional = getattr(self._library, "fuselog_filter_innovation", None)
         required = {name: _address(functions[name]) for name in Addresses._fields[:-1]}

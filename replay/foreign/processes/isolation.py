@@ -23,9 +23,10 @@ from replay.engine.streams.blocks import copied
 from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
 from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
-from replay.foreign.processes.tasks import LOADING, RunGiven, mapped
+from replay.foreign.native.library import Library
+from replay.foreign.processes.tasks import LOADING, RunGiven, follow_given, mapped, sizes_of
 from replay.foreign.processes.worker import IDLE
-from replay.foreign.results import begun
+from replay.foreign.results import begun, results
 
 Given = TypeVar("Given")
 Found = TypeVar("Found")
@@ -163,10 +164,10 @@ class Worker:
                 continue
             if not answer:
                 raise Ended(how_ended(self._process.wait()))
-            told = json.loads(answer)
-            if "refused" in told:
-                raise BadInput(told["refused"])
-            return told
+            reply = json.loads(answer)
+            if "refused" in reply:
+                raise BadInput(reply["refused"])
+            return reply
 
 
 def state_of(library: str) -> list[int]:
@@ -201,20 +202,27 @@ def follow_apart(
             "library": library,
             "state": state_of(library),
             "folder": str(folder),
-            "parameters": list(given.parameters),
-            "seed": given.seed,
         }
         failure = None
         try:
-            told = worker.ask(task, limits, lambda: int(made.progress[0]))["failure"]
-            if told is not None:
-                failure = Failure(told[1], reason_of_code(told[0], description))
+            failed = worker.ask(task, limits, lambda: int(made.progress[0]))["failure"]
+            if failed is not None:
+                failure = Failure(failed[1], reason_of_code(failed[0], description))
         except Ended as ended:
             worker.end()
             if worker.code == IDLE and int(made.progress[0]) == LOADING:
                 return None
             failure = failure_at(int(made.progress[0]), given, description, str(ended))
         return Ran(copied(followed(made, due, recorded)), failure)
+
+
+def follow_here(library: Library, given: RunGiven, description: Description) -> Ran:
+    """Take one run through its filter in this process."""
+    due, recorded = offsets_of(description, given.events)
+    made = begun(results(due, recorded, sizes_of(description)), due, recorded)
+    failed = follow_given(library, given, description, made)
+    failure = failed and Failure(failed[1], reason_of_code(failed[0], description))
+    return Ran(followed(made, due, recorded), failure)
 
 
 def failure_at(event: int, given: RunGiven, description: Description, why: str) -> Failure:

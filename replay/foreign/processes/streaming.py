@@ -76,8 +76,8 @@ class Stream(Program):
                 while len(buffer) >= 4:
                     size = _HEAD.unpack_from(buffer)[0]
                     if not 0 < size <= MOST_BYTES:
-                        said = printable(bytes(buffer[:60]).splitlines()[0].decode(errors="replace"))
-                        fault = f"wrote '{said}' to standard output, which is no frame,"
+                        text = printable(bytes(buffer[:60]).splitlines()[0].decode(errors="replace"))
+                        fault = f"wrote '{text}' to standard output, which is no frame,"
                         self._frames.put(_Frame(b"", fault))
                         return
                     if len(buffer) < 4 + size:
@@ -231,6 +231,7 @@ def _note(
         estimates.mean[row] = state[: estimates.mean.shape[1]]
         estimates.covariance[row].ravel()[:] = state[estimates.mean.shape[1] :]
         estimates.time_ns[row] = time_ns
+        made.issued_ns[row] = events.arrival[event, 0] if events.arrival.shape[1] else time_ns
         estimates.end[0] = row + 1
     if innovation is not None and events.source[event] >= 0:
         row, innovations = made.innovations.end[0], made.innovations

@@ -69,7 +69,7 @@ def _follow(task: dict[str, Any]) -> dict[str, Any]:
         follow_task,
     )  # NumPy and the compiler, which describing needs not
 
-    return follow_task(_library(task), Path(task["folder"]), task["parameters"], task["seed"])
+    return follow_task(_library(task), Path(task["folder"]))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ much wider than that message that the message itself, used like any other, is wh
 a plane that no channel states is the first geodetic fix. All of it is told, on the topic `started`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -25,7 +25,7 @@ from replay.inference.model.model import Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.settings import complaint_of, reading_settings
 from replay.inference.model.stage import Stage
-from replay.inference.run.broad_start import broad_priors
+from replay.inference.run.broad_start import Reference, broad_priors
 from replay.inference.run.events import Context, data_columns, filter_events, sensor_table
 from replay.inference.run.first_messages import (
     Begun,
@@ -137,25 +137,30 @@ class Initializer:
         return Initialized(found, [*told, *started(self.name, facts)])
 
     def find_broad(
-        self, first: Mapping[str, Ragged], _static: Mapping[str, Ragged], clock: Clock, time_ns: int
+        self,
+        first: Mapping[str, Ragged],
+        _static: Mapping[str, Ragged],
+        clock: Clock,
+        times_ns: Sequence[int],
     ) -> list[Initialized]:
-        """Find one run's equally likely starts at a stamp; see `broad_priors`."""
-        origins = None if self.found.origin is None else self.found.origin[None]
+        """Find the equally likely starts of runs, each at its stamp; see `broad_priors`."""
+        runs = run_count(first)
+        origins = None if self.found.origin is None else np.tile(self.found.origin, (runs, 1))
         begun: dict[str, Ragged] = {}
         for topic in self.found.geodetic if origins is None else ():
-            begun[topic.name] = gather([first[topic.name].of_run(0).take(slice(0, 1))])
+            fixes = [first[topic.name].of_run(run).take(slice(0, 1)) for run in range(runs)]
+            begun[topic.name] = gather(fixes)
             origins = origins_of(begun[topic.name])
-        references = []
+        references: list[list[Reference]] = [[] for _ in range(runs)]
         for number, sensor, topic in self._measuring:
             ragged = first[topic.name]
             table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
-            _when, [has_message], [row] = first_of_runs(ragged, clock, table.source >= 0)
-            if has_message:
-                references.append(
-                    (sensor.measured, *state_by_message(self.stage, number, table.data[row]))
-                )
-        priors = broad_priors(self.stage.model, self.found.prior.name, time_ns, references)
-        has_one = np.ones(1, np.bool_)
+            _when, has_message, rows = first_of_runs(ragged, clock, table.source >= 0)
+            for run in np.flatnonzero(has_message):
+                told = state_by_message(self.stage, number, table.data[rows[run]])
+                references[run].append((sensor.measured, *told))
+        priors = broad_priors(self.stage.model, self.found.prior.name, times_ns, references)
+        has_one = np.ones(runs, np.bool_)
         return [Initialized({**begun, prior.topic: of_runs(prior, has_one)}, []) for prior in priors]
 
     def _prior(

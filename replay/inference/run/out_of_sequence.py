@@ -259,7 +259,7 @@ class OutOfSequenceFilter:
             failures = state.carried.failure, carried.failure, carried.time_ns, FAILURES
             made.append(failures_of(f"/estimates/{inner.name}", *failures))
         skipped = passed_over(inner.name, inner.stage, inner.found, block, without_covariance)
-        made += [self.reprocessed(events, repeated), *skipped]
+        made += [rewound(inner.name, events, repeated), *skipped]
         return state._replace(carried=carried, kept=history), made
 
     def finish(self, state: Any) -> list[Ragged]:
@@ -274,17 +274,18 @@ class OutOfSequenceFilter:
         innovations = Innovations(offsets[1:], *(column[rows] for column in columns))
         return [self.inner.innovations(innovations, offsets)]
 
-    def reprocessed(self, events: FilterEvents, repeated: Integers) -> Ragged:
-        """List the late messages, and how many updates each had repeated."""
-        is_late = repeated > 0
-        stream = make_stream(
-            f"/estimates/{self.inner.name}/rewound",
-            schemas.REWOUND,
-            events.time_ns[is_late],
-            log_time_ns=events.arrival[is_late, 0],
-            repeated=repeated[is_late],
-        )
-        return Ragged(stream, ragged_rows(is_late, events.offsets))
+
+def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
+    """List the late messages, and how many updates (n,) each had repeated."""
+    is_late = repeated > 0
+    stream = make_stream(
+        f"/estimates/{name}/rewound",
+        schemas.REWOUND,
+        events.time_ns[is_late],
+        log_time_ns=events.arrival[is_late, 0],
+        repeated=repeated[is_late],
+    )
+    return Ragged(stream, ragged_rows(is_late, events.offsets))
 
 
 def issued(estimates: Ragged, events: FilterEvents, start_ns: Integers) -> Ragged:

@@ -99,17 +99,17 @@ class Errors:
 
     @property
     def position(self) -> list[int]:
-        """The indices of the position's components."""
+        """Return the indices of the position's components."""
         return [index for index, name in enumerate(self.components) if name in POSITION]
 
     @property
     def rotation(self) -> list[int]:
-        """The indices of an orientation's components, which are a rotation vector in rad."""
+        """Return the indices of an orientation's components, which are a rotation vector in rad."""
         return [index for index, kind in enumerate(self.kinds) if kind == "rotation"]
 
     @property
     def main(self) -> Quantity:
-        """The position, else the orientation, else the first component."""
+        """Return the position, else the orientation, else the first component."""
         if self.position:
             return Quantity("position_rmse_m", self.position)
         if self.rotation:
@@ -308,7 +308,10 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
         return ""
     verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
     truth = estimates.stream.metadata["truth"]
-    return f"{what}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
+    said = f"{what}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
+    if len(names) < len(_components(estimates.stream)):
+        return said
+    return f"{said}; it has {', '.join(stated_components(sources[0].topics[truth].metadata, {}, truth))}"
 
 
 def _components(stream: Stream) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from replay.judging.errors.evaluation import Errors, Innovations
 
 
 class Output(NamedTuple):
-    """Messages of one output topic of an estimator, of any schema.
+    """Holds messages of one output topic of an estimator, of any schema.
 
     Row r of a run belongs to `sources[run]`, whose number in the whole ensemble is `first_run` + run.
     """
@@ -34,7 +34,7 @@ State = TypeVar("State", bound=Any)
 
 @dataclass(frozen=True)
 class Metric(Generic[Judged, State]):
-    """A registered metric: what it tells, what it judges, and how it comes to its numbers.
+    """Describes a registered metric: what it tells, what it judges, and how it comes to its numbers.
 
     Attributes:
         summary: what it tells, in a line.
@@ -57,7 +57,7 @@ class Metric(Generic[Judged, State]):
     finish: Callable[[State], Mapping[str, float]]
 
     def of(self, judged: Judged) -> Mapping[str, float]:
-        """The numbers of something that is judged whole."""
+        """Return the numbers of something that is judged whole."""
         return self.finish(self.add(self.start(), judged))
 
 
@@ -70,7 +70,7 @@ def metric_of_sums(
     sums: Callable[[Judged], Mapping[str, Any]],
     finish: Callable[[Sums], Mapping[str, float]],
 ) -> Metric[Judged, Sums]:
-    """A metric whose state is sums by name.
+    """Return a metric whose state is sums by name.
 
     Args:
         summary: what it tells.

@@ -25,7 +25,7 @@ ORDER = 2.0
 
 
 class SetErrors(NamedTuple):
-    """A set estimate of an ensemble, judged: one row (n,) per run and step.
+    """Holds a set estimate of an ensemble, judged: one row (n,) per run and step.
 
     Distances are in m; localisation, missed and false are GOSPA's parts in m^2. `estimated` and `true`
     are the numbers of targets.

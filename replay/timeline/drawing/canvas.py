@@ -64,7 +64,7 @@ class Scene:
 
     @property
     def estimators(self) -> list[str]:
-        """The estimators' labels, in the order they were given."""
+        """Return the estimators' labels, in the order they were given."""
         names = [split_topic(topic)[0] for topic in self.outputs]
         return list(dict.fromkeys([*names, *(errors.estimator for errors in self.errors)]))
 
@@ -76,11 +76,11 @@ class Scene:
         return sorted(found, key=_natural) or [""]
 
     def colour(self, estimator: str) -> Colour:
-        """The one colour of an estimator, everywhere."""
+        """Return the one colour of an estimator, everywhere."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
 
     def outputs_of(self, case: str, schema: Schema) -> list[tuple[str, Stream]]:
-        """The non-empty output streams of a case that have this schema, with their estimators."""
+        """Return the non-empty output streams of a case that have this schema, with their estimators."""
         return [
             (split_topic(topic)[0], stream)
             for topic, stream in self.outputs.items()
@@ -90,16 +90,16 @@ class Scene:
         ]
 
     def errors_of(self, case: str) -> list[Errors]:
-        """The non-empty errors of a case."""
+        """Return the non-empty errors of a case."""
         return [errors for errors in self.errors if errors.case == case and len(errors.error)]
 
     def truths_of(self, case: str) -> list[Stream]:
-        """The non-empty truth streams of a case."""
+        """Return the non-empty truth streams of a case."""
         truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
         return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
-        """The run's sensor topics below a case, and those that are below none; see `unread`."""
+        """Return the run's sensor topics below a case, and those that are below none; see `unread`."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
         return [
@@ -110,7 +110,7 @@ class Scene:
 
     @cached_property
     def unread(self) -> dict[str, str]:
-        """The run's topics whose messages are no columns, such as images, and why."""
+        """Return the run's topics whose messages are no columns, such as images, and why."""
         found: dict[str, str] = {}
         for topic in self.source.topics:
             try:
@@ -172,7 +172,7 @@ def dates_of(stream: Stream) -> Dates | None:
 
 @dataclass(frozen=True)
 class Canvas:
-    """A recording and its clocks.
+    """Represents a recording and its clocks.
 
     Attributes:
         recording: where it goes.

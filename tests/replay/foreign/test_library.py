@@ -58,6 +58,29 @@ def test_blocks_and_estimates_between_messages(compile_filter: Compile) -> None:
             np.testing.assert_array_equal(cut[f"/estimates/{label}/robot1/pose"][name], column)
 
 
+@pytest.mark.parametrize("late", ["rewind:0.5", "wait:0.1"])
+def test_late_messages(compile_filter: Compile, late: str) -> None:
+    """It goes back for them as our filter does, says when it knew what, and in order at the end."""
+    path = compile_filter(EXAMPLES / "robot_ekf.c")
+    slow = {"latency_s": 0.02, "latency_jitter_s": 0.1}
+    log = fl.record("landmarks", seed=3, duration_s=5.0, range_bearing=slow)
+    given = {
+        "c": library(path, in_process=True),
+        "apart": library(path),
+        "ekf": {"gate_probability": 1.0},
+    }
+    done = fl.replay(log, allowed(given), arrival_order=True, late=late)
+    [made] = done.estimates
+    ours = {topic: each for topic, each in made.items() if topic.startswith("/estimates/ekf/")}
+    assert len(made["/estimates/ekf/robot1/" + ("rewound" if "rewind" in late else "waited")]) > 40
+    for topic, stream in ours.items():
+        for label in ("c", "apart"):
+            own = made[topic.replace("/ekf/", f"/{label}/")]
+            np.testing.assert_array_equal(own.log_time_ns, stream.log_time_ns, err_msg=topic)
+            for name, column in stream.columns.items():
+                np.testing.assert_allclose(own[name], column, rtol=1e-12, atol=1e-12, err_msg=topic)
+
+
 def ranges(*values: float) -> MemorySource:
     stamps = np.arange(len(values)) * 1_000_000
     stream = make_stream("/range", schemas.RANGE, stamps, target_id=np.ones(len(values)), range_m=values)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from fuselog import BadInput
 from pipeline.command_line.process import main
 from tests.docs.test_worked_pages import blocks_of
 from tests.replay.foreign.conftest import EXAMPLES, HEADER, Compile
@@ -38,6 +39,41 @@ def test_the_page_is_worked_through(drifter: Path) -> None:
     metrics = done.metrics.set_index("quantity")["value"]
     assert metrics["position_rmse_m"] < 5.0
     assert metrics["failed_runs"] == 0
+
+
+def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_filter: Compile) -> None:
+    """Then by the likelihood is refused, and by RMSE it gives what it gives with them."""
+    said = ' \\"innovation\\": {\\"x_m\\": \\"linear\\", \\"y_m\\": \\"linear\\"},'
+    text = Path("drifter.c").read_text(encoding="utf-8")
+    assert said in text
+    Path("silent.c").write_text(text.replace(said, ""), encoding="utf-8")
+    silent = compile_filter(Path("silent.c").resolve())
+    log = fl.record("vehicles", seed=7, vehicles=1, duration_s=4.0)
+    given = {"kind": "lib", "in_process": True}
+    tuned = [
+        fl.tune(log, {"mine": given | {"path": str(path)}}, "drift_density", by="rmse").parameters[
+            "value"
+        ]
+        for path in (drifter, silent)
+    ]
+    assert tuned[0].tolist() == tuned[1].tolist()
+    assert 1.0 < tuned[0].iloc[0] < 100.0
+    with pytest.raises(BadInput, match="innovations"):
+        fl.tune(log, {"mine": given | {"path": str(silent)}}, "drift_density")
+
+
+def test_a_state_by_other_names_is_told_those_of_the_truth(
+    drifter: Path, compile_filter: Compile, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = Path("drifter.c").read_text(encoding="utf-8")
+    for own, other in (("x_m", "east"), ("y_m", "north"), ("prior", "none")):
+        text = text.replace(f'\\"{own}\\":', f'\\"{other}\\":')
+    Path("east.c").write_text(text.replace('\\"none\\": \\"prior\\",', ""), encoding="utf-8")
+    compile_filter(Path("east.c").resolve()).rename("east.so")
+    fl.write("run.mcap", fl.record("vehicles", vehicles=1, duration_s=3.0))
+    assert main(["replay", "run.mcap", "-e", "lib:./east.so", "--set", "in_process=true"]) == 0
+    said = "east, north are not judged: /vehicle1/truth lacks them; it has x_m, vx_mps, y_m, vy_mps"
+    assert said in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_client_in_cpp_gives_the_same(drifter: Path) -> None:

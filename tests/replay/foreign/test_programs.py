@@ -133,6 +133,23 @@ def test_a_program_that_reads_a_log(tmp_path: Path, place: str, how: str) -> Non
     assert done.done.parameters["writes"]["sigma_m"] == 0.25
 
 
+def test_a_program_that_writes_mcap(tmp_path: Path) -> None:
+    """Its estimates and innovations, with their topics' ends, are judged like those that it wrote."""
+    log, written = fl.record("landmarks", seed=1, duration_s=2.0), tmp_path / "written.mcap"
+    first = fl.replay(log, "ekf")
+    fl.write(
+        written, [each for name, each in first.estimates[0].items() if name.startswith("/estimates/")]
+    )
+    copies = (
+        f"'{sys.executable}' -c 'import shutil, sys; shutil.copy(*sys.argv[1:])' '{written}' {{out}}"
+    )
+    done = fl.replay(log, {"ekf": {}, "mine": program(copies)})
+    judged = done.metrics.set_index("quantity")
+    ours, theirs = (judged.loc[judged["estimator"] == label, "value"] for label in ("ekf", "mine"))
+    assert {"nees", "log_likelihood", "position_rmse_m"} <= set(theirs.index)
+    pd.testing.assert_series_equal(theirs, ours, rtol=1e-12)
+
+
 @pytest.mark.paper
 @pytest.mark.parametrize(
     ("how", "sentence"),

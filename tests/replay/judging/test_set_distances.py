@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from recorders.errors import BadInput
-from replay.judging.sets.distances import gospa, ospa
+from replay.judging.sets.distances import gospa, gospa_pairs, ospa
 
 THREE = [(0, 0), (10, 0), (0, 10)]
 EMPTY = np.empty((0, 2))
@@ -77,3 +77,16 @@ def test_parts_make_the_whole(estimates, truths):
 def test_bad_input_is_named(arguments, said):
     with pytest.raises(BadInput, match=said):
         gospa(*arguments)
+
+
+@settings(max_examples=20)
+@given(st.floats(0.1, 100.0), st.integers(0, 3))
+def test_what_is_as_far_as_the_cutoff_is_no_pair(cutoff, paired):
+    """One missed and one false, as beyond it; just within it is a pair."""
+    near = [[1000.0 * cutoff * row, 0.0] for row in range(1, paired + 1)]
+    for away, pairs in ((cutoff, 0), (2.0 * cutoff, 0), (np.nextafter(cutoff, 0.0), 1)):
+        estimates, truths = [[0.0, away], *near], [[0.0, 0.0], *near]
+        found = gospa(estimates, truths, cutoff)
+        assert found.missed == found.false == pytest.approx((1 - pairs) * cutoff**2 / 2.0)
+        assert found.localisation == pytest.approx(pairs * cutoff**2)
+        assert len(gospa_pairs(estimates, truths, cutoff)[0]) == paired + pairs

@@ -1,7 +1,5 @@
 """The timeline of a body in space: its path with tube and axes, fixes by quality, outages, biases."""
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -11,9 +9,11 @@ from recorders.models.states import NAVIGATION, state_metadata
 from recorders.recording import SIMULATION_EPOCH_NS, Recording
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import memory_source
+from replay.timeline.drawing.canvas import PALETTE
 from replay.timeline.drawing.geodetic import POOR, QUALITIES
 from replay.timeline.show import show
-from tests.replay.timeline.test_timeline import read, told
+from tests.replay.timeline.reading import Picture, Wanted, check_views, compare, picture_of
+from tests.replay.timeline.test_timeline import told
 
 SECOND = 10**9
 STAMPS = SIMULATION_EPOCH_NS + np.arange(60) * SECOND
@@ -21,15 +21,8 @@ STAMPS = SIMULATION_EPOCH_NS + np.arange(60) * SECOND
 ORIGIN = {"origin_latitude_deg": "48.0", "origin_longitude_deg": "9.0", "origin_altitude_m": "0.0"}
 
 
-class Drawn(NamedTuple):
-    """What moves, and what stays."""
-
-    moving: dict[str, dict[str, list]]
-    still: dict[str, dict[str, list]]
-
-
 @pytest.fixture(scope="module")
-def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> Picture:
     """A minute north, with fixes of four qualities and none from 20 to 40 s."""
     seconds = np.arange(60.0)
     state = np.zeros((60, 16))
@@ -88,10 +81,10 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     outputs = {each.topic: gather([each]) for each in (estimate, innovation)}
     path = tmp_path_factory.mktemp("navigation") / "run.rrd"
     show(source, outputs, [], save=path)
-    return Drawn(read(path), read(path, static=True))
+    return picture_of(path)
 
 
-def test_the_scene_has_path_tube_axes_and_fixes_by_quality(drawn: Drawn):
+def test_the_scene_has_path_tube_axes_and_fixes_by_quality(drawn: Picture):
     [path] = drawn.still["/navigation/ekf/path"]["LineStrips3D:strips"][0]
     assert_allclose([path[0], path[-1]], [[0, 0, 0], [0, 118, 0]])
     [sizes] = drawn.still["/navigation/ekf/tube"]["Ellipsoids3D:half_sizes"]
@@ -110,7 +103,7 @@ def test_the_scene_has_path_tube_axes_and_fixes_by_quality(drawn: Drawn):
     assert colours[:4] == packed
 
 
-def test_outages_are_marked_and_shaded(drawn: Drawn):
+def test_outages_are_marked_and_shaded(drawn: Picture):
     [[strip]] = drawn.still["/navigation/ekf/without_fixes"]["LineStrips3D:strips"]
     assert_allclose([strip[0], strip[-1]], [[0, 38, 0], [0, 80, 0]])
     for plot in ("velocity", "attitude", "gyro_bias"):
@@ -119,7 +112,7 @@ def test_outages_are_marked_and_shaded(drawn: Drawn):
         assert np.isfinite(values).tolist() == [True, True, False]
 
 
-def test_biases_have_bands_and_each_sensor_its_innovations(drawn: Drawn):
+def test_biases_have_bands_and_each_sensor_its_innovations(drawn: Picture):
     band = drawn.moving["/plots/motion/gyro_bias/gyro_bias_x_radps_band"]
     assert_allclose(np.concatenate(band["Measurements:values"]), 0.1, rtol=1e-12)
     deviation_deg = 2.0 * np.degrees(0.1)
@@ -129,9 +122,37 @@ def test_biases_have_bands_and_each_sensor_its_innovations(drawn: Drawn):
         assert_allclose(np.concatenate(squares), np.arange(first, 60, 2))
 
 
-def test_the_map_has_the_estimates_and_events_the_solutions_and_stops(drawn: Drawn):
+def test_the_map_has_the_estimates_and_events_the_solutions_and_stops(drawn: Picture):
     [[way]] = drawn.still["/geodetic/ekf"]["GeoLineStrings:line_strings"]
     assert_allclose(way[-1], [48.0 + 118.0 / 111_194.0, 9.0], atol=1e-5)
     said = {sensor: told(drawn.moving[f"/events/{sensor}"]) for sensor in ("quality", "standing")}
     assert said["quality"] == ["quality: solution fixed", "quality: solution float"]
     assert said["standing"] == ["standing: moves", "standing: stands: no velocity"]
+
+
+def test_every_panel_is_called_by_what_it_shows(drawn: Picture):
+    """Components by themselves, and those of a kind together; NIS is far above its band."""
+    titles = {(name.rpartition("_")[0].replace("_", " "), name) for name in NAVIGATION}
+    units = {"m": "m", "mps": "m/s", "radps": "deg/s", "mps2": "m/s²"}
+    titles = {
+        (f"{quantity.capitalize()} ({units.get(name.rpartition('_')[2], name[-1])})", f"plots/{name}")
+        for quantity, name in titles
+    }
+    for name in ("latitude", "longitude"):
+        titles.add((f"{name.capitalize()} (deg)", f"plots/fix/{name}_deg"))
+    titles |= {("Altitude (m)", "plots/fix/altitude_m"), ("Map", "map"), ("OpenStreetMap", "geodetic")}
+    titles |= {("Value (-)", f"plots/{name}/value") for name in ("quality", "standing")}
+    groups = {"velocity": "m/s", "attitude": "deg", "gyro_bias": "deg/s", "accelerometer_bias": "m/s²"}
+    for name, unit in groups.items():
+        titles.add((f"{name.replace('_', ' ').capitalize()} ({unit})", f"plots/motion/{name}"))
+    for first in ("x_m, y_m, z_m", "vx_mps, vy_mps, vz_mps"):
+        plot = f"plots/nis_3_{first.partition(',')[0]}"
+        titles.add((f"NIS of {first}; 95 % are below 9.35", plot))
+    titles |= {("Scene, tubes of 2 sigma; red without fixes", "navigation"), ("Events", "events")}
+    check_views(drawn, titles, ["ekf"])
+    velocities = {"vx_mps": 0.0, "vy_mps": 2.0, "vz_mps": 0.0}
+    wanted = {name: Wanted("curve", STAMPS, np.full(60, at)) for name, at in velocities.items()}
+    compare({name: drawn.moving[f"/plots/motion/velocity/{name}"] for name in wanted}, wanted)
+    styles = [drawn.still[f"/plots/motion/velocity/{name}"] for name in velocities]
+    packed = [int.from_bytes(bytes((*colour, 255)), "big") for colour in PALETTE[:3]]
+    assert [style["SeriesLines:colors"][0] for style in styles] == [[colour] for colour in packed]

@@ -12,6 +12,7 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.judging.tracks.errors import instants_of, track_errors, tracks_at
 from replay.timeline.show import show
 from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, passing, sensor
+from tests.replay.timeline.reading import Wanted, check_views, compare, picture_of
 from tests.replay.timeline.test_timeline import read, told
 
 
@@ -62,8 +63,18 @@ def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
     at_ns, truths = instants_of(source)
     sizes = outputs["/estimates/jipda/set"].stream
     gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
-    drawn = np.concatenate(found["/plots/gospa/jipda"]["Scalars:scalars"])
-    np.testing.assert_allclose(drawn, gospa, rtol=1e-9)
+    existence = outputs["/estimates/jipda/existence"].stream
+    curves = {
+        "gospa/jipda": (at_ns, gospa),
+        "count/jipda": (sizes.publish_time_ns, sizes["elements"]),
+        "existence/track1": (tracks.publish_time_ns, existence["existence"]),
+    }
+    picture = picture_of(tmp_path / "run.rrd")
+    plots = {name: picture.moving[f"/plots/{name}"] for name in curves}
+    compare(plots, {name: Wanted("curve", *curve) for name, curve in curves.items()})
+    titles = {("GOSPA (m), c = 20 m", "plots/gospa"), ("Confirmed tracks", "plots/count")}
+    titles |= {("Existence", "plots/existence"), ("Events", "events"), ("jipda", "map/jipda")}
+    check_views(picture, titles, [])
 
 
 def test_associations_and_what_happened(tmp_path: Path, uncompiled: None):

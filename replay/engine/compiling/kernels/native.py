@@ -1,7 +1,7 @@
 """Makes machine code of kernels through LLVM, keeps and loads it, and calls it with NumPy's arrays.
 
 A kernel is compiled for the kinds and sizes of its arguments: of arrays that a core works in all sizes
-are known, of all others those behind the first axis, up to 64 (see `_described`). Its key is all that it
+are known, of all others those behind the first axis, up to `arguments.KNOWN`. Its key is all that it
 is made of (`identity`), this room itself, LLVM, and the processor.
 """
 
@@ -56,6 +56,7 @@ _layout_of = cache(_Layout)
 
 
 def _described(memory: Any) -> tuple[_Layout, list[Any]]:
+    """Describe what a core works in: kinds, with all sizes known, and the numbers to hand over."""
     kinds: list[Any] = []
     words: list[Any] = []
     describe(memory, 0, kinds, words)
@@ -99,7 +100,7 @@ class Kernel:
                     arguments = *arguments, memory.value
                     kinds += layout_of_memory.kinds
                 known = self._entries.get(key) or self._entries.setdefault(
-                    key, self._entry(arguments, iter(kinds))
+                    key, self._layout_and_entry(arguments, iter(kinds))
                 )
         layout, entry = known
         given = layout.pack(*numbers)
@@ -109,14 +110,15 @@ class Kernel:
 
         return loop
 
-    def _entry(
+    def _layout_and_entry(
         self, arguments: Sequence[Any], kinds: Iterator[Any]
     ) -> tuple[Struct, Callable[..., Any]]:
+        """Return how the numbers of such arguments are packed, and the entry that takes them."""
         is_checked = next(kinds)
         described = tuple(with_types(each, kinds) for each in arguments)
         key = is_checked, described
         if key not in self._loaded:
-            make = _checked_entry if is_checked else _entry
+            make = _checked_entry if is_checked else _kept_entry
             self._loaded[key] = make(self._function, described, self._title)
         return Struct(f"={''.join(map(letters, described))}"), self._loaded[key]
 
@@ -207,8 +209,8 @@ def _checked_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -
     return checked
 
 
-def _entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., int]:
-    """Make the kernel's entry: kept, or made."""
+def _kept_entry(function: FunctionType, kinds: tuple[Any, ...], title: str) -> Callable[..., int]:
+    """Load the kernel's entry from the cache; where that lacks it, make it and keep it there."""
     known = "\n".join([_surroundings(), repr(_named(kinds)), identity(function)])
     key = sha256(known.encode()).hexdigest()[:32]
     path = None
@@ -236,6 +238,7 @@ def _kept(path: Path, key: str) -> bytes | None:
 
 
 def _keep(path: Path, code: bytes) -> None:
+    """Write object code to a file; says once where that is impossible."""
     try:
         write_checked(path, code, _MADE_BY)
     except BadInput as error:
@@ -275,7 +278,7 @@ def _machine() -> tuple[str, str]:
 
 
 def _new_target() -> Any:
-    """LLVM's description of the machine."""
+    """Return LLVM's description of the machine."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name, features = _machine()
@@ -292,7 +295,7 @@ def _made(function: FunctionType, kinds: Sequence[Any]) -> bytes:
 
 
 def object_code(text: str) -> bytes:
-    """Machine code of LLVM's text.
+    """Return the machine code of LLVM's text.
 
     Without the SLP vectoriser, which costs as much as all else and gains these kernels nothing.
     """
@@ -321,7 +324,7 @@ def _loaded(code: bytes) -> Callable[..., int]:
 
 @contextmanager
 def _without_garbage() -> Iterator[None]:
-    """Return a compiler makes very many objects and little garbage: nobody looks for it meanwhile."""
+    """Collect no garbage meanwhile: a compiler makes very many objects and little of that."""
     collecting = gc.isenabled()
     gc.disable()
     try:

@@ -1,0 +1,167 @@
+"""Hands messages to the filters of a library as they arrive: late ones take their places by stamp.
+
+Every run has two filters. The settled one has taken, in order, the messages before which none can come
+any more, the newest one all that have arrived. At a late message the newest one becomes a copy of the
+settled one, and takes again what the window has. The estimates are those of the newest, the innovations
+those of the settled one: so both are what processing in order gives.
+"""
+
+from bisect import bisect
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Function, Integers, varying
+from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.streams.blocks import Ragged, join
+from replay.engine.streams.results import ALL_WELL
+from replay.foreign.description import Description
+from replay.foreign.native.calls import COPY, DESTROY
+from replay.foreign.native.following import (
+    NOBODY,
+    NOT_COPIED,
+    Filters,
+    Given,
+    Static,
+    addresses_of,
+    advance,
+    copies_of,
+    work_of,
+)
+from replay.foreign.native.library import Library
+from replay.foreign.results import Results
+from replay.inference.linear_algebra.gaussian import Innovation
+from replay.inference.run.out_of_sequence import rewound
+from replay.inference.run.recursion import FilterEvents
+
+
+@varying(1)
+class Arrived(NamedTuple):
+    """Holds what has arrived, in order, and how late a message may be.
+
+    Attributes:
+        order: (n,) the messages that have arrived, by stamp and place in the file; those of run r from
+            where its events begin.
+        estimating: (n,) 1 for messages at whose stamps there are estimates.
+        window_ns: (1,).
+    """
+
+    order: Integers
+    estimating: Integers
+    window_ns: Integers
+
+
+def follow_as_arrived(
+    run: int,
+    given: Given,
+    arrived: Arrived,
+    settled: Filters,
+    newest: Filters,
+    made: Results,
+    work: tuple[Innovation, Innovation],
+) -> None:
+    """Hand one run's messages to its filters as they arrive, until the run fails; see the module."""
+    events, order = given.events, arrived.order
+    begin, end = events.offsets[run], events.offsets[run + 1]
+    taken = begin
+    for event in range(begin, end):
+        if newest.failure[run] == ALL_WELL:
+            first = insert(begin, event, events, order)
+            if first < event:
+                first = taken
+                restart(run, given, settled, newest)
+            estimated = newest_estimated(event, events, arrived)
+            for row in range(first, event + 1):
+                calls = events.wants_estimate[event] and row == estimated
+                caller = event if calls else NOBODY
+                recorded = made.innovations.end[run]
+                advance(run, order[row], caller, given, newest, made, work)
+                made.innovations.end[run] = recorded
+            since_ns = events.time_ns[order[event]] - arrived.window_ns[0]
+            while taken < event and events.time_ns[order[taken]] < since_ns:
+                advance(run, order[taken], NOBODY, given, settled, made, work)
+                taken += 1
+            end = event + 1 if newest.failure[run] != ALL_WELL else end
+    for row in range(taken, end):
+        advance(run, order[row], NOBODY, given, settled, made, work)
+
+
+def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int:
+    """Put a message where it belongs, by stamp and place in the file; returns its row."""
+    time_ns, position = events.time_ns[event], events.arrival[event, 1]
+    row = event
+    while row > begin and (
+        events.time_ns[order[row - 1]] > time_ns
+        or (events.time_ns[order[row - 1]] == time_ns and events.arrival[order[row - 1], 1] > position)
+    ):
+        order[row] = order[row - 1]
+        row -= 1
+    order[row] = event
+    return row
+
+
+def restart(run: int, given: Given, settled: Filters, newest: Filters) -> None:
+    """Make the newest filter a copy of the settled one."""
+    DESTROY(given.addresses.destroy, newest.handle[run])
+    newest.handle[run] = COPY(given.addresses.copy, settled.handle[run])
+    newest.time_ns[run], newest.begun[run] = settled.time_ns[run], settled.begun[run]
+    if newest.handle[run] == 0:
+        newest.failure[run] = NOT_COPIED
+
+
+def newest_estimated(last: int, events: FilterEvents, arrived: Arrived) -> int:
+    """Find the last row of the newest stamp at which there are estimates; row `last` is the newest."""
+    row, order = last, arrived.order
+    while row > 0 and arrived.estimating[order[row]] == 0:
+        row -= 1
+    while row < last and events.time_ns[order[row + 1]] == events.time_ns[order[row]]:
+        row += 1
+    return row
+
+
+@lru_cache(maxsize=1)
+def _loop() -> Function:
+    title = "filters of a library, which go back for late messages"
+    return compile_over_runs(follow_as_arrived, allocates=False, title=title)
+
+
+def follow_all_as_arrived(
+    window_ns: int,
+    library: Library,
+    description: Description,
+    static: Static,
+    events: FilterEvents,
+    carried: Filters,
+    made: Results,
+) -> None:
+    """Hand the messages of all runs to their filters as they arrive; see `following.follow_all`."""
+    estimates = np.array([each.estimates for each in description.topics])
+    arrived = Arrived(
+        np.zeros(len(events.time_ns), np.int64),
+        estimates[events.source].astype(np.int64),
+        np.array([window_ns]),
+    )
+    settled = copies_of(library, carried)
+    given = Given(addresses_of(library, description), static, events)
+    runs = len(settled.handle)
+    _loop()(runs, given, arrived, settled, carried, made, scratch=work_of(description))
+    library.destroy_all(settled.handle.tolist())
+
+
+def gone_back(name: str, blocks: Sequence[FilterEvents]) -> Ragged:
+    """List the late messages of blocks, and behind how many that came before each of them belongs."""
+    newer = [list[tuple[int, int]]() for _ in blocks[0].offsets[1:]]
+    made = []
+    for events in blocks:
+        counts = np.zeros(len(events.time_ns), np.int64)
+        keys = list(zip(events.time_ns.tolist(), events.arrival[:, 1].tolist(), strict=True))
+        for order, (begin, end) in zip(newer, pairwise(events.offsets.tolist()), strict=True):
+            for event in range(begin, end):
+                place = bisect(order, keys[event])
+                counts[event] = len(order) - place
+                order.insert(place, keys[event])
+        made.append(rewound(name, events, counts))
+    return join(made)

@@ -1,0 +1,325 @@
+"""What charts hold of tables that are made: which series of whom, in which unit, with which label."""
+
+from collections.abc import Mapping
+from itertools import product
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipeline.comparing.comparing import _chart as difference_chart
+from pipeline.output.charts import Axis, Chart, Panel, band, curve, draw
+from pipeline.output.report.first_run import first_run
+from pipeline.output.report.scene import plan
+from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
+from pipeline.runs.sweeps import Over, figures_of
+from pipeline.tuning.outcome import Tuning
+from recorders.log import RunMetadata, make_stream, schemas, write_log
+from replay.judging.errors.evaluation import Errors
+
+TIMES = np.array([0.0, 1.0, 2.0])
+
+
+def held(chart: Chart) -> dict[str, dict[str, Any]]:
+    """What a reader of the JSON finds: by axes' labels the columns of series and bands by label."""
+    return {
+        f"{panel.title}{': ' if panel.title else ''}{panel.y.label} over {panel.x.label}": {
+            **{each.label: [each.x, each.y] for each in panel.series},
+            **{f"{each.label} band": [each.x, each.low, each.high] for each in panel.bands},
+        }
+        for panel in Chart.model_validate_json(chart.model_dump_json()).panels
+    }
+
+
+def same(found: Mapping[str, Any], wanted: Mapping[str, Mapping[str, Any]]) -> None:
+    """All panels and series of both, and their numbers to seven digits."""
+    assert {name: set(own) for name, own in found.items()} == {
+        name: set(own) for name, own in wanted.items()
+    }
+    for name, own in wanted.items():
+        for label, columns in own.items():
+            np.testing.assert_allclose(
+                found[name][label], columns, rtol=1e-6, err_msg=f"{name}: {label}"
+            )
+
+
+def errors(estimator: str, *components: str, is_bound: bool = False) -> Errors:
+    """Errors of three components or one, without rows."""
+    size, none = len(components), np.empty(0)
+    kinds = tuple("rotation" if each.startswith("body") else "linear" for each in components)
+    stamps = np.empty(0, np.int64)
+    shapes = none.reshape(0, size), none.reshape(0, size, size)
+    rows = (stamps, stamps, stamps, none, *shapes, none)
+    return Errors(estimator, "robot1", components, kinds, *rows, 0, is_bound=is_bound)
+
+
+def steps(start: float, quantity: str) -> pd.DataFrame:
+    """A table of steps whose columns all differ."""
+    names = [quantity, f"{quantity}_low", f"{quantity}_high", "nees", "nees_low", "nees_high"]
+    columns = {name: start + 0.1 * number + TIMES for number, name in enumerate(names)}
+    return pd.DataFrame({"elapsed_s": TIMES, "runs": 7, **columns})
+
+
+def test_errors_and_nees_are_of_their_estimators_in_their_unit() -> None:
+    ekf, bound = steps(1.0, "position_rmse_m"), steps(5.0, "position_rmse_m")
+    plane = ("x_m", "y_m")
+    judged = [(errors("ekf", *plane), ekf), (errors("bound", *plane, is_bound=True), bound)]
+    chart = error_chart(judged, "robot1")
+    assert chart.title == (
+        "robot1, 7 runs; tinted: where 95 % lie if the estimator's covariance is right"
+    )
+    assert all(panel.y.log for panel in chart.panels)
+    rmse = {
+        "ekf": [TIMES, ekf["position_rmse_m"]],
+        "ekf band": [TIMES, ekf["position_rmse_m_low"], ekf["position_rmse_m_high"]],
+        "bound": [TIMES, bound["position_rmse_m"]],
+    }
+    nees = {
+        "ekf": [TIMES, ekf["nees"]],
+        "95 % if consistent (2 components) band": [TIMES, ekf["nees_low"], ekf["nees_high"]],
+    }
+    own = held(chart)
+    assert all(of.pop("outside") for of in own.values())  # the strip along the foot
+    name = "ekf: outside always: "
+    axes_of = {f"{name}position error, RMS (m) over time (s)": rmse}
+    same(own, {**axes_of, f"{name}mean NEES over time (s)": nees})
+    turned = ("body_x_rad", "body_y_rad", "body_z_rad")
+    axes = {
+        "orientation_rmse_deg": (turned, "orientation error (°)"),
+        "rmse_room_degC": (("room_degC",), "error of room_degC, RMS"),
+    }
+    for quantity, (components, label) in axes.items():
+        chart = error_chart([(errors("ekf", *components), steps(1.0, quantity))], "")
+        assert chart.panels[0].y.label == label
+        np.testing.assert_allclose(chart.panels[0].series[0].y, 1.0 + TIMES)
+    assert chart.title.startswith("errors, 7 runs")
+
+
+def test_modes_particles_and_late_messages_are_of_their_estimators() -> None:
+    rows = product(("imm", "bank"), ("drive", "stand"), (False, True), TIMES)
+    modes = pd.DataFrame(rows, columns=["estimator", "mode", "smoothed", "elapsed_s"])
+    modes["probability"] = np.arange(len(modes)) / len(modes)
+    chart = mode_chart(modes, "vehicle1")
+    assert chart.title == "vehicle1, probability of each mode; dashed: given all data of a run"
+    for panel, start in zip(chart.panels, (0, 12), strict=True):
+        assert panel.title == ("imm" if start == 0 else "bank")
+        drawn = [(each.label, each.style) for each in panel.series]
+        assert drawn == list(product(("drive", "stand"), ("line", "dashed")))
+        np.testing.assert_allclose(
+            np.ravel([each.y for each in panel.series]), np.arange(start, start + 12) / 24, rtol=1e-6
+        )
+    shares = modes[~modes["smoothed"] & (modes["mode"] == "drive")].assign(
+        effective_share=lambda of: of["probability"]
+    )
+    chart = effective_chart(shares, "")
+    own = {name: [TIMES, each["probability"]] for name, each in shares.groupby("estimator")}
+    same(held(chart), {"effective share over time (s)": own})
+    assert chart.title == "particles, share of the particles that is effective"
+    late = pd.DataFrame(
+        {
+            "estimator": ["ekf", "ekf", "ukf"],
+            "case": "robot1",
+            "became": ["inserted", "dropped", "dropped"],
+            "elapsed_s": [1.0, 2.0, 3.0],
+            "late_s": [0.1, 0.2, 0.3],
+            "messages": [2, 3, 4],
+            "repeated": [5.0, np.nan, np.nan],
+        }
+    )
+    delay = "mean delay (s) over time (s)"
+    wanted = {
+        f"ekf: 2 inserted, 10 used again for them; 3 dropped: {delay}": {
+            "inserted": [[1.0], [0.1]],
+            "dropped": [[2.0], [0.2]],
+        },
+        f"ukf: 4 dropped: {delay}": {"dropped": [[3.0], [0.3]]},
+    }
+    same(held(late_chart(late, "robot1")), wanted)
+    again = late.replace({"became": {"inserted": "dropped"}})
+    assert late_counts(again)["late_s"].tolist() == pytest.approx([(2 * 0.1 + 3 * 0.2) / 5, 0.3])
+
+
+def swept(over: list[Over], values: np.ndarray, quantity: str = "position_rmse_m") -> pd.DataFrame:
+    """A sweep of two estimators over a grid: values (estimators, points)."""
+    points = list(product(*(each.taken for each in over)))
+    rows = [
+        {
+            "estimator": name,
+            "quantity": quantity,
+            "case": "robot1",
+            "point": number,
+            "value": value,
+            "low": 0.9 * value,
+            "high": 1.2 * value,
+        }
+        | {each.key: taken for each, taken in zip(over, point, strict=True)}
+        for name, own in zip(("ekf", "ukf"), values, strict=True)
+        for number, (point, value) in enumerate(zip(points, own, strict=True))
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_a_sweep_is_curves_over_what_is_swept() -> None:
+    over = [Over("ekf.sigma_m", (0.1, 0.2, 0.4), (0.1, 0.4), is_log=True)]
+    values = np.array([[3.0, 1.0, 2.0], [4.0, 6.0, 5.0]])
+    [(name, chart)] = figures_of(swept(over, values), over).items()
+    assert name == "position_rmse_m-robot1"
+    assert chart.title == "position error, RMS (m) of robot1; bands: nine in ten runs"
+    wanted = {label: [over[0].taken, own] for label, own in zip(("ekf", "ukf"), values, strict=True)}
+    bands = {f"{label} band": [x, 0.9 * own, 1.2 * own] for label, (x, own) in wanted.items()}
+    same(held(chart), {"position error, RMS (m) over ekf.sigma_m": {**wanted, **bands}})
+    assert chart.panels[0].x.log
+    mixed = [Over("kind", ("a", "b")), over[0]]
+    values = np.arange(12.0).reshape(2, 2, 3)
+    [chart] = figures_of(swept(mixed, values.reshape(2, 6)), mixed).values()
+    assert ", means over the others;" in chart.title
+    by_kind, by_sigma = chart.panels
+    assert (by_kind.x.label, by_kind.x.log, by_sigma.x.log) == ("kind", False, True)
+    assert [each.y for each in by_kind.series] == values.mean(axis=2).tolist()
+    assert [each.y for each in by_sigma.series] == values.mean(axis=1).tolist()
+
+
+def test_a_map_of_a_sweep_has_its_cross_where_the_error_is_least() -> None:
+    """The first parameter goes up, the second to the right; NEES has no cross."""
+    over = [Over("q", (1.0, 2.0)), Over("r", (10.0, 20.0, 40.0))]
+    values = np.array([[4.0, 3.0, 2.0, 5.0, 6.0, 9.0], [8.0, 7.0, 5.0, 4.0, 3.5, 6.0]])
+    [figure] = figures_of(swept(over, values), over).values()
+    *maps, bar = figure.axes
+    for axes, label, own, least in zip(maps, ("ekf", "ukf"), values, [(2, 0), (1, 1)], strict=True):
+        assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == (label, "r", "q")
+        assert np.array_equal(axes.images[0].get_array(), own.reshape(2, 3))
+        assert axes.images[0].origin == "lower"
+        [[cross]] = [line.get_xydata().tolist() for line in axes.lines]
+        assert tuple(cross) == least
+        assert [text.get_text() for text in axes.get_xticklabels()] == ["10", "20", "40"]
+    assert bar.get_ylabel() == "position_rmse_m-robot1"
+    assert maps[0].images[0].norm is maps[1].images[0].norm
+    [figure] = figures_of(swept(over, values, "nees"), over).values()
+    assert not figure.axes[0].lines
+
+
+def test_a_comparison_has_the_difference_of_the_second_less_the_first() -> None:
+    columns = {"first": "ekf", "second": "ukf", "case": "robot1", "elapsed_s": TIMES}
+    rows = pd.concat(
+        pd.DataFrame(
+            {
+                **columns,
+                "quantity": name,
+                "difference": at + TIMES,
+                "low": at - 1 + TIMES,
+                "high": at + 2 + TIMES,
+            }
+        )
+        for at, name in ((1.0, "position_rmse_m"), (5.0, "nees"))
+    )
+    chart = difference_chart(rows)
+    assert chart.title == "robot1: ukf less ekf, with 95 % over the runs"
+    wanted = {
+        f"difference of {name} over time (s)": {
+            "ukf - ekf": [TIMES, at + TIMES],
+            "ukf - ekf band": [TIMES, at - 1 + TIMES, at + 2 + TIMES],
+            "no difference": [[0.0, 2.0], [0.0, 0.0]],
+        }
+        for at, name in ((1.0, "position_rmse_m"), (5.0, "nees"))
+    }
+    same(held(chart), wanted)
+
+
+def test_a_profile_falls_from_the_maximum_along_its_parameter() -> None:
+    """The level is where 95 % end: half of 1.96 squared below."""
+    free = [SimpleNamespace(name=name, is_positive=name == "sigma") for name in ("sigma", "bias")]
+    profiles = [
+        SimpleNamespace(
+            name=each.name, along=at + TIMES, parabola=(TIMES - 1) ** 2, rise=2 * (TIMES - 1) ** 2
+        )
+        for at, each in zip((1.0, -1.0), free, strict=True)
+    ]
+    tuned = SimpleNamespace(
+        found=SimpleNamespace(coordinates=SimpleNamespace(free=free)), _profiles=profiles
+    )
+    chart = Tuning.profile_chart.fget(tuned)
+    wanted = {
+        f"log-likelihood less its greatest over {each.name}": {
+            "log-likelihood": [each.along, -each.rise],
+            "by curvature": [each.along, -each.parabola],
+            "95 %": [each.along[[0, -1]], [-1.92073, -1.92073]],
+        }
+        for each in profiles
+    }
+    same(held(chart), wanted)
+    assert [panel.x.log for panel in chart.panels] == [True, False]
+
+
+def test_the_first_picture_has_the_paths_in_the_plane(tmp_path) -> None:
+    """The x axis goes right and y up, whatever the order of the state; the truth is a reference."""
+    stamps = np.arange(1, 5) * 10**9
+    metadata = {"components": "y_m,heading_rad,x_m", "kinds": "linear,angle,linear"}
+    state = np.stack([stamps * 1e-9, np.zeros(4), stamps * -2e-9], axis=1)
+    truth = make_stream("/robot1/truth", schemas.TRUTH_STATE, stamps, metadata=metadata, state=state)
+    made = [
+        make_stream(
+            f"/estimates/{name}/robot1/pose",
+            schemas.GAUSSIAN_ESTIMATE,
+            stamps,
+            metadata={**metadata, "truth": "/robot1/truth"},
+            mean=state + off,
+            covariance=np.tile(1e-6 * np.eye(3).ravel(), (4, 1)),
+        )
+        for name, off in (("ekf", 0.5), ("ukf", 0.25))
+    ]
+    run = RunMetadata("own", epoch_ns=0)
+    for folder in ("logs", "estimates"):
+        (tmp_path / folder).mkdir()
+    write_log(tmp_path / "logs/run-0000.mcap", [truth], run)
+    write_log(tmp_path / "estimates/run-0000.mcap", made, run)
+    found = first_run(tmp_path)
+    assert found is not None
+    chart = plan(found)
+    assert chart.title == "robot1, first run from above"
+    paths = {
+        name: [state[:, 2] + off, state[:, 0] + off]
+        for name, off in (("ekf", 0.5), ("ukf", 0.25), ("truth", 0.0))
+    }
+    same(held(chart), {"y (m) over x (m)": paths})
+    [panel] = chart.panels
+    assert panel.plane
+    assert [each.reference for each in panel.series] == [True, False, False]
+
+
+def test_a_figure_has_what_its_chart_says() -> None:
+    """Each curve over its x in its look, each band from low to high, in the colour of its label."""
+    x = np.array([1.0, 2.0, 4.0])
+    chart = Chart(
+        title="all of it",
+        panels=[
+            Panel(
+                x=Axis(label="time (s)", log=True, limits=(0.5, 5.0)),
+                y=Axis(label="error (m)"),
+                title="first",
+                series=[
+                    curve("a", x, [3.0, 1.0, 2.0], "dashed"),
+                    curve("b", x, [5.0, 6.0, 7.0], "markers"),
+                ],
+                bands=[band("b", x, [4.0, 5.0, 6.0], [6.0, 7.0, 9.0])],
+            )
+        ],
+    )
+    figure = draw(chart)
+    [axes] = figure.axes
+    assert [line.get_xydata().T.tolist() for line in axes.lines] == [
+        [x.tolist(), each.y] for each in chart.panels[0].series
+    ]
+    assert [(line.get_linestyle(), line.get_marker()) for line in axes.lines] == [
+        ("--", "None"),
+        ("None", "o"),
+    ]
+    assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == ("first", "time (s)", "error (m)")
+    assert (axes.get_xscale(), axes.get_yscale(), axes.get_xlim()) == ("log", "linear", (0.5, 5.0))
+    [filled] = axes.collections
+    corners = {tuple(corner) for corner in filled.get_paths()[0].vertices.tolist()}
+    assert {(1.0, 4.0), (2.0, 7.0), (4.0, 9.0)} <= corners
+    colours = chart.colours()
+    assert [line.get_color() for line in axes.lines] == [colours["a"], colours["b"]]
+    assert figure.get_suptitle() == "all of it"

@@ -1,0 +1,166 @@
+"""What the commands print: one script over a few small logs, its output by command."""
+
+import io
+import json
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from pyarrow.parquet import read_schema
+
+from pipeline.command_line import main
+from pipeline.output import terminal
+
+ROOT = Path(__file__).parents[2]
+# In this order: what a line writes, later ones read. Of a line that is wrong its error is kept.
+SCRIPT = """
+record landmarks --set duration_s=5 --set landmarks=4 -o run.mcap
+record landmarks --set duration_s=5 --set landmarks=4 --seed 1 -o other.mcap
+record navigation --set duration_s=11 --set unit.rate_hz=20 -o car.mcap
+replay run.mcap -e ekf -e ukf -o est.mcap
+replay other.mcap -e ekf --set sigma_range_m=0.02 -o sure.mcap
+replay run.mcap -e ekf -e dead-reckoning -o wide.mcap --set ekf.sigma_bearing_rad=0.1 --parameters
+evaluate est.mcap
+evaluate est.mcap --metric accuracy
+evaluate line.tum --truth shifted.tum
+compare run.mcap other.mcap -e ekf -e ukf
+compare est.mcap sure.mcap
+compare est.mcap wide.mcap -e ekf
+diagnose run.mcap -e ekf
+diagnose run.mcap -e ekf --set /robot1/odometry.forward_mps_scale=1.3 --tried
+observability run.mcap
+explore run.mcap -e ekf -e ukf -e iekf
+explore run.mcap -e network
+tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
+check run.mcap --against ekf.golden.xz --update -e ekf
+check run.mcap --against ekf.golden.xz
+check other.mcap --against ekf.golden.xz
+info run.mcap
+info est.mcap
+info car.mcap --all
+cut run.mcap --start 1 --end 3 -o cut.mcap
+relabel other.mcap --topic /=/b/ -o b.mcap
+merge run.mcap b.mcap --offset b.mcap=-0.5 -o both.mcap
+merge run.mcap other.mcap -o never.mcap
+constrain car.mcap -o constrained.mcap --set rolling_hz=10
+export run.mcap --to csv -o csv
+export est.mcap --to tum -o tum
+import table drive.csv --guess -o mapping.toml
+import table drive.csv --mapping mapping.toml -o drive.mcap
+header
+cache
+run landmarks --runs 2 --set duration_s=5 --out result
+report result -o page.html
+info result
+sweep landmarks --runs 2 --set duration_s=5 --over range_bearing.sigma_range_m=0.1,0.2 --out swept
+view run.mcap --save view.rrd
+view view.rrd --start 1
+scenarios
+scenarios landmarks
+models
+models robot
+estimators
+estimators ekf
+metrics
+metrics consistency
+experiments
+experiments landmarks
+""".strip().splitlines()
+
+
+def texts(folder: Path) -> dict[str, str]:
+    """What every command says in an empty folder; it is left there what they write."""
+    found = defaultdict[str, list[str]](list)
+    with chdir(folder), _alike():
+        _write_files()
+        for line in SCRIPT:
+            found[line.split()[0]].append(_said(line.split()))
+        found["report"].append(_page(Path("page.html").read_text(encoding="utf-8")))
+        for command, place in (("run", "result"), ("sweep", "swept"), ("tune", "out/tune")):
+            found[command].extend(_figures(Path(place)))
+    return {command: "\n".join(sections) for command, sections in found.items()}
+
+
+@contextmanager
+def _alike() -> Iterator[None]:
+    """Make a machine's own width, cache and time of no account."""
+    width = terminal.out.width
+    terminal.out.width = terminal.err.width = 1000
+    try:
+        with patch.object(terminal, "TOLD_EVERY_S", 1e9):
+            yield
+    finally:
+        terminal.out.width = terminal.err.width = width
+
+
+def _said(arguments: list[str]) -> str:
+    """A command, and below it what it prints; lines of standard error begin with a bar."""
+    out, err = io.StringIO(), io.StringIO()
+    cache = {"FUSELOG_CACHE": "empty"} if arguments[0] == "cache" else {}
+    with redirect_stdout(out), redirect_stderr(err), patch.dict(os.environ, cache):
+        code = main(arguments)
+    lines = [f"$ fuselog {' '.join(arguments)}" + (f"   # exit code {code}" if code else "")]
+    lines += [
+        *_masked(out.getvalue()).splitlines(),
+        *(f"| {each}" for each in err.getvalue().splitlines()),
+    ]
+    return "\n".join(each.rstrip() for each in lines) + "\n"
+
+
+def _masked(text: str) -> str:
+    """A text without what is of this machine: how long it took, where it is, and its version."""
+    timed = r"(estimator +time \(s\) *\n─+\n)((?: .*\n)+)"
+    text = re.sub(timed, lambda found: found[1] + re.sub(r"  [-+\d.e]+", "  TIME", found[2]), text)
+    text = re.sub(r"(fuselog \S+, input )[0-9a-f]+", r"\1SHA-256", text)
+    return text.replace(str(ROOT), "ROOT").replace(f"fuselog {version('fuselog')}", "fuselog VERSION")
+
+
+def _page(page: str) -> str:
+    """What a page says, without its scripts, styles and figures."""
+    text = re.sub(r"<(script|style|svg|title)\b.*?</\1>", "", page, flags=re.DOTALL)
+    cells = re.sub(r"\s*</t[dh]>\s*", "  ", text)
+    lines = (re.sub(r"<[^>]*>", "", line).strip() for line in cells.splitlines())
+    return "\n".join(["# the page", *filter(None, map(_masked, lines))]) + "\n"
+
+
+def _figures(folder: Path) -> Iterator[str]:
+    """The columns of a result's tables; the titles, axes and legends of its figures."""
+    lines = ["# its tables and figures"]
+    for path in sorted((folder / "tables").glob("*.parquet")):
+        lines.append(f"{path.stem}: {', '.join(read_schema(path).names)}")
+    for path in sorted((folder / "figures").glob("*.json")):
+        lines.append(f"{path.stem}: {chart_in_words(json.loads(path.read_text(encoding='utf-8')))}")
+    yield "\n".join(lines) + "\n"
+
+
+def chart_in_words(chart: Mapping[str, Any]) -> str:
+    """What a chart's titles, axes and legends say."""
+    panels = []
+    for panel in chart["panels"]:
+        drawn = [f"{each['label']} ({each['style']})" for each in panel["series"]]
+        drawn += [f"{each['label']} (band)" for each in panel["bands"]]
+        title = f"{panel['title']}: " if panel["title"] else ""
+        panels.append(f"  {title}{_axis(panel['y'])} over {_axis(panel['x'])}: {', '.join(drawn)}")
+    return "\n".join([chart["title"], *panels])
+
+
+def _axis(axis: Mapping[str, Any]) -> str:
+    return axis["label"] + (" (log)" if axis["log"] else "")
+
+
+def _write_files() -> None:
+    """Trajectories and a table that commands of the script read."""
+    for name, apart in (("line.tum", 0.0), ("shifted.tum", 0.01)):
+        rows = (f"{time} {time + apart * (time % 3) ** 2} {apart} 0 0 0 0 1\n" for time in range(9))
+        Path(name).write_text("".join(rows), encoding="utf-8")
+    rows = (
+        f"{10 + 0.1 * n:.1f},{0.2 * n:.2f},{1 + 0.1 * n:.2f},{2 + (n % 3) * 0.01:.2f}" for n in range(40)
+    )
+    head = "time_s,x_m,y_m,speed_mps"
+    Path("drive.csv").write_text("\n".join([head, *rows]) + "\n", encoding="utf-8")

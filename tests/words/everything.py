@@ -1,0 +1,31 @@
+"""All texts: what commands print, and below it made cases of their sentences."""
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+from tests.claims import limits
+from tests.words import commands
+from tests.words.made import alarms, claims, comparing, diagnosing, plausibility, reporting, tuning
+
+# By command, a case's title is its docstring, and it gives sentences that its command may print.
+MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
+    "check": comparing.CHECKED,
+    "compare": comparing.COMPARED,
+    "diagnose": diagnosing.DIAGNOSED,
+    "info": plausibility.FOUND,
+    "replay": alarms.ALARMED,
+    "report": reporting.REPORTED,
+    "run": claims.CLAIMED,
+    "tune": tuning.TUNED,
+}
+
+
+def everything(folder: Path) -> dict[str, str]:
+    """The text of every command, and of claims; an empty folder takes what commands write."""
+    found = commands.texts(folder)
+    for command, cases in MADE.items():
+        for case in cases:
+            lines = [f"# {case.__doc__}", *case()]
+            found[command] += "\n" + "\n".join(lines) + "\n"
+    found["claims"] = "\n".join(limits.in_words()) + "\n"
+    return found

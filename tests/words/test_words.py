@@ -1,0 +1,53 @@
+"""What a person reads is what was reviewed: the texts in `stored`, and how they are compared."""
+
+from collections.abc import Mapping
+
+import pytest
+
+from pipeline.command_line.group import fuselog
+from tests.words.everything import everything
+from tests.words.texts import differences, path_of
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
+    """The text of every command, as it is now."""
+    return everything(tmp_path_factory.mktemp("words"))
+
+
+@pytest.mark.parametrize("command", [*sorted(fuselog.commands), "claims"])
+def test_a_command_says_what_was_reviewed(command: str, found: Mapping[str, str]) -> None:
+    """A new command comes with lines in the script of `commands`, and with its text."""
+    path = path_of(command)
+    assert command in found, "tests/words/commands.py has no line of it"
+    assert path.exists(), "python -m tests.words --update"
+    told = differences(path.read_text(encoding="utf-8"), found[command])
+    assert not told, f"{told}\nwhere it is meant: python -m tests.words --update"
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("it is 3.141 m", "it is  3.142 m"),
+        ("0.2 (─── 1)", "0.3 (─ 1)"),  # either side of a border of rounding
+        ("1,234.5 and 2e-07", "1,234.6 and 3e-07"),
+    ],
+)
+def test_texts_that_say_the_same(before: str, after: str) -> None:
+    assert not differences(before, after)
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("it is 3.141 m", "it is 3.141 s"),
+        ("it is 3.141 m", "it is 3.151 m"),
+        ("it is 3.141 m", "it is -3.141 m"),
+        ("5 of 6 runs", "6 of 6 runs"),
+        ("robot1", "robot2"),
+        ("a\nb", "b\na"),
+        ("a\nb", "a"),
+    ],
+)
+def test_texts_that_differ(before: str, after: str) -> None:
+    assert differences(before, after)
