@@ -57,7 +57,7 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
             found = outer - 2 * phases[begin + m : end + m]
             if lost is not None:
                 found = found[lost[begin + 2 * m : end + 2 * m] == lost[begin:end]]
-            squares[place] += found @ found
+            squares[place] += np.square(found).sum()
             pairs[place] += len(found)
     with np.errstate(divide="ignore", invalid="ignore"):
         deviations = np.sqrt(squares / (2.0 * multiples**2 * pairs))
