@@ -11,6 +11,7 @@ from pipeline.command_line.options import (
     ANY_PATH,
     LOG_OR_FOLDER,
     PICTURE,
+    RESULT,
     TIMELINE,
     Seconds,
     gap_option,
@@ -42,6 +43,52 @@ def info(log: Path, is_all: bool, recover: bool, as_json: bool) -> None:
     from pipeline.logs.information import show_log
 
     show_log(log, is_all=is_all, recover=recover, as_json=as_json)
+
+
+@command(
+    "Say what noise sensors at rest have, with intervals.",
+    "fuselog noise rest.mcap",
+    "fuselog noise rest.mcap --topic /imu --out noise",
+)
+@click.argument("log", type=ANY_PATH)
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="TOPIC|TOPIC.FIELD",
+    help="A topic, or one of its fields (repeatable) [default: all inertial units].",
+)
+@click.option(
+    "--sheet",
+    multiple=True,
+    metavar="FIELD=VALUE UNIT",
+    help="What a data sheet states, to compare (repeatable); 'one-sided' behind it is of a density.",
+)
+@click.option(
+    "--tau",
+    "taus",
+    multiple=True,
+    type=click.FloatRange(min=0, min_open=True),
+    help="Also say the Allan deviation at this time in s (repeatable).",
+)
+@click.option(
+    "--out",
+    type=RESULT,
+    help="A result folder to write: curves, tables, and the numbers for fuselog, Kalibr, PX4, GTSAM and "
+    "robot_localization.",
+)
+@recover_option
+@json_option
+def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options: Any) -> None:
+    """Say what noise sensors have by LOG, of a unit at rest: white noise, walk and more.
+
+    By maximum likelihood, with intervals; the Allan deviation is measured beside it, and where the model
+    leaves it, that is said. LOG may also be what imu_utils or allan_variance_ros wrote: what its numbers
+    mean is said.
+    """
+    from pipeline.sensing.command import show_noise
+
+    show_noise(log, list(topics), _pairs("--sheet", sheet), **options)
 
 
 @command(

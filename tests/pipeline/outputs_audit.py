@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import click
+import numpy as np
 import rerun as rr
 from mcap.writer import Writer
 from PIL import Image
@@ -20,6 +21,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from pipeline.command_line.group import fuselog
 from pipeline.command_line.options import Output
+from recorders.log import make_stream, schemas, write_log
 from tests.pipeline.conftest import MRCLAM, run_here
 
 AIS = (
@@ -47,6 +49,7 @@ QUICK = {
     "diagnose": "diagnose run.mcap -e ekf",
     "run": "run dead.toml --runs 1",
     "sweep": "sweep dead.toml --over duration_s=1,2 --runs 1",
+    "noise": "noise rest.mcap",
     "report": "report result",
     "view": "view run.mcap",
     "export": "export run.mcap --to csv",
@@ -141,6 +144,19 @@ SETTINGS = {
 
 def prepare() -> None:
     """Write the inputs of all commands here."""
+    noise = np.random.default_rng(1).normal(size=500)
+    write_log(
+        "rest.mcap",
+        [
+            make_stream(
+                "/range",
+                schemas.RANGE,
+                range(0, 25 * 10**9, 5 * 10**7),
+                target_id=[1] * 500,
+                range_m=noise,
+            )
+        ],
+    )
     Path("dead.toml").write_text(EXPERIMENT)
     Path("settings.toml").write_text("")
     Path("line.tum").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in range(9)))

@@ -1,0 +1,81 @@
+"""The overlapping Allan deviation, and intervals from the degrees of freedom that a model gives it.
+
+NIST SP 1065 has the definitions. Degrees of freedom are exact for any sum of Gaussian terms: with M
+second differences of autocovariance g, they are M^2 g_0^2 / sum over |k| < M of (M - |k|) g_k^2.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pipeline.sensing.terms import Terms
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+PER_DECADE = 8
+_BLOCK = 1 << 16
+_FULL = 1 << 17  # samples, from which on degrees of freedom are those of a grid of 1000 a window
+
+
+class Curve(NamedTuple):
+    """An Allan deviation: times (n,), deviations (n,), and how many differences (n,) each is of."""
+
+    taus_s: Floats
+    deviations: Floats
+    pairs: Integers
+
+
+def multiples_of(count: int) -> Integers:
+    """Return at how many samples the curve of `count` of them is looked at, up to a third of all."""
+    decades = np.log10(max(count // 3, 1))
+    spread = np.logspace(0, decades, int(PER_DECADE * decades) + 1)
+    return np.unique(np.floor(spread + 1e-9).astype(np.int64))
+
+
+def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve:
+    """The overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
+
+    Only pairs of whole windows count.
+
+    Args:
+        values: the samples, in any unit, on a grid without gaps.
+        step_s: the grid's step.
+        multiples: (m,) the lengths of windows, in samples.
+    """
+    is_there = np.isfinite(values)
+    first = values[is_there][:1]
+    phases = np.zeros(len(values) + 1)
+    np.cumsum(np.where(is_there, values - first, 0.0), out=phases[1:])
+    lost = None if is_there.all() else np.concatenate([[0], np.cumsum(~is_there)])
+    squares, pairs = np.zeros(len(multiples)), np.zeros(len(multiples), np.int64)
+    for place, m in enumerate(multiples.tolist()):
+        for begin in range(0, len(values) - 2 * m + 1, _BLOCK):
+            end = min(begin + _BLOCK, len(values) - 2 * m + 1)
+            outer = phases[begin + 2 * m : end + 2 * m] + phases[begin:end]
+            found = outer - 2 * phases[begin + m : end + m]
+            if lost is not None:
+                found = found[lost[begin + 2 * m : end + 2 * m] == lost[begin:end]]
+            squares[place] += np.square(found).sum()
+            pairs[place] += len(found)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        deviations = np.sqrt(squares / (2.0 * multiples**2 * pairs))
+    return Curve(np.asarray(multiples * step_s, float), deviations, pairs)
+
+
+def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -> float:
+    """Return the degrees of freedom of an Allan variance of `pairs` differences, by its terms."""
+    coarser = max(1, multiple // 1000) if pairs + 2 * multiple > _FULL else 1
+    multiple, pairs, step_s = multiple // coarser, max(1, pairs // coarser), step_s * coarser
+    g = terms.autocovariance(multiple, step_s, pairs)
+    weights = 2.0 * (pairs - np.arange(len(g)))
+    weights[0] = pairs
+    return float(pairs**2 * g[0] ** 2 / (weights @ g**2))
+
+
+def interval(deviations: Floats, degrees: Floats, confidence: float = 0.95) -> tuple[Floats, Floats]:
+    """Return where the true deviations (n,) lie with a confidence, by chi-square."""
+    tail = (1 - confidence) / 2
+    low = deviations * np.sqrt(degrees / chi2.ppf(1 - tail, degrees))
+    return low, deviations * np.sqrt(degrees / chi2.ppf(tail, degrees))

@@ -1,0 +1,59 @@
+"""The command `fuselog noise`: it prints what noise sensors have, and writes the result folder."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pipeline.output.outputs import check_outputs
+from pipeline.output.terminal import print_json, print_table, say, status
+from pipeline.sensing.foreign_files import explained
+from pipeline.sensing.noise import noise
+from recorders.errors import BadInput
+from recorders.log import open_log
+from replay.engine.streams.sources import LogSource
+
+
+def show_noise(
+    log: Path,
+    topics: Sequence[str],
+    sheet: Mapping[str, str],
+    *,
+    taus: Sequence[float],
+    out: Path | None,
+    recover: bool,
+    as_json: bool,
+) -> None:
+    """Print a table of numbers with intervals, then sentences; of a file of others, what it means."""
+    sentences = explained(log)
+    if sentences:
+        if out is not None or topics or sheet or taus:
+            raise BadInput(
+                f"{log}: holds another tool's numbers and no samples; give it without options"
+            )
+        if as_json:
+            print_json({"path": str(log), "notes": sentences})
+        else:
+            for sentence in sentences:
+                say(sentence)
+        return
+    check_outputs(out, None, {"log": [log]})
+    with status() as show:
+        show("searching for the likeliest noise of each column")
+        found = noise(LogSource(open_log(log, recover=recover)), topics, sheet=sheet, taus=taus)
+    written = [str(found.save(out).folder)] if out is not None else []
+    table = found.table
+    if as_json:
+        numbers = table.to_dict("records")
+        curves = found.curves.to_dict("list")
+        print_json(
+            {
+                "log": str(log),
+                "numbers": numbers,
+                "curves": curves,
+                "notes": found.notes,
+                "written": written,
+            }
+        )
+        return
+    print_table(("column", "term", "value", "95 % from", "to"), table.to_numpy().tolist())
+    for sentence in [*found.notes, *written]:
+        say(sentence)

@@ -1,0 +1,88 @@
+"""Files of noise that imu_utils and allan_variance_ros wrote: what their numbers are, and in what unit.
+
+imu_utils states `gyr_n` as the root of the rate times the Allan deviation at 1 s, a standard deviation
+per sample, although its README says rad/s/sqrt(Hz); `gyr_w` is the least of its curve and no walk.
+allan_variance_ros differences neighbouring bins that overlap, and its curve of a gyro is in deg/s.
+"""
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+_MOST_BYTES = 1 << 16
+_NUMBER = r"\s*:\s*([-+.\deE]+)"
+
+
+def explained(path: Path) -> list[str]:
+    """Return what the numbers of a file of theirs mean, in sentences; none of any other file."""
+    if path.suffix not in (".yaml", ".yml", ".txt") or not path.is_file():
+        return []
+    text = path.read_bytes()[:_MOST_BYTES].decode(errors="replace")
+    if "gyr_n" in text and "acc_w" in text:
+        return [f"{path}: {each}" for each in _of_imu_utils(path, text)]
+    if "accelerometer_noise_density" in text and "gyroscope_random_walk" in text:
+        return [
+            f"{path}: is Kalibr's imu.yaml, as allan_variance_ros writes it: N in unit/sqrt(Hz) and K "
+            "in unit/s/sqrt(Hz), continuous; Kalibr makes them discrete by update_rate",
+            f"{path}: allan_variance_ros reads N off a line over fixed times up to 10 s and differences "
+            "neighbours of overlapping bins; it states no interval: give fuselog noise the recording",
+        ]
+    if path.suffix == ".txt" and re.search(r"_(gyr|acc)_[xyzt]$", path.stem):
+        what = (
+            "averaging times in s"
+            if path.stem.endswith("t")
+            else "an Allan deviation, of a gyro in deg/h"
+        )
+        return [f"{path}: is a column of imu_utils: {what}; it states no interval"]
+    return []
+
+
+def _of_imu_utils(path: Path, text: str) -> list[str]:
+    sentences = [
+        "is of imu_utils; its gyr_n and acc_n are called rad/s/sqrt(Hz) in its README, and its code "
+        "writes sqrt(rate) times the Allan deviation at 1 s: a standard deviation per sample",
+        "its gyr_w and acc_w are the least of its curves (a bias instability), in the samples' unit: "
+        "they are no random walk, though used as one",
+    ]
+    average = re.search(rf"Gyr:.*?avg-axis:.*?gyr_n{_NUMBER}", text, re.DOTALL)
+    read = _deviation_at_1_s(path)
+    if average and read and (stated := _number(average[1])) > 0:
+        factor = stated / read
+        verdict = (
+            "is that very deviation: N in rad/s/sqrt(Hz), continuous"
+            if 0.8 < factor < 1.25
+            else f"is {factor:.4g} times that, sqrt of a rate of {factor**2:.4g} Hz: divide by "
+            f"{factor:.4g} for N in rad/s/sqrt(Hz)"
+        )
+        sentences.append(
+            f"its curves beside it have {read:.6g} rad/s at 1 s, mean of the axes; gyr_n {stated:.6g} "
+            f"{verdict}"
+        )
+    else:
+        sentences.append("without its curves beside it nothing tells which convention these follow")
+    return sentences
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _deviation_at_1_s(path: Path) -> float | None:
+    """The mean Allan deviation at 1 s of the gyro's axes, in rad/s, of the curves beside a file."""
+    name = path.name.partition("_imu_param")[0]
+    times = path.with_name(f"data_{name}_gyr_t.txt")
+    curves = [path.with_name(f"data_{name}_gyr_{axis}.txt") for axis in "xyz"]
+    if not times.is_file() or not all(map(Path.is_file, curves)):
+        return None
+    try:
+        taus_s = np.loadtxt(times, ndmin=1)
+        found = [np.loadtxt(curve, ndmin=1) for curve in curves]
+        read = [np.exp(np.interp(0.0, np.log(taus_s), np.log(each))) for each in found]
+    except ValueError:
+        return None
+    return float(np.mean(read)) * math.pi / 180 / 3600

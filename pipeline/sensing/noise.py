@@ -1,0 +1,226 @@
+"""The noise of a sensor at rest: its terms with intervals, its Allan deviation, and what to be told.
+
+Begin here: `noise` goes through the columns of a log's topics, `_analysed` through one column.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.api.planning import Log, sources_of
+from pipeline.sensing import preparing
+from pipeline.sensing.allan import allan_deviation, degrees_of_freedom, interval, multiples_of
+from pipeline.sensing.fitting import choose, profile_interval, walk_below
+from pipeline.sensing.outcome import MISFIT, ColumnNoise, Number, SensorNoise
+from pipeline.sensing.preparing import Drift, Grid, block_means, samples_of
+from pipeline.sensing.units import parse_sheet, unit_of
+from recorders.errors import BadInput, choices
+from recorders.log import Stream
+
+Floats = NDArray[np.float64]
+_DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times
+_FEWEST_DEGREES = 3.0
+
+
+def noise(
+    log: Log,
+    topics: str | Iterable[str] = (),
+    *,
+    sheet: Mapping[str, str] | None = None,
+    taus: Iterable[float] = (),
+) -> SensorNoise:
+    """Say what noise sensors at rest have, with intervals: by maximum likelihood, and Allan deviations.
+
+    Args:
+        log: a path, a log that was opened, or a recording, of a unit at rest.
+        topics: which, as `/imu` or, for one field, `/imu.turn_rate_radps`; by default all inertial
+            units, or the only topic that has numbers.
+        sheet: what a data sheet states, by the name of a field: `{"turn_rate_radps": "0.007
+            deg/s/sqrt(Hz)"}`.
+        taus: also say the Allan deviation at these times, in s.
+
+    Raises BadInput where a unit moves, the log is too short, a column is constant, stamps go back, too
+    many messages are lost, a time is beyond the log's third, or a unit is another quantity's.
+    """
+    (source,) = _one(sources_of(log))
+    stated = {name: (text, *parse_sheet(name, text)) for name, text in (sheet or {}).items()}
+    wanted = [topics] if isinstance(topics, str) else list(topics)
+    found: list[ColumnNoise] = []
+    for topic, fields in _chosen(source, wanted).items():
+        stream = source.read([topic])[topic]
+        grid = preparing.grid_of(stream)
+        for name in fields or _numbers(stream):
+            values = np.asarray(stream[name], float).reshape(len(stream), -1)
+            for place, column in enumerate(values.T):
+                if np.isfinite(column).any():
+                    component = "xyz"[place] if values.shape[1] == 3 else str(place)
+                    where = topic, name, component if stream[name].ndim > 1 else ""
+                    found.append(_analysed(where, column, grid, stated.get(name), list(taus)))
+    unknown = set(stated) - {each.field for each in found}
+    if unknown:
+        name = min(unknown)
+        raise BadInput(f"--sheet {name}: {choices(name, sorted({each.field for each in found}))}")
+    return SensorNoise(source.name, found)
+
+
+def _one(sources: Sequence[Any]) -> Sequence[Any]:
+    if len(sources) != 1:
+        raise BadInput(f"{len(sources)} logs: the noise of one log is looked at at a time")
+    return sources
+
+
+def _chosen(source: Any, wanted: Sequence[str]) -> dict[str, list[str]]:
+    """The topics and, where they are named, their fields."""
+    chosen: dict[str, list[str]] = {}
+    for text in wanted:
+        topic, _, name = (text, "", "") if text in source.topics else text.rpartition(".")
+        if topic not in source.topics:
+            raise BadInput(f"{source.name}: has no topic {text}; {choices(text, list(source.topics))}")
+        if name and name not in _numbers(source.empty(topic)):
+            known = _numbers(source.empty(topic))
+            raise BadInput(f"{topic}: has no numbers {name}; {choices(name, known)}")
+        chosen.setdefault(topic, []).extend([name] if name else [])
+    if wanted:
+        return chosen
+    usable = {topic: _numbers(source.empty(topic)) for topic in source.topics}
+    units = [topic for topic, names in usable.items() if "specific_force_mps2" in names]
+    candidates = units or [topic for topic, names in usable.items() if names]
+    if not candidates or (len(candidates) > 1 and not units):
+        raise BadInput(
+            f"{source.name}: has no inertial unit; say with --topic which of: {', '.join(candidates)}"
+        )
+    return {topic: [] for topic in candidates}
+
+
+def _numbers(stream: Stream) -> list[str]:
+    """The fields that are real numbers and no covariances."""
+    return [
+        name
+        for name, column in stream.columns.items()
+        if column.dtype.kind == "f" and "covariance" not in name
+    ]
+
+
+def _analysed(
+    where: tuple[str, str, str],
+    column: Floats,
+    grid: Grid,
+    stated: tuple[str, str, float] | None,
+    taus_s: Sequence[float],
+) -> ColumnNoise:
+    topic, name, component = where
+    title = f"{topic}.{name}" + (f".{component}" if component else "")
+    unit = unit_of(name) or "unit"
+    values, step_s, notes = preparing.on_grid(column, grid), grid.step_s, []
+    preparing.check_at_rest(title, name, values, step_s)
+    if grid.lost:
+        notes.append(f"{100 * grid.lost:.2g} % of the messages are lost; gaps are gone by their stamps")
+    if line := preparing.find_vibration(values, step_s):
+        notes.append(f"vibrates at {line[0]:.4g} Hz with {line[1]:.2g} {unit}; the numbers include it")
+    values = values - values[np.isfinite(values)][0]
+    drift = preparing.find_drift(values, step_s)
+    if drift is not None:
+        notes.append(_drifts(drift, unit))
+        values = values - drift.over(step_s * np.arange(len(values), dtype=float))
+    block = preparing.white_block(values, step_s)
+    samples = samples_of(block_means(values, block), step_s * block)
+    if block > preparing.fewest_block(len(values)):
+        notes.append(
+            f"samples are correlated; averaged over {block} ({block * step_s:.3g} s), they are white"
+        )
+    fitted = choose(samples)
+    numbers = {
+        each: Number(getattr(fitted.terms, each), *profile_interval(samples, fitted, each))
+        for each in fitted.free
+    }
+    if not {"walk", "markov"} & set(fitted.free):
+        numbers["walk"] = Number(0.0, 0.0, walk_below(samples, fitted))
+        notes.append(f"no walk found; K < {numbers['walk'].high:.2g} {unit}/sqrt(s)")
+    if drift is not None and not drift.offset:
+        reach = 1.96 * drift.rate_sigma
+        numbers["ramp"] = Number(drift.rate, drift.rate - reach, drift.rate + reach)
+    multiples = multiples_of(len(values))
+    measured = allan_deviation(values, step_s, multiples)
+    degrees = np.array(
+        [
+            degrees_of_freedom(fitted.terms, step_s, int(m), int(pairs)) if pairs else np.nan
+            for m, pairs in zip(multiples, measured.pairs, strict=True)
+        ]
+    )
+    found = ColumnNoise(*where, step_s, block, numbers, fitted, measured, degrees, ())
+    notes += [*_misfits(found), *_read_at(found, taus_s, values), _least(found, unit)]
+    if stated is not None:
+        notes.append(_against(stated, numbers, unit))
+    return replace(found, notes=[f"{title}: {each}" for each in notes])
+
+
+def _drifts(drift: Drift, unit: str) -> str:
+    if drift.offset:
+        return (
+            f"warms up: {drift.offset:.2g} {unit} that decays in {drift.time_s:.3g} s, and "
+            f"{drift.rate:.2g} {unit}/s; taken out of all numbers (log-likelihood +{drift.gain:.3g})"
+        )
+    return (
+        f"drifts by {drift.rate:.3g} {unit}/s; taken out of all numbers "
+        f"(log-likelihood +{drift.gain:.3g})"
+    )
+
+
+def _misfits(found: ColumnNoise) -> list[str]:
+    """Say where the fitted model's curve leaves the measured one's interval."""
+    low, high = interval(found.curve.deviations, found.degrees, _DOUBTFUL)
+    model, taus_s = found.model_deviations, found.curve.taus_s
+    is_seen = (found.degrees > _FEWEST_DEGREES) & (taus_s > 0.99 * found.block * found.step_s)
+    beyond = is_seen & ((model < low) | (model > high))
+    if not beyond.any():
+        return []
+    ratio = model / found.curve.deviations
+    worst = int(np.argmax(np.where(beyond, np.abs(np.log(ratio)), 0.0)))
+    return [
+        f"{MISFIT}{found.fitted.words} do not explain it: at {taus_s[worst]:.3g} s the model's Allan "
+        f"deviation is {ratio[worst]:.2g} times the measured one, outside its 99.9 % interval at "
+        f"{int(beyond.sum())} of {int(is_seen.sum())} times; do not trust these numbers there"
+    ]
+
+
+def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> list[str]:
+    longest_s = len(values) // 3 * found.step_s
+    said = []
+    for tau_s in taus_s:
+        m = round(tau_s / found.step_s)
+        if not 1 <= m <= len(values) // 3:
+            raise BadInput(
+                f"--tau {tau_s:g}: the log has averages over {found.step_s:.3g} to {longest_s:.4g} s, a "
+                "third of its length; give a time between"
+            )
+        at = allan_deviation(values, found.step_s, np.array([m]))
+        degrees = degrees_of_freedom(found.fitted.terms, found.step_s, m, int(at.pairs[0]))
+        low, high = interval(at.deviations, np.array([degrees]))
+        said.append(
+            f"Allan deviation at {at.taus_s[0]:.4g} s: {at.deviations[0]:.4g} "
+            f"({low[0]:.4g} to {high[0]:.4g}) {unit_of(found.field) or 'unit'}"
+        )
+    return said
+
+
+def _least(found: ColumnNoise, unit: str) -> str:
+    """The least of the curve, which data sheets call bias instability, in both conventions."""
+    least = int(np.nanargmin(np.where(found.degrees > _FEWEST_DEGREES, found.curve.deviations, np.inf)))
+    value = float(found.curve.deviations[least])
+    return (
+        f"least Allan deviation {value:.3g} {unit} at {found.curve.taus_s[least]:.3g} s (as flicker "
+        f"noise, divided by .664, {value / 0.664283:.3g}); white noise and a walk have a least as well"
+    )
+
+
+def _against(stated: tuple[str, str, float], numbers: Mapping[str, Number], unit: str) -> str:
+    text, term, value = stated
+    if term not in numbers:
+        return f"the sheet states {text}; no {term} was found to compare"
+    yours = Number(*(each / value for each in numbers[term]))
+    ends = f"{yours.low:.3g} to {yours.high:.3g}"
+    kind = "sqrt(Hz)" if term == "white" else "sqrt(s)"
+    return f"stated {text} ({value:.4g} {unit}/{kind}), yours {yours.value:.3g} ({ends}) times that"

@@ -1,0 +1,182 @@
+"""What is found of the noise of sensors: tables, curves, sentences, a result folder."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pipeline.api.api import ResultFolder
+from pipeline.output.charts import Axis, Chart, Panel, band, curve
+from pipeline.output.outputs import check_folder
+from pipeline.output.results import Outcome, result_folder, write_outcome
+from pipeline.sensing.allan import Curve, interval
+from pipeline.sensing.exports import FILES, Densities, Density
+from pipeline.sensing.fitting import Fit
+from pipeline.sensing.units import unit_of
+
+Floats = NDArray[np.float64]
+MISFIT = "misfit: "  # what a sentence has that whoever uses the numbers reads first
+_TERMS = {  # what a table says of each number: the name of its field, and its unit beside the column's
+    "white": "white noise N ({}/sqrt(Hz))",
+    "walk": "random walk K ({}/sqrt(s))",
+    "markov": "Gauss-Markov s ({})",
+    "markov_time_s": "Gauss-Markov T (s)",
+    "quantisation": "quantised angle Q ({} s)",
+    "ramp": "ramp R ({}/s)",
+}
+
+
+class Number(NamedTuple):
+    """A number of a noise model and its 95 % interval; of a walk that was not found the value is 0."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnNoise:
+    """Holds the noise of one column.
+
+    Attributes:
+        topic, field, component: where it stands; no component of a scalar.
+        step_s: the mean time between samples.
+        block: over how many samples it was averaged before the likelihood.
+        numbers: by the names of `Terms`, and `ramp`.
+        fitted: the model that was chosen.
+        curve: the Allan deviation that was measured.
+        degrees: (n,) its degrees of freedom.
+        notes: sentences.
+    """
+
+    topic: str
+    field: str
+    component: str
+    step_s: float
+    block: int
+    numbers: Mapping[str, Number]
+    fitted: Fit
+    curve: Curve
+    degrees: Floats
+    notes: Sequence[str]
+
+    @property
+    def name(self) -> str:
+        """The column as sentences name it."""
+        return f"{self.topic}.{self.field}" + (f".{self.component}" if self.component else "")
+
+    @property
+    def model_deviations(self) -> Floats:
+        """The Allan deviation (n,) of the fitted model at the curve's times."""
+        return np.sqrt(self.fitted.terms.allan_variance(self.curve.taus_s, self.step_s))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SensorNoise:
+    """Holds the noise of a log's columns.
+
+    Attributes:
+        name: of the log.
+        columns: one after the other.
+    """
+
+    name: str
+    columns: Sequence[ColumnNoise] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return "\n".join([self.table.to_string(index=False), *self.notes])
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row per number: column, term with its unit, value, 95 % interval."""
+        rows = [
+            (column.name, _TERMS[name].format(unit_of(column.field) or "unit"), *number)
+            for column in self.columns
+            for name, number in column.numbers.items()
+        ]
+        return pd.DataFrame(rows, columns=["column", "term", "value", "low", "high"])
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences on all columns."""
+        return [note for column in self.columns for note in column.notes]
+
+    @property
+    def densities(self) -> Densities:
+        """What other programs are told: N and K of each field, the largest of its axes.
+
+        Of Gauss-Markov noise without a walk, the walk is the one that begins as it does: s sqrt(2 / T).
+        """
+        found: dict[str, Density] = {}
+        for column in self.columns:
+            terms = column.fitted.terms
+            walk = max(terms.walk, terms.markov * math.sqrt(2 / terms.markov_time_s))
+            before = found.get(column.field, Density(0.0, 0.0, column.step_s))
+            largest = max(before.white, terms.white), max(before.walk, walk)
+            found[column.field] = Density(*largest, column.step_s)
+        doubts = [note for note in self.notes if MISFIT in note]
+        return Densities(self.columns[0].topic, found, doubts)
+
+    @property
+    def curves(self) -> pd.DataFrame:
+        """A row per column and time: the deviation, its 95 % interval, the model's."""
+        tables = []
+        for column in self.columns:
+            low, high = interval(column.curve.deviations, column.degrees)
+            values = {
+                "tau_s": column.curve.taus_s,
+                "deviation": column.curve.deviations,
+                "low": low,
+                "high": high,
+                "model": column.model_deviations,
+                "degrees_of_freedom": column.degrees,
+            }
+            tables.append(pd.DataFrame({"column": column.name, **values}))
+        return pd.concat(tables, ignore_index=True)
+
+    @property
+    def chart(self) -> Chart:
+        """The measured curves, their intervals, and the models'."""
+        panels = []
+        for column in self.columns:
+            low, high = interval(column.curve.deviations, column.degrees)
+            taus_s = column.curve.taus_s
+            panels.append(
+                Panel(
+                    title=column.name,
+                    x=Axis(label="averaging time (s)", log=True),
+                    y=Axis(label=f"Allan deviation ({unit_of(column.field) or 'unit'})", log=True),
+                    bands=[band("95 %", taus_s, low, high)],
+                    series=[
+                        curve("measured", taus_s, column.curve.deviations, "line+markers"),
+                        curve("fitted model", taus_s, column.model_deviations, "dashed"),
+                    ],
+                )
+            )
+        title = "slopes: -1 quantised angle, -1/2 white noise, 0 least, +1/2 random walk, +1 ramp"
+        return Chart(title=title, panels=panels, columns=min(3, len(panels)))
+
+    def save(self, folder: str | Path) -> ResultFolder:
+        """Write tables, the curves' figure, and the numbers as other programs read them.
+
+        Raises BadInput where something else than a result of ours is in the place.
+        """
+        place = Path(folder)
+        check_folder(place, {"log": [Path(self.name)]})
+        outcome = Outcome(tables={"noise": self.table, "curves": self.curves})
+        outcome.figures["allan"] = self.chart
+        for column in self.columns:
+            for name, number in column.numbers.items():
+                outcome.measure(f"noise.{name}.{column.name.replace('.', '_')}", *number)
+        settings = {"title": f"Noise of {self.name}", "logs": [self.name], "notes": self.notes}
+        with result_folder(place) as part:
+            for name, text in FILES.items():
+                written = text(self.densities)
+                if written:
+                    (part / name).write_text(written, encoding="utf-8")
+            return ResultFolder(place, write_outcome(part, "noise", settings, outcome))

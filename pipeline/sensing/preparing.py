@@ -1,0 +1,200 @@
+"""Recordings at rest as noise is read from them: on a grid, still, without the drift of warming up."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from pipeline.sensing.fitting import fit
+from pipeline.sensing.likelihood import Samples, likelihood, residuals
+from pipeline.sensing.units import unit_of
+from recorders.errors import BadInput
+from recorders.log import Stream
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+FEWEST, SHORTEST_S = 500, 20.0
+MOST = 1 << 16  # samples that a likelihood is of; of more, the means of blocks
+_GAP = 1.75  # times the median step: a longer one is a gap
+_MOST_LOST = 0.4
+# By how much means over a second of a unit at rest may spread, by its unit: no sensor drifts so far.
+_STILL = {"rad/s": 0.03, "m/s^2": 0.3}
+_DRIFT_GAIN = 4.6  # of the log-likelihood, by a line and an exponential: by chance once in a hundred
+_IMPROBABLE = 1e-4
+_DRIFT_SAMPLES = 4096
+
+
+class Grid(NamedTuple):
+    """The stamps of a topic as a grid: its step, and which of its places (n,) the messages have."""
+
+    step_s: float
+    places: Integers
+    rows: Integers
+
+    @property
+    def size(self) -> int:
+        """How many places there are."""
+        return int(self.places[-1]) + 1
+
+    @property
+    def lost(self) -> float:
+        """The share of messages that are not there."""
+        return 1 - len(self.places) / self.size
+
+
+class Drift(NamedTuple):
+    """What a column drifts by: a rate, and an offset that decays; and what they gain in likelihood."""
+
+    rate: float
+    rate_sigma: float
+    offset: float
+    time_s: float
+    gain: float
+
+    def over(self, times_s: Floats) -> Floats:
+        """The drift (n,) at times since the first sample."""
+        return self.rate * times_s + self.offset * np.exp(-times_s / self.time_s)
+
+
+def grid_of(stream: Stream) -> Grid:
+    """Lay a topic's stamps on a grid; the step is the mean of those that are no gaps.
+
+    Raises BadInput where there are too few messages, stamps go back, or too many are lost.
+    """
+    stamps = stream.publish_time_ns
+    span_s = (stamps[-1] - stamps[0]) * 1e-9 if len(stamps) else 0.0
+    if len(stamps) < FEWEST or span_s < SHORTEST_S:
+        raise BadInput(
+            f"{stream.topic}: has {len(stamps)} messages in {span_s:.3g} s; noise takes {FEWEST} in "
+            f"{SHORTEST_S:.0f} s at least, and a walk an hour at rest"
+        )
+    written = np.diff(stamps[np.argsort(stream.position, kind="stable")])
+    if (written < 0).any():
+        raise BadInput(
+            f"{stream.topic}: its stamps go back {int((written < 0).sum())} times; record it by one "
+            "clock, or write it in order with fuselog cut"
+        )
+    rows = np.flatnonzero(np.diff(stamps, prepend=stamps[0] - 1) > 0)
+    steps = np.diff(stamps[rows]) * 1e-9
+    median_s = float(np.median(steps))
+    is_gap = steps > _GAP * median_s
+    step_s = float(steps[~is_gap].mean())
+    counts = np.where(is_gap, np.maximum(np.rint(steps / step_s), 2), 1).astype(np.int64)
+    grid = Grid(step_s, np.concatenate([[0], np.cumsum(counts)]), rows)
+    if grid.lost > _MOST_LOST:
+        raise BadInput(
+            f"{stream.topic}: {100 * grid.lost:.0f} % of it is lost, in {int(is_gap.sum())} gaps; "
+            "record again, or take a whole part with fuselog cut"
+        )
+    return grid
+
+
+def on_grid(values: Floats, grid: Grid) -> Floats:
+    """Samples (n,) at their places on the grid; NaN where one was lost."""
+    found = np.full(grid.size, np.nan)
+    found[grid.places] = values[grid.rows]
+    return found
+
+
+def check_at_rest(name: str, field: str, values: Floats, step_s: float) -> None:
+    """Raise BadInput where samples on a grid are constant, or those of a unit that moves."""
+    there = values[np.isfinite(values)]
+    if len(there) < FEWEST:
+        raise BadInput(f"{name}: has {len(there)} numbers; noise takes {FEWEST} at least")
+    if np.ptp(there) == 0:
+        raise BadInput(f"{name}: is constant, {there[0]:.6g}; a sensor that is on has noise")
+    means = block_means(values, max(1, round(1 / step_s)))
+    spread, most = float(np.nanstd(means)), _STILL.get(unit_of(field), math.inf)
+    size = max(20, len(values) // 200)
+    blocks = np.diff(values)[: (len(values) - 1) // size * size].reshape(-1, size)
+    with np.errstate(invalid="ignore"):
+        activity = np.sqrt(np.nanmean(blocks**2, axis=1))
+    busiest = int(np.nanargmax(activity))
+    if spread > most or activity[busiest] > 4 * np.nanmedian(activity) > 0:
+        at_s = busiest * size * step_s
+        raise BadInput(
+            f"{name}: the unit moves, most of all {at_s:.0f} s into the log; record it at rest, or take "
+            "the part where it is with fuselog cut"
+        )
+
+
+def block_means(values: Floats, block: int) -> Floats:
+    """Means (m,) of blocks of samples on a grid; NaN where less than half of one is there."""
+    if block == 1:
+        return values
+    blocks = values[: len(values) // block * block].reshape(-1, block)
+    is_there = np.isfinite(blocks)
+    counts = is_there.sum(axis=1)
+    sums = np.where(is_there, blocks, 0.0).sum(axis=1)
+    return np.where(2 * counts >= block, sums / np.maximum(counts, 1), np.nan)
+
+
+def samples_of(values: Floats, step_s: float, regressors: Floats | None = None) -> Samples:
+    """Samples on a grid, NaN where one was lost, as the likelihood takes them."""
+    rows = np.flatnonzero(np.isfinite(values))
+    columns = values[rows, None] if regressors is None else np.column_stack([values, regressors])[rows]
+    # the first value is taken off, that digits are kept
+    return Samples(np.ascontiguousarray(columns - columns[0]), np.diff(rows, prepend=rows[0]), step_s)
+
+
+def find_drift(values: Floats, step_s: float) -> Drift | None:
+    """Return the drift of a sensor that warms up, where a line and an exponential explain enough."""
+    block = -(-len(values) // _DRIFT_SAMPLES)
+    means, step_s = block_means(values, block), step_s * block
+    times_s = (np.arange(len(means)) + 0.5 * (1 - 1 / block)) * step_s
+    span_s = float(times_s[-1])
+    best = fit(samples_of(means, step_s), ("walk",))
+    found = None
+    for share in (math.inf, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4):
+        decay = np.exp(-times_s / (share * span_s))
+        columns = np.stack([times_s] if share == math.inf else [times_s, decay], axis=1)
+        samples = samples_of(means, step_s, columns)
+        drifting = fit(samples, ("walk",))
+        gain = drifting.log_likelihood - best.log_likelihood - (found.gain if found else 0.0)
+        if gain > (_DRIFT_GAIN if found is None or not found.offset else 0.0):
+            said = likelihood(samples, drifting.terms)
+            offset = float(said.coefficients[1]) if share < math.inf else 0.0
+            gain += found.gain if found else 0.0
+            rate, sigma = float(said.coefficients[0]), float(said.sigmas[0])
+            found = Drift(rate, sigma, offset, share * span_s, gain)
+    return found
+
+
+def fewest_block(count: int) -> int:
+    """Return over how many samples to average so that a likelihood has no more than it can take."""
+    return -(-count // MOST)
+
+
+def white_block(values: Floats, step_s: float) -> int:
+    """Return over how many samples to average, so that noise is white beside what drifts.
+
+    A sensor that filters its output correlates neighbours, and a likelihood at its full rate gives too
+    little noise. The residuals of white noise and a walk tell.
+    """
+    block = fewest_block(len(values))
+    while len(values) // (2 * block) >= FEWEST:
+        samples = samples_of(block_means(values, block), step_s * block)
+        white = residuals(samples, fit(samples, ("walk",)).terms)
+        correlation = float(white[1:] @ white[:-1] / (white @ white))
+        if correlation < max(3 / math.sqrt(len(white)), 0.02):
+            break
+        block *= 2
+    return block
+
+
+def find_vibration(values: Floats, step_s: float) -> tuple[float, float] | None:
+    """Return the frequency in Hz and the amplitude of a line in the spectrum, where there is one."""
+    part = values[:MOST]
+    part = np.where(np.isfinite(part), part - np.nanmean(part), 0.0)
+    window = np.hanning(len(part))
+    power = np.abs(np.fft.rfft(part * window)) ** 2
+    width = min(201, len(power) // 4 * 2 + 1)
+    usual = median_filter(power, width) / math.log(2)
+    first = width // 2  # below are drifts
+    line = first + int(np.argmax(power[first:] / usual[first:]))
+    if power[line] < 1.5 * usual[line] * math.log(len(power) / _IMPROBABLE):
+        return None
+    amplitude = 2 * math.sqrt(power[line]) / window.sum()
+    return line / (len(part) * step_s), amplitude

@@ -1,0 +1,73 @@
+"""The terms of a sensor's noise, after IEEE Std 952-1997, annex C: their Allan variances add.
+
+White noise N, random walk K, Gauss-Markov noise of standard deviation s and time T, a quantised angle Q.
+With u the unit of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Terms(NamedTuple):
+    """The noise of one column; a term that is zero is not there."""
+
+    white: float = 0.0
+    walk: float = 0.0
+    markov: float = 0.0
+    markov_time_s: float = 1.0
+    quantisation: float = 0.0
+
+    def allan_variance(self, taus_s: Floats, step_s: float) -> Floats:
+        """The expected Allan variance (n,) of samples every `step_s` at times (n,), exactly."""
+        multiples = np.rint(taus_s / step_s)
+        return self._second_differences(multiples, step_s) / (2 * taus_s**2)
+
+    def autocovariance(self, multiple: int, step_s: float, count: int) -> Floats:
+        """Return the autocovariance, at lags 0, 1, ... below `count`, of the second differences.
+
+        These are of the phases, the sums of samples times `step_s`, at a distance of `multiple` samples:
+        what the Allan variance is the mean square of. Beyond twice that distance only the Gauss-Markov
+        term is left; it ends where it has decayed.
+        """
+        memory = int(40 * self.markov_time_s / step_s) if self.markov else 0
+        lags = np.arange(min(count, 2 * multiple + 2 + memory), dtype=float)
+        near = lags[: 2 * multiple + 2]
+        found = np.zeros(len(lags))
+        found[: len(near)] = self._second_differences(multiple, step_s, near)
+        beyond = lags[len(near) :]
+        if len(beyond):
+            a, power = self._decay(step_s)
+            # all four differences of an exponential, without their cancellation
+            whole = np.expm1(multiple * np.log(a)) ** 4
+            found[len(near) :] = -power * whole * a ** (beyond - 2 * multiple)
+        return found
+
+    def _second_differences(
+        self, multiple: Floats | int, step_s: float, lags: Floats | float = 0.0
+    ) -> Floats:
+        """The autocovariance of second differences as differences of what is summed twice."""
+        far = 2 * np.asarray(multiple)
+        ends = (lags + far, lags - far), (lags + far / 2, lags - far / 2)
+        outer, inner = (sum(self._summed_twice(np.abs(end), step_s) for end in pair) for pair in ends)
+        return np.atleast_1d(-outer + 4 * inner - 6 * self._summed_twice(np.abs(lags), step_s))
+
+    def _summed_twice(self, lag: Floats | float, step_s: float) -> Floats:
+        """What has the autocovariance of the samples, times step_s^2, as second differences."""
+        lag = np.asarray(lag, dtype=float)
+        white = self.white**2 / step_s * lag / 2
+        walk = -(self.walk**2) * step_s * (lag * lag * lag - lag) / 12
+        quantised = -((self.quantisation / step_s) ** 2) * (lag == 0)
+        found = (white + walk + quantised) * step_s**2
+        if self.markov:
+            a, power = self._decay(step_s)
+            slope = (self.markov * step_s) ** 2 * (1 + a) / (2 * (1 - a))
+            found = found + power * a**lag + slope * lag
+        return found
+
+    def _decay(self, step_s: float) -> tuple[float, float]:
+        a = float(np.exp(-step_s / self.markov_time_s))
+        return a, (self.markov * step_s) ** 2 * a / (1 - a) ** 2

@@ -1,0 +1,234 @@
+"""Noise of sensors: the reference sheet's numbers, what is found, said, written and refused."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import fuselog as fl
+from pipeline.sensing.allan import allan_deviation, degrees_of_freedom
+from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
+from pipeline.sensing.likelihood import Samples, likelihood
+from pipeline.sensing.preparing import find_drift, find_vibration, samples_of, white_block
+from pipeline.sensing.terms import Terms
+from pipeline.sensing.units import parse_sheet
+from tests.pipeline.conftest import Said
+
+STEP_S = 0.02
+ALL = Terms(1e-3, 1e-4, 4e-4, 20.0, 2e-5)
+
+
+def unit(seed: int, size: int = 65536, terms: Terms = ALL, step_s: float = STEP_S) -> np.ndarray:
+    """The sheet's simulated unit (n,): white noise, walk, Gauss-Markov noise, quantised angle."""
+    rng = np.random.Generator(np.random.Philox(key=seed))
+    white, walk, markov = (rng.standard_normal(size) for _ in range(3))
+    angle = rng.random(size + 1) - 0.5
+    decay = np.exp(-step_s / terms.markov_time_s)
+    driven = terms.markov * np.sqrt(1 - decay**2) * markov
+    driven[0] = terms.markov * markov[0]
+    walked = np.concatenate([[0.0], np.cumsum(terms.walk * np.sqrt(step_s) * walk)[:-1]])
+    quantised = np.diff(terms.quantisation * np.sqrt(12) * angle) / step_s
+    return terms.white / np.sqrt(step_s) * white + walked + lfilter([1], [1, -decay], driven) + quantised
+
+
+@pytest.fixture(scope="module")
+def walking() -> np.ndarray:
+    """Unit WK, seed 1."""
+    return unit(1, terms=Terms(1e-3, 1e-4))
+
+
+def test_allan_deviation_is_the_sheets() -> None:
+    multiples = np.array([1, 2, 5, 10, 50, 100, 500, 1000, 5000, 10000, 20000])
+    found = allan_deviation(unit(1), STEP_S, multiples)
+    expected = [
+        *(0.00728406572105, 0.00506446640573, 0.00317272205932, 0.00225764014447, 0.00104432521182),
+        *(0.000715291270883, 0.000424044094043, 0.000445851425601, 0.000530059636167),
+        *(0.000786141278771, 0.0013542075859),
+    ]
+    assert found.deviations == pytest.approx(expected, rel=1e-9)
+    degrees = [
+        degrees_of_freedom(ALL, STEP_S, int(m), int(pairs))
+        for m, pairs in zip(multiples, found.pairs, strict=True)
+    ]
+    expected = [
+        *(43137.5, 37545.9, 18957.4, 9796.35, 1974.92, 994.66, 190.765, 81.8306, 11.9316),
+        *(4.75428, 1.62958),
+    ]
+    assert degrees == pytest.approx(expected, rel=5e-6)
+
+
+@pytest.mark.parametrize(
+    ("terms", "expected"),
+    [
+        (Terms(white=1.0), [43690.2, 9706.96, 980.683, 96.0613, 7.67306]),
+        (Terms(walk=1.0), [65535, 6107.13, 606.122, 59.2264, 4.56379]),
+        (Terms(quantisation=1.0), [33704, 33697.1, 33628.4, 32942.8, 26400.7]),
+    ],
+)
+def test_degrees_of_freedom_are_exact(terms: Terms, expected: list[float]) -> None:
+    found = [degrees_of_freedom(terms, STEP_S, m, 65537 - 2 * m) for m in (1, 10, 100, 1000, 10000)]
+    assert found == pytest.approx(expected, rel=5e-6)
+
+
+def test_gaps_count_whole_windows_by_stamps(walking: np.ndarray) -> None:
+    lost = np.random.Generator(np.random.Philox(key=77)).random(65536) < 0.1
+    lost[0] = False
+    values = np.where(lost, np.nan, walking)
+    found = allan_deviation(values, STEP_S, np.array([5]))
+    assert found.pairs[0] == 22797
+    assert found.deviations[0] == pytest.approx(0.00313284159734, rel=1e-9)
+    fitted = fit(samples_of(values, STEP_S), ("walk",))
+    assert fitted.terms[:2] == pytest.approx([9.99584e-4, 1.10109e-4], rel=1e-4)
+
+
+def test_likelihood_is_the_dense_one() -> None:
+    values, steps = unit(1)[:, None].copy(), np.ones(65536, np.int64)
+    found = likelihood(Samples(values, steps, STEP_S), ALL).log_likelihood
+    assert found == pytest.approx(230127.207494, abs=1e-4)
+    without = ALL._replace(quantisation=0.0)
+    found = likelihood(Samples(values, steps, STEP_S), without).log_likelihood
+    assert found == pytest.approx(230088.170998, abs=1e-4)
+    first = likelihood(Samples(values[:200].copy(), steps[:200], STEP_S), ALL)
+    assert first.log_likelihood == pytest.approx(683.303488791, abs=1e-7)
+
+
+def test_the_likeliest_noise_and_its_interval(walking: np.ndarray) -> None:
+    samples = samples_of(walking, STEP_S)
+    found = choose(samples)
+    assert found.free == ("white", "walk")
+    assert (
+        np.log(found.terms[:2]) == pytest.approx(np.log([9.99815291e-4, 1.119811e-4]), abs=1e-4 * 0.0028)
+        or abs(found.terms.walk / 1.119811e-4 - 1) < 1e-4 * 0.1175
+    )
+    assert found.log_likelihood == pytest.approx(231458.393072, abs=1e-4)
+    assert found.sigmas == pytest.approx([0.002765, 0.117495], rel=1e-3)
+    assert profile_interval(samples, found, "white") == pytest.approx(
+        (9.9442081e-4, 1.0052586e-3), rel=1e-5
+    )
+    assert profile_interval(samples, found, "walk") == pytest.approx(
+        (8.9022984e-5, 1.4102172e-4), rel=1e-4
+    )
+
+
+def test_a_walk_that_is_not_there_has_a_bound() -> None:
+    samples = samples_of(unit(3, 8192, Terms(1e-3)), STEP_S)
+    found = choose(samples)
+    assert found.free == ("white",)
+    assert 1e-6 < walk_below(samples, found) < 3e-4
+
+
+def test_bic_tells_a_walk_from_gauss_markov_noise() -> None:
+    kinds = {
+        ("white",): Terms(1e-3),
+        ("white", "walk"): Terms(1e-3, 1e-4),
+        ("white", "markov", "markov_time_s"): Terms(1e-3, 0.0, 6e-4, 60.0),
+    }
+    for free, terms in kinds.items():
+        assert choose(samples_of(unit(7000, 16384, terms, 0.2), 0.2)).free == free
+
+
+def test_warming_up_is_found_and_taken_out(walking: np.ndarray) -> None:
+    times_s = STEP_S * np.arange(len(walking))
+    assert find_drift(walking, STEP_S) is None
+    warming = walking + 0.02 * np.exp(-times_s / 200)
+    assert fit(samples_of(warming, STEP_S), ("walk",)).terms.walk == pytest.approx(1.6267e-4, rel=1e-4)
+    drift = find_drift(warming, STEP_S)
+    assert drift is not None
+    assert drift.gain > 4.6
+    rest = warming - drift.over(times_s)
+    assert fit(samples_of(rest, STEP_S), ("walk",)).terms.walk < 1.3e-4
+
+
+def test_a_filtered_sensor_is_averaged_until_white(walking: np.ndarray) -> None:
+    assert white_block(walking, STEP_S) == 1
+    filtered = np.convolve(walking, [0.25, 0.5, 0.25], "valid")
+    assert white_block(filtered, STEP_S) > 2
+
+
+def test_vibration_is_noticed(walking: np.ndarray) -> None:
+    assert find_vibration(walking, STEP_S) is None
+    shaken = walking + 1e-3 * np.sin(2 * np.pi * 7.3 * STEP_S * np.arange(len(walking)))
+    frequency_hz, amplitude = find_vibration(shaken, STEP_S) or (0.0, 0.0)
+    assert (frequency_hz, amplitude) == pytest.approx((7.3, 1e-3), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("text", "term", "value"),
+    [
+        ("1 deg/sqrt(h)", "white", 2.908882086657e-4),
+        ("1 deg/s/sqrt(Hz)", "white", 0.01745329252),
+        ("1 deg/h/sqrt(h)", "walk", 8.080228018e-8),
+        ("1 deg/s/sqrt(Hz) one-sided", "white", 0.01745329252 / np.sqrt(2)),
+    ],
+)
+def test_units_of_sheets(text: str, term: str, value: float) -> None:
+    assert parse_sheet("turn_rate_radps", text) == (term, pytest.approx(value, rel=1e-9))
+
+
+def test_units_of_sheets_for_accelerometers() -> None:
+    assert parse_sheet("specific_force_mps2", "1 ug/sqrt(Hz)")[1] == pytest.approx(9.80665e-6)
+    assert parse_sheet("specific_force_mps2", "1 m/s/sqrt(h)")[1] == pytest.approx(1 / 60)
+
+
+def rest(size: int = 4096, seconds: float = STEP_S, **changed: np.ndarray) -> fl.Stream:
+    """A unit at rest."""
+    stamps = np.rint(np.arange(size) * seconds * 1e9).astype(np.int64)
+    force = np.stack([unit(seed, size, Terms(1e-2, 1e-3)) for seed in (4, 5, 6)], axis=1)
+    turn = np.stack([unit(seed, size, Terms(1e-3)) for seed in (7, 8, 9)], axis=1)
+    columns = {
+        "specific_force_mps2": force + np.array([0, 0, 9.81]),
+        "turn_rate_radps": turn,
+        "magnetic_field_ut": np.full((size, 3), np.nan),
+    }
+    return fl.make_stream("/imu", fl.schemas.INERTIAL_SAMPLE, stamps, **columns | changed)
+
+
+@pytest.mark.usefixtures("blank_figures")
+def test_the_command_writes_what_others_read(
+    fuselog: Callable[..., Said], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fl.write("rest.mcap", [rest()])
+    said = fuselog(
+        *("noise", "rest.mcap", "--topic", "/imu", "--json", "--out", "noise", "--tau", "1"),
+        *("--sheet", "turn_rate_radps=0.05 deg/s/sqrt(Hz)"),
+    )
+    assert said.code == 0, said.err
+    numbers = {(row["column"], row["term"]): row["value"] for row in said.json["numbers"]}
+    white = max(
+        numbers[f"/imu.turn_rate_radps.{axis}", "white noise N (rad/s/sqrt(Hz))"] for axis in "xyz"
+    )
+    assert white == pytest.approx(1e-3, rel=0.05)
+    assert sum("times that" in note for note in said.json["notes"]) == 3
+    none_found = [note for note in said.json["notes"] if "no walk found; K <" in note]
+    assert sum("turn_rate" in note for note in none_found) == 3
+    px4 = dict(line.split() for line in Path("noise/px4.params").read_text().splitlines()[1:])
+    assert float(px4["EKF2_GYR_NOISE"]) == pytest.approx(10 * white, rel=1e-5)
+    assert f"gyroscope_noise_density: {white:.6g}" in Path("noise/kalibr-imu.yaml").read_text()
+    assert f"setGyroscopeCovariance(I_3x3 * {white**2:.6g})" in Path("noise/gtsam.cpp").read_text()
+    assert json.loads(Path("noise/result.json").read_text())["experiment"] == "noise"
+
+
+def test_bad_input_is_a_sentence() -> None:
+    def refused(stream: fl.Stream, **options: object) -> str:
+        with pytest.raises(fl.BadInput) as raised:
+            fl.noise(fl.Recording([stream]), **options)  # type: ignore[arg-type]
+        return str(raised.value)
+
+    size = 2000
+    moved = rest(size)["turn_rate_radps"].copy()
+    moved[800:900] += 0.5 * np.sin(np.arange(100)[:, None])
+    assert "the unit moves" in refused(rest(size, turn_rate_radps=moved))
+    assert "noise takes 500 in 20 s" in refused(rest(250))
+    assert "is constant" in refused(rest(size, turn_rate_radps=np.zeros((size, 3))))
+    rows = np.r_[0:500, 1500:2000]
+    assert "% of it is lost" in refused(rest(size).take(rows))
+    stamps = rest(size).publish_time_ns.copy()
+    stamps[1000:] -= 1_000_000_007
+    assert "stamps go back" in refused(replace(rest(size), publish_time_ns=stamps))
+    assert "a third of its length" in refused(rest(size), taus=[30.0])
+    assert "is a unit for m/s^2" in refused(rest(size), sheet={"turn_rate_radps": "1 ug/sqrt(Hz)"})
