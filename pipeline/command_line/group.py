@@ -28,7 +28,8 @@ for each in (
     *(replaying.replay, replaying.tune, replaying.check),
     *(judging.evaluate, judging.compare, judging.diagnose, judging.observability),
     *(experiments.run, experiments.sweep, experiments.report),
-    *(logs.info, logs.view, logs.export, logs.cut, logs.merge, logs.constrain, logs.relabel),
+    *(logs.info, logs.lint, logs.view, logs.export, logs.cut, logs.merge, logs.constrain),
+    logs.relabel,
     *(
         lists.scenarios,
         lists.models,
