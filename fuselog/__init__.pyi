@@ -11,6 +11,7 @@ from pipeline.api.api import run as run
 from pipeline.api.api import scenarios as scenarios
 from pipeline.api.api import sweep as sweep
 from pipeline.api.api import write as write
+from pipeline.api.linting import lint as lint
 from pipeline.api.observability import observability as observability
 from pipeline.api.planning import open as open  # noqa: A004
 from pipeline.api.precompiling import Precompiled as Precompiled
@@ -56,6 +57,7 @@ from recorders.log import Topic as Topic
 from recorders.log import make_stream as make_stream
 from recorders.log import schemas as schemas
 from recorders.parameters import Parameters as Parameters
+from recorders.plausibility.finding import Finding as Finding
 from recorders.recording import SIMULATION_EPOCH_NS as SIMULATION_EPOCH_NS
 from recorders.recording import Blocks as Blocks
 from recorders.recording import Importer as Importer

@@ -28,7 +28,7 @@ for each in (
     *(replaying.replay, replaying.explore, replaying.tune, replaying.check, replaying.deploy),
     *(judging.evaluate, judging.compare, judging.diagnose, judging.observability),
     *(experiments.run, experiments.sweep, experiments.report),
-    *(logs.info, logs.noise, logs.view, logs.export, logs.cut, logs.merge),
+    *(logs.info, logs.lint, logs.noise, logs.view, logs.export, logs.cut, logs.merge),
     *(logs.constrain, logs.relabel),
     *(
         lists.scenarios,

@@ -92,6 +92,27 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 
 
 @command(
+    "Say what is wrong with a log as it is written.",
+    "fuselog lint run.mcap",
+    "fuselog lint run.mcap --set /imu.turn_rate_scale=0.01745",
+)
+@click.argument("log", type=ANY_PATH)
+@recover_option
+@json_option
+@set_option("lint")
+def lint(log: Path, recover: bool, as_json: bool, settings: tuple[str, ...]) -> None:
+    """Say what is wrong with LOG before any filter: units, stamps, frames, covariances, values, names.
+
+    Each finding says how sure it is, its evidence, and what mends it; --set tries that at once. It exits
+    with 1 where something is found that is more than a hint.
+    """
+    from pipeline.api.linting import show_lint
+
+    if not show_lint(log, settings, recover=recover, as_json=as_json):
+        click.get_current_context().exit(1)
+
+
+@command(
     "Open a log, estimates or a result in the Rerun viewer.",
     "fuselog view est.mcap",
     "fuselog view run.mcap --start 10 --end 20",

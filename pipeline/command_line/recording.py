@@ -117,9 +117,9 @@ def import_(
     """
     from pipeline.logs.information import worst
     from pipeline.output.outputs import check_files, imported
+    from recorders.linting.lint import lint_log
     from recorders.log import open_log
     from recorders.parameters import parse_settings
-    from recorders.plausibility.checks import findings_of
     from recorders.recording import import_log
 
     if guess:
@@ -142,7 +142,7 @@ def import_(
     for subject, fact in metadata.notes.items():
         click.echo(printable(f"{subject}: {fact}" if fact else subject))
     say_written(target, messages)
-    for sentence in worst(findings_of(open_log(target)), target):
+    for sentence in worst(lint_log(open_log(target), portions=1), target):
         click.echo(printable(sentence))
 
 

@@ -61,6 +61,10 @@ KINDS: Mapping[Cause, Kind] = {
     "quaternion": "values",
     "mounting": "bias or turned frame",
     "covariance": "measurement noise",
+    "values": "values",
+    "magnetometer": "values",
+    "place": "values",
+    "name": "values",
 }
 
 

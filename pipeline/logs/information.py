@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 from pipeline.output import RESULT_FILE
 from pipeline.output.terminal import print_json, print_table, say, warn
 from recorders.errors import BadInput
+from recorders.linting.lint import lint_log
 from recorders.log import Log, NotMcap, RunMetadata, Topic, open_log, read_span
 from recorders.parameters import build, describe
-from recorders.plausibility.checks import findings_of
 from recorders.plausibility.finding import Finding
 from recorders.recording import Recorder
 from recorders.registry import available, foreign_code, load
@@ -89,14 +89,14 @@ def show_log(path: Path, *, is_all: bool, recover: bool, as_json: bool) -> None:
 def worst(found: Sequence[Finding], path: Path) -> Iterator[str]:
     """Say the worst of a log's findings in a sentence, and where the others are; nothing of none."""
     if found:
-        others = f"; {len(found) - 1} more: fuselog info {shlex.quote(str(path))} --json"
+        others = f"; {len(found) - 1} more: fuselog lint {shlex.quote(str(path))}"
         yield f"implausible: {found[0].mended}{others if len(found) > 1 else ''}"
 
 
 def _findings(log: Log) -> list[Finding]:
     """What the log says of its own faults; of one that is damaged nothing, and that it is."""
     try:
-        return findings_of(log)
+        return lint_log(log, portions=1)
     except BadInput as error:
         warn(f"{error}; what it holds is not looked at")
         return []

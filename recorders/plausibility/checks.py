@@ -5,8 +5,7 @@ A check of motion takes a body's topics compared in pairs, one of stamps a topic
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 
-from recorders.errors import BadInput
-from recorders.log import Log, Stream, read_blocks, read_empty
+from recorders.log import Stream
 from recorders.log.streams import concatenate
 from recorders.plausibility import speeds, stamps, turns
 from recorders.plausibility.body import bodies
@@ -64,19 +63,3 @@ def findings_in(blocks: Iterable[Mapping[str, Stream]]) -> list[Finding]:
         if count > MOST:
             break
     return findings({topic: concatenate(found) for topic, found in parts.items()})
-
-
-def findings_of(log: Log) -> list[Finding]:
-    """The findings of a log file, by its first `MOST` messages; raises BadInput where it is damaged."""
-    topics = [topic for topic in log.topics if _is_sensed(log, topic)]
-    return findings_in(read_blocks(log, topics, block_messages=BLOCK) if topics else ())
-
-
-def _is_sensed(log: Log, topic: str) -> bool:
-    if topic.startswith("/estimates/"):
-        return False
-    try:
-        read_empty(log, topic)
-    except BadInput:
-        return False
-    return True

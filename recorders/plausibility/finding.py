@@ -14,7 +14,12 @@ Cause = Literal[
     "quaternion",
     "mounting",
     "covariance",
+    "values",
+    "magnetometer",
+    "place",
+    "name",
 ]
+Surety = Literal["fact", "likely", "hint"]  # counted in the log; far from chance; may well be meant so
 
 
 class Finding(NamedTuple):
@@ -28,6 +33,7 @@ class Finding(NamedTuple):
         key, setting: what `--set KEY=SETTING` undoes it with when the log is replayed; empty where
             nothing does.
         mapping: what the import's mapping would have to say, or the log's writer to do.
+        sure: whether it is a fact, likely, or a hint at what may be meant so.
     """
 
     cause: Cause
@@ -38,6 +44,7 @@ class Finding(NamedTuple):
     key: str = ""
     setting: float | str = ""
     mapping: str = ""
+    sure: Surety = "likely"
 
     @property
     def mended(self) -> str:

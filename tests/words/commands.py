@@ -44,6 +44,8 @@ check other.mcap --against ekf.golden.xz
 info run.mcap
 info est.mcap
 info car.mcap --all
+lint run.mcap
+lint car.mcap --set /body/inertial.specific_force_scale=0.102
 cut run.mcap --start 1 --end 3 -o cut.mcap
 relabel other.mcap --topic /=/b/ -o b.mcap
 merge run.mcap b.mcap --offset b.mcap=-0.5 -o both.mcap

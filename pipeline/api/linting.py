@@ -1,0 +1,53 @@
+"""Lints a log: what is wrong with it as it is written, before any filter."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.api.planning import Log, sources_of
+from pipeline.output.terminal import print_json, say, warn
+from pipeline.runs.settings import split_texts
+from recorders.errors import BadInput
+from recorders.linting.lint import lint as lint_blocks
+from recorders.log import open_log
+from recorders.plausibility.checks import BLOCK
+from recorders.plausibility.finding import Finding
+from replay.engine.streams.sources import LogSource, is_sensed
+
+
+def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  # noqa: A002
+    """Return what is wrong with a log as it is written, the worst first and hints last.
+
+    Args:
+        log: a path, a log or a recording.
+        set: alterations of topics, such as {"/imu.delay_s": 0.1}, with which it is looked at.
+
+    Raises BadInput where the log cannot be read, or not be altered so.
+
+    >>> import fuselog as fl
+    >>> run = fl.record("landmarks", seed=7, duration_s=2.0)
+    >>> fl.lint(run)
+    []
+    """
+    [source] = sources_of([log], set)
+    topics = [topic for topic in source.topics if is_sensed(source, topic)]
+    return lint_blocks(source.blocks(topics, "publish_time", BLOCK) if topics else ())
+
+
+def show_lint(path: Path, settings: Sequence[str], *, recover: bool, as_json: bool) -> bool:
+    """Print the findings of a log; returns whether there is none but hints."""
+    alterations, others = split_texts(settings)
+    if others:
+        raise BadInput(f"--set {others[0]}: lint has settings of topics alone, such as /imu.delay_s=0.1")
+    log = open_log(path, recover=recover)
+    found = lint(LogSource(log), set=alterations)
+    if as_json:
+        print_json({"path": str(path), "findings": [each._asdict() for each in found]})
+    else:
+        for each in found:
+            say(f"{each.sure}: {each.mended}")
+        if not found:
+            say(f"{path}: nothing found")
+    if log.loss_statement:
+        warn(log.loss_statement)
+    return all(each.sure == "hint" for each in found)

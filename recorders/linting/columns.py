@@ -1,0 +1,136 @@
+"""Checks of single columns: values that freeze, are rounded, or end where the sensor's range does."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from recorders.plausibility.finding import Finding
+from recorders.plausibility.stamps import FEWEST, REGULARS
+
+Floats = NDArray[np.float64]
+LONG, TIMES = 10, 10.0  # rows, and times the usual run, that a value may stay
+MOVING = 0.5  # of the rows of a span, in which another column changes
+LOOKED_AT = 20_000  # rows by which a resolution is told
+LEVELS, CHANGES = 3, 0.05  # that a rounded column has at least: values, and rows that differ
+SHARE, ROWS, NEAR = 1e-3, 5, 5e-3
+RANGES = {
+    "turn_rate_radps": np.radians([125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0]),
+    "specific_force_mps2": 9.80665 * np.array([2.0, 4.0, 8.0, 16.0, 32.0]),
+}
+COUNTS = 2**15
+_DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # exact zeros of these are standstills
+
+
+def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """A value that stays for far longer than the column's do, while others of the topic move."""
+    entries = list(_entries(stream))
+    for field, name, column in entries:
+        edges = np.flatnonzero(np.append(True, column[1:] != column[:-1]))
+        if len(edges) < 2 or len(column) < FEWEST:
+            continue
+        runs = np.diff(np.append(edges, len(column)))
+        begin, length = int(edges[np.argmax(runs)]), int(runs.max())
+        usual = float(np.quantile(runs, 0.99))  # what is rounded, or slow, stays now and then
+        is_standing = stream.schema.full_name in _DRIVEN and column[begin] == 0.0
+        if length <= max(LONG, TIMES * usual) or is_standing or not np.isfinite(column[begin]):
+            continue
+        others = [other for of, at, other in entries if (of, at) != (field, name)]
+        if any(_changes(other[begin : begin + length]) > MOVING / max(usual, 1.0) for other in others):
+            first_s = 1e-9 * float(stream.publish_time_ns[begin] - stream.publish_time_ns[0])
+            yield Finding(
+                "values",
+                stream.topic,
+                field,
+                float(length),
+                f"{stream.topic}: {name} is frozen at {column[begin]:.6g} for {length} messages, from "
+                f"{first_s:.4g} s after its first stamp on, where {usual:.3g} are usual and others move",
+                mapping="leave these messages out: fuselog cut LOG --start ... --end ...",
+            )
+
+
+def rounded(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Columns on a grid that is wider than their noise."""
+    for field, name, column in _entries(stream):
+        known = column[:LOOKED_AT][np.isfinite(column[:LOOKED_AT])]
+        step = resolution(known)
+        if not step or _changes(known) < CHANGES:
+            continue
+        noise = float(np.std(np.diff(known, 2)) / np.sqrt(6.0))
+        if step > noise > 0.0:
+            yield Finding(
+                "values",
+                stream.topic,
+                field,
+                step,
+                f"{stream.topic}: {name} is rounded to {step:.3g}, and its noise is "
+                f"{noise:.2g}: what is "
+                "smaller is lost, and its errors are not white",
+                mapping="write it with more digits, or state a noise of at least "
+                f"{step / np.sqrt(12.0):.2g}",
+                sure="hint",
+            )
+
+
+def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Inertial columns that stand at the end of a usual range."""
+    for field, name, column in _entries(stream):
+        ranges = RANGES.get(field)
+        if ranges is None or stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name:
+            continue
+        for end in (column.max(), column.min()):
+            count = int(np.sum(column == end))
+            if count < max(ROWS, SHARE * len(column)):
+                continue
+            step = resolution(column[:LOOKED_AT])
+            is_end = np.abs(abs(end) / ranges - 1.0).min() < NEAR
+            if is_end or (step and COUNTS - 1.5 < abs(end) / step < COUNTS + 0.5):
+                first_s = 1e-9 * float(
+                    stream.publish_time_ns[int(np.argmax(column == end))] - stream.publish_time_ns[0]
+                )
+                yield Finding(
+                    "values",
+                    stream.topic,
+                    field,
+                    float(count),
+                    f"{stream.topic}: {name} is saturated: {count} of {len(column)} messages are at "
+                    f"{end:.6g}, the end of a range, the first {first_s:.4g} s after its first stamp",
+                    mapping="set the sensor to a larger range; leave these messages out",
+                )
+                break
+
+
+def resolution(values: Floats) -> float:
+    """The grid that all values lie on; zero where there is none."""
+    levels = np.unique(values)
+    if len(levels) < LEVELS or len(levels) > len(values) / 2:
+        return 0.0
+    steps = np.diff(levels)
+    step = float(steps.min())
+    largest = max(abs(float(levels[0])), abs(float(levels[-1])))
+    if step < 1e-9 * largest:
+        return 0.0
+    places = (levels - levels[0]) / step
+    # a step is known to the rounding of the numbers, which adds up over the places
+    tolerance = 0.01 + 4e-16 * largest / step * places
+    return step if (np.abs(places - np.rint(places)) < tolerance).all() else 0.0
+
+
+def _entries(stream: Stream) -> Iterator[tuple[str, str, Floats]]:
+    """The field, name and values (n,) of every measured component; of what is regular alone."""
+    if stream.schema.full_name not in REGULARS:
+        return
+    for entry in stream.schema:
+        column = stream.columns[entry.name]
+        if entry.kind not in ("real", "vector") or entry.name.startswith("covariance"):
+            continue
+        if column.ndim == 1:
+            yield entry.name, entry.name, column
+        for index in range(column.shape[1] if column.ndim == 2 else 0):
+            axis = "xyz"[index] if column.shape[1] <= 3 else str(index)
+            yield entry.name, f"{entry.name} {axis}", column[:, index]
+
+
+def _changes(values: Floats) -> float:
+    return float(np.mean(values[1:] != values[:-1])) if len(values) > 1 else 0.0

@@ -1,0 +1,77 @@
+"""A check of covariances: matrices that none can be, and numbers that stand for unknown."""
+
+from collections.abc import Iterator, Mapping
+from math import isqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from recorders.plausibility.finding import Finding
+
+TOLERANCE = 1e-6  # of the largest entry
+# Of what has no such component, as a planar robot's height, zero may stand for it.
+_PARTIAL = {schemas.POSE.full_name, schemas.TWIST.full_name}
+
+
+def impossible(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Covariances that are -1, zero, negative, not symmetric, indefinite, or one number throughout."""
+    for entry in stream.schema:
+        column = stream.columns[entry.name]
+        if not entry.name.startswith("covariance") or column.ndim != 2 or not column.shape[1]:
+            continue
+        is_new = np.ones(len(column), bool)
+        is_new[1:] = (column[1:] != column[:-1]).any(
+            axis=1
+        )  # of equal ones in a row the first tells all
+        rows = np.flatnonzero(is_new & np.isfinite(column).all(axis=1))
+        is_partial = stream.schema.full_name in _PARTIAL
+        for words, bad in _faults(column[rows], is_partial=is_partial, is_stated=len(stream) == 1):
+            if bad.any():
+                share = np.repeat(bad, np.diff(np.append(rows, len(column)))).sum()
+                first_s = 1e-9 * float(
+                    stream.publish_time_ns[rows[np.argmax(bad)]] - stream.publish_time_ns[0]
+                )
+                is_unknown = words.startswith("-1")
+                yield Finding(
+                    "covariance",
+                    stream.topic,
+                    entry.name,
+                    float(share),
+                    f"{stream.topic}: {entry.name} is {words} in {int(share)} of "
+                    f"{len(column)} messages, "
+                    f"the first {first_s:.4g} s after its first stamp",
+                    mapping="missing = [-1] in the mapping"
+                    if is_unknown
+                    else f"deviations.{entry.name} = [SIGMA, ...] in the mapping, a number "
+                    f"for each axis",
+                    sure="fact",
+                )
+                break
+
+
+def _faults(
+    values: NDArray[np.float64], *, is_partial: bool, is_stated: bool
+) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Each fault with the rows (n,) that have it, the plainest first.
+
+    `is_partial` says that zero may stand for a component that there is none, `is_stated` that one
+    message is for all of the log.
+    """
+    width = values.shape[1]
+    size = isqrt(width)
+    is_matrix = width > 3 and size * size == width
+    diagonal = values[:, :: size + 1] if is_matrix else values
+    yield "-1, which stands for unknown", np.equal(diagonal[:, 0], -1.0)
+    yield "negative on its diagonal", np.less(diagonal.min(axis=1), 0.0)
+    zero = np.equal(diagonal, 0.0)
+    if not is_stated:  # of a place that is stated once zero says that it is exact
+        yield "zero", np.greater_equal(zero.sum(axis=1), zero.shape[1] if is_partial else 1)
+    if not is_matrix:
+        return
+    yield "one number in all its entries", np.less_equal(np.ptp(values, axis=1), 0.0)
+    matrices = values.reshape(-1, size, size)
+    scale = np.abs(values).max(axis=1, initial=0.0)
+    apart = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+    yield "not symmetric", apart > TOLERANCE * scale
+    yield "indefinite", np.linalg.eigvalsh(matrices)[:, 0] < -TOLERANCE * scale

@@ -1,0 +1,64 @@
+"""A check of specific forces: which axis is up."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from recorders.plausibility.body import FEWEST, Series
+from recorders.plausibility.finding import Finding
+from recorders.plausibility.turns import quietest
+
+LARGEST_SHARE = 0.9
+# Of the axis that is up, and its sign: roll, pitch, yaw that turn it to z.
+UPRIGHT = {
+    (0, 1): (0, -90, 0),
+    (0, -1): (0, 90, 0),
+    (1, 1): (90, 0, 0),
+    (1, -1): (-90, 0, 0),
+    (2, -1): (180, 0, 0),
+}
+
+
+def upright(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Units whose z axis is not up at rest; beside orientations, which may say so, nothing is."""
+    if stream.schema.full_name != schemas.INERTIAL_SAMPLE.full_name or len(stream) < FEWEST:
+        return
+    if any(_turns(each) for each in streams.values()):
+        return
+    times_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
+    forces = stream["specific_force_mps2"]
+    mean = quietest(Series(stream.topic, "specific_force_mps2", times_s, forces))
+    norm = 0.0 if mean is None else float(np.linalg.norm(mean))
+    if mean is None or not norm:
+        return
+    axis = int(np.argmax(np.abs(mean)))
+    mounting = UPRIGHT.get((axis, int(np.sign(mean[axis]))))
+    is_so = np.sign(np.median(forces[:, axis])) == np.sign(mean[axis])
+    if mounting is None or abs(mean[axis]) < LARGEST_SHARE * norm or not is_so:
+        return
+    is_down = axis == 2
+    what = (
+        "its z axis is down (FRD), or its forces have the wrong sign"
+        if is_down
+        else f"it is mounted upright, its {'xy'[axis]} axis {'up' if mean[axis] > 0 else 'down'}"
+    )
+    roll, pitch, yaw = mounting
+    yield Finding(
+        "gravity" if is_down else "mounting",
+        stream.topic,
+        "specific_force_mps2",
+        -1.0 if is_down else float(np.radians(roll or pitch)),
+        f"{stream.topic}: {what}: at rest the force along {'xyz'[axis]} is {mean[axis]:.4g} "
+        f"of {norm:.4g}, "
+        "where specific force points up along z",
+        f"{stream.topic}.specific_force_z_scale" if is_down else "",
+        -1 if is_down else "",
+        f"mounting_deg = [{roll}, {pitch}, {yaw}] in the mapping",
+        "likely" if is_down else "hint",
+    )
+
+
+def _turns(stream: Stream) -> bool:
+    """Whether a topic says how a body is turned in space."""
+    return "quaternion" in stream.columns or "quaternion" in stream.metadata.get("kinds", "")

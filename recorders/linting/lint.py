@@ -1,0 +1,97 @@
+"""The checks of a log in their table, asked portion by portion, so that memory is bounded."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
+
+from recorders.errors import BadInput
+from recorders.linting import columns, covariances, forces, magnetic, names, places, stamps
+from recorders.log import Log, Stream, read_blocks, read_empty
+from recorders.log.streams import concatenate
+from recorders.plausibility.checks import BLOCK, MOST, OF_STAMPS, findings
+from recorders.plausibility.finding import Finding
+
+CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] = (
+    stamps.units,
+    stamps.order,
+    stamps.jitter,
+    stamps.leaps,
+    stamps.drift,
+    covariances.impossible,
+    places.ranges,
+    places.exchanged,
+    places.heights,
+    forces.upright,
+    magnetic.units,
+    magnetic.iron,
+    columns.frozen,
+    columns.saturated,
+    columns.rounded,
+    names.frames,
+    names.strays,
+)
+
+
+def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None) -> list[Finding]:
+    """What is wrong with a log, of blocks that follow one another in time; hints stand last.
+
+    Every portion of some `MOST` messages is checked by itself, and what is found in several is said
+    once, of the first. Topics are compared in pairs in the first portion alone.
+
+    Args:
+        blocks: streams by topic; estimates are not looked at.
+        portions: how many portions to look at; all without it.
+
+    Returns:
+        The findings, the worst first; none of a log without a fault: thresholds are far from chance.
+    """
+    found: dict[tuple[str, str, str], list[Finding]] = {}
+    for index, streams in enumerate(islice(_portions(blocks), portions)):
+        told = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
+        for each in (*told, *_asked(CHECKS, streams)):
+            others = found.setdefault((each.cause, each.topic, each.field), [])
+            if not others or (each in told and not index):
+                others.append(each)
+    listed = [each for several in found.values() for each in several]
+    return sorted(listed, key=lambda each: each.sure == "hint")
+
+
+def lint_log(log: Log, *, portions: int | None = None) -> list[Finding]:
+    """The findings of a log file, see `lint`; raises BadInput where it is damaged."""
+    topics = [topic for topic in log.topics if _is_sensed(log, topic)]
+    blocks = read_blocks(log, topics, block_messages=BLOCK) if topics else ()
+    return lint(blocks, portions=portions)
+
+
+def _asked(
+    checks: Iterable[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]]],
+    streams: Mapping[str, Stream],
+) -> Iterator[Finding]:
+    for stream in streams.values():
+        for check in checks:
+            yield from check(stream, streams)
+
+
+def _portions(blocks: Iterable[Mapping[str, Stream]]) -> Iterator[dict[str, Stream]]:
+    """Blocks joined until they have `MOST` messages, without estimates and topics that are empty."""
+    parts: dict[str, list[Stream]] = {}
+    count = 0
+    for block in blocks:
+        for topic, stream in block.items():
+            if len(stream) and not topic.startswith("/estimates/"):
+                parts.setdefault(topic, []).append(stream)
+                count += len(stream)
+        if count > MOST:
+            yield {topic: concatenate(several) for topic, several in parts.items()}
+            parts, count = {}, 0
+    if parts:
+        yield {topic: concatenate(several) for topic, several in parts.items()}
+
+
+def _is_sensed(log: Log, topic: str) -> bool:
+    if topic.startswith("/estimates/"):
+        return False
+    try:
+        read_empty(log, topic)
+    except BadInput:
+        return False
+    return True

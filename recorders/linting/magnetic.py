@@ -1,0 +1,127 @@
+"""Checks of magnetic fields: their unit, and iron on board, by the circle of a full turn."""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from recorders.plausibility.finding import Finding, digits
+
+Floats = NDArray[np.float64]
+FIELD = "magnetic_field_ut"
+FEWEST = 50
+EARTH_UT = (22.0, 67.0)
+UNITS_UT = {"G": 100.0, "T": 1e6, "mT": 1e3, "mG": 0.1, "nT": 1e-3}
+SECTORS = 12  # of a turn, each of which has to be seen
+FLAT = 0.05  # of the second spread, that the third may be of a turn about one axis
+HARD, SOFT = 0.2, 1.1  # the centre in radii; the ratio of the axes
+SCATTER = 0.1  # about the ellipse, of the radius
+
+
+def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Fields that are the Earth's in another unit, or in none."""
+    field = _field(stream)
+    if field is None:
+        return
+    norm = float(np.median(np.linalg.norm(field, axis=1)))
+    if EARTH_UT[0] <= norm <= EARTH_UT[1] or not norm:
+        return
+    given = next((unit for unit, ut in UNITS_UT.items() if EARTH_UT[0] <= norm * ut <= EARTH_UT[1]), "")
+    factor = UNITS_UT.get(given, 0.0)
+    what = f"is in {given}" if given else "is in no unit that is known, or normalised, or of iron nearby"
+    yield Finding(
+        "magnetometer",
+        stream.topic,
+        FIELD,
+        1.0 / factor if given else norm,
+        f"{stream.topic}: {FIELD} {what}: half of its lengths are above {norm:.3g}, and the "
+        f"Earth's field "
+        f"has {EARTH_UT[0]:g} to {EARTH_UT[1]:g} uT",
+        f"{stream.topic}.magnetic_field_scale" if given else "",
+        digits(factor) if given else "",
+        f'units.{FIELD} = "{given}" in the mapping'
+        if given
+        else "calibrate it: it tells only directions",
+        "likely" if given else "hint",
+    )
+
+
+def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Fields whose circle in a full turn is off the origin (hard iron), or an ellipse (soft iron)."""
+    field = _field(stream)
+    told = None if field is None else ellipse(field)
+    if told is None:
+        return
+    share = float(np.linalg.norm(told.centre)) / told.radius
+    if share > HARD:
+        offsets = ", ".join(f"{-each:.4g}" for each in told.centre)
+        axis = int(np.argmax(np.abs(told.centre)))
+        yield Finding(
+            "magnetometer",
+            stream.topic,
+            FIELD,
+            share,
+            f"{stream.topic}: hard iron: in a full turn {FIELD} goes round a centre that is {share:.2g} "
+            f"of the radius, {told.radius:.3g} uT, off zero",
+            f"{stream.topic}.magnetic_field_{'xyz'[axis]}_bias",
+            digits(float(told.centre[axis])),
+            f"offsets.{FIELD} = [{offsets}] in the mapping",
+        )
+    elif told.ratio > SOFT:
+        yield Finding(
+            "magnetometer",
+            stream.topic,
+            FIELD,
+            told.ratio,
+            f"{stream.topic}: soft iron: in a full turn {FIELD} goes along an ellipse whose axes are "
+            f"{told.ratio:.3g} to 1",
+            mapping="calibrate its axes",
+        )
+
+
+class Ellipse(NamedTuple):
+    """What a field goes along in a turn: its centre (3,), mean radius and ratio of axes."""
+
+    centre: Floats
+    radius: float
+    ratio: float
+
+
+def ellipse(field: Floats) -> Ellipse | None:
+    """The ellipse of a full turn about one axis, by least squares; None where no turn is whole."""
+    mean = field.mean(axis=0)
+    spreads, axes = np.linalg.eigh(np.cov((field - mean).T))
+    if spreads[1] <= 0.0 or spreads[0] > FLAT * spreads[1]:
+        return None
+    plane = axes[:, 1:]
+    size = float(np.sqrt(spreads.sum()))
+    x, y = ((field - mean) @ plane / size).T
+    (a, b, c, d, e), *_ = np.linalg.lstsq(
+        np.stack([x * x, x * y, y * y, x, y], axis=1), np.ones(len(x)), rcond=None
+    )
+    form = np.array([[a, 0.5 * b], [0.5 * b, c]])
+    if np.linalg.eigvalsh(form)[0] <= 0.0:
+        return None
+    middle = -0.5 * np.linalg.solve(form, [d, e])
+    scaled = np.linalg.eigvalsh(form / (1.0 + middle @ form @ middle))
+    radii = size / np.sqrt(scaled)
+    offset = np.stack([x, y], axis=1) - middle
+    sector = np.floor(SECTORS * (np.arctan2(offset[:, 1], offset[:, 0]) / (2.0 * np.pi) + 0.5)).astype(
+        int
+    )
+    length = np.sqrt(np.einsum("ni,ij,nj->n", offset, form, offset) / (1.0 + middle @ form @ middle))
+    if len(np.unique(sector % SECTORS)) < SECTORS or np.std(length) > SCATTER:
+        return None
+    centre = plane @ (plane.T @ mean + size * middle)
+    return Ellipse(centre, float(radii.mean()), float(radii[0] / radii[1]))
+
+
+def _field(stream: Stream) -> Floats | None:
+    """The fields (n, 3) that are known, where they are enough."""
+    known = {schemas.INERTIAL_SAMPLE.full_name, schemas.MAGNETIC_FIELD.full_name}
+    if stream.schema.full_name not in known or stream[FIELD].shape[1] != 3:
+        return None
+    field = stream[FIELD][np.isfinite(stream[FIELD]).all(axis=1)]
+    return field if len(field) >= FEWEST else None

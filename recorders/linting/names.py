@@ -1,0 +1,59 @@
+"""Checks of names: frames by REP 103 and 105, and topics that no namespace binds to the others."""
+
+import re
+from collections.abc import Iterator, Mapping
+
+from recorders.log import Stream
+from recorders.plausibility.finding import Finding
+from recorders.plausibility.stamps import REGULARS
+
+SUFFIX = re.compile(r"_(ned|frd)$", re.IGNORECASE)
+
+
+def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Frames that their own name says to be NED or FRD, where REP 103 has ENU and FLU."""
+    for key in ("frame_id", "child_frame_id"):
+        found = SUFFIX.search(stream.metadata.get(key, ""))
+        if found:
+            kind = found[1].upper()
+            ours = {"NED": "east, north, up", "FRD": "forward, left, up"}[kind]
+            yield Finding(
+                "name",
+                stream.topic,
+                "",
+                0.0,
+                f"{stream.topic}: its {key} {stream.metadata[key]} says {kind}, where REP "
+                f"103 and fuselog "
+                f"have {ours}",
+                mapping="mounting_deg = [180, 0, 0] in the mapping"
+                if kind == "FRD"
+                else "in the mapping exchange north and east, and give down the factor -1",
+                sure="hint",
+            )
+
+
+def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Of two topics of one message the one alone in its namespace, which replay may leave out."""
+    sensed = [each for each in streams.values() if each.schema.full_name in REGULARS]
+    alike = [each for each in sensed if each.schema.full_name == stream.schema.full_name]
+    if stream.schema.full_name not in REGULARS or len(alike) != 2:
+        return
+    spaces = [each.topic.rpartition("/")[0] for each in sensed]
+    [other] = [each for each in alike if each.topic != stream.topic]
+    space, used = (each.topic.rpartition("/")[0] for each in (stream, other))
+    if spaces.count(space) > 1 or spaces.count(used) < 2 or f"{space}/".startswith(f"{used}/"):
+        return
+    name = stream.topic.rpartition("/")[2]
+    yield Finding(
+        "name",
+        stream.topic,
+        "",
+        0.0,
+        f"{stream.topic}: it is alone in its namespace, while {other.topic}, which says the "
+        f"same, is with "
+        f"{spaces.count(used) - 1} other topics in {used or '/'}: replay uses that one",
+        mapping=f"fuselog relabel LOG --topic {stream.topic}={used}/second/{name} joins "
+        f"them; at the import "
+        f"""--set 'names={{"{stream.topic}" = "{used}"}}'""",
+        sure="hint",
+    )

@@ -1,0 +1,162 @@
+"""Checks of places: latitudes and longitudes that are none, or exchanged, and heights."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from recorders.log import Stream, schemas
+from recorders.plausibility.body import bodies
+from recorders.plausibility.finding import Finding
+from recorders.plausibility.motion import Motion, Slope
+
+GEOID_M = (5.0, 110.0)  # that heights above the ellipsoid and the sea differ by
+STEADY_M = 5.0
+INTEGER, INTEGERS_A_DEG = 1e6, 1e7
+BETTER = 3.0
+CLEAR = 0.02  # of a spread, above which an exchange is worth trying
+SCALE = (0.9, 1.1)
+CLIMB_M, MIRRORED = 2.0, -0.9
+FEWEST = 20
+
+
+def ranges(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Latitudes and longitudes beyond their range, in integers, or at 0, 0."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name:
+        return
+    latitude, longitude = stream["latitude_deg"], stream["longitude_deg"]
+    largest = float(np.nanmax(np.abs(latitude))), float(np.nanmax(np.abs(longitude)))
+    if max(largest) > INTEGER:
+        yield _place(
+            stream,
+            1e7,
+            f"latitude and longitude are integers of 1e-7 deg: they reach {largest[0]:.6g}",
+            "factors = { latitude_deg = 1e-7, longitude_deg = 1e-7 } in the mapping",
+        )
+        return
+    if largest[0] > 90.0:
+        is_exchanged = largest[1] <= 90.0
+        what = "are exchanged" if is_exchanged else "are out of range"
+        yield _place(
+            stream,
+            largest[0],
+            f"latitude and longitude {what}: a latitude is {largest[0]:.6g} deg",
+            "in the mapping exchange the sources of latitude_deg and longitude_deg",
+        )
+    elif largest[1] > 180.0:
+        yield _place(
+            stream,
+            largest[1],
+            f"longitudes reach {largest[1]:.6g} deg, beyond 180",
+            "write them from -180 to 180 deg",
+        )
+    zero = (latitude == 0.0) & (longitude == 0.0)
+    if zero.any():
+        first_s = 1e-9 * float(stream.publish_time_ns[int(np.argmax(zero))] - stream.publish_time_ns[0])
+        yield _place(
+            stream,
+            float(zero.sum()),
+            f"{int(zero.sum())} of {len(stream)} fixes are at 0, 0, where there was none, the first "
+            f"{first_s:.4g} s after its first stamp",
+            "missing = [0] in the mapping",
+        )
+
+
+def exchanged(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Latitudes that are longitudes, by how far the wheels come."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
+        return
+    if np.nanmax(np.abs([stream["latitude_deg"], stream["longitude_deg"]])) > 90.0:
+        return
+    as_is = _wheels(streams, stream)
+    if as_is is None or not as_is.spread > CLEAR:
+        return
+    columns = {
+        **stream.columns,
+        "latitude_deg": stream["longitude_deg"],
+        "longitude_deg": stream["latitude_deg"],
+    }
+    other = _wheels(streams, replace(stream, columns=columns))
+    if other and SCALE[0] < other.value < SCALE[1] and BETTER * other.spread < as_is.spread:
+        yield _place(
+            stream,
+            as_is.spread / other.spread,
+            f"latitude and longitude are exchanged: so fixes move {other.value:.4g} m for "
+            f"each metre of the "
+            f"wheels (spread {other.spread:.2g}), as they are {as_is.value:.4g} m (spread "
+            f"{as_is.spread:.2g})",
+            "in the mapping exchange the sources of latitude_deg and longitude_deg",
+            is_fact=False,
+        )
+
+
+def heights(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Heights above the sea beside ones above the ellipsoid, and a z that points down."""
+    if stream.schema.full_name != schemas.GEODETIC_FIX.full_name or len(stream) < FEWEST:
+        return
+    if not np.isfinite(stream["altitude_m"]).all():
+        return
+    for other in streams.values():
+        if len(other) < FEWEST or other.topic == stream.topic:
+            continue
+        if other.schema.full_name == schemas.GEODETIC_FIX.full_name and other.topic > stream.topic:
+            apart = _at(stream, other.publish_time_ns) - other["altitude_m"]
+            by_m = float(np.median(apart))
+            if GEOID_M[0] < abs(by_m) < GEOID_M[1] and np.std(apart) < STEADY_M:
+                yield Finding(
+                    "place",
+                    other.topic,
+                    "altitude_m",
+                    by_m,
+                    f"{other.topic}: its altitudes are {abs(by_m):.4g} m "
+                    f"{'below' if by_m > 0 else 'above'} "
+                    f"those of {stream.topic}: one is above the sea, the other above the ellipsoid",
+                    f"{other.topic}.altitude_bias",
+                    round(-by_m, 3),
+                    sure="hint",
+                )
+        if other.schema.full_name in _PLACED and other["position_m"].shape[1] == 3:
+            z, height = other["position_m"][:, 2], _at(stream, other.publish_time_ns)
+            if not np.isfinite(z).all() or min(np.ptp(z), np.ptp(height)) < CLIMB_M:
+                continue
+            likeness = float(np.corrcoef(z, height)[0, 1])
+            if likeness < MIRRORED:
+                yield Finding(
+                    "sign",
+                    other.topic,
+                    "position_m",
+                    -1.0,
+                    f"{other.topic}: its z points down (NED), ours up: it falls as the altitude of "
+                    f"{stream.topic} rises (correlation {likeness:.3f})",
+                    f"{other.topic}.position_z_scale",
+                    -1,
+                    "factors.position_m = [1, 1, -1] in the mapping, of north and east exchanged",
+                )
+
+
+_PLACED = {schemas.POSITION_FIX.full_name, schemas.POSE.full_name}
+
+
+def _at(stream: Stream, times_ns: np.ndarray) -> np.ndarray:
+    """Altitudes at other stamps."""
+    return np.interp(times_ns, np.sort(stream.publish_time_ns), stream["altitude_m"])
+
+
+def _wheels(streams: Mapping[str, Stream], stream: Stream) -> Slope | None:
+    """How far fixes move for each metre of the wheels of the same body."""
+    for body in bodies({**streams, stream.topic: stream}):
+        if body.speeds and body.fixes and body.fixes[0].topic == stream.topic:
+            return Motion(body).speed(body.speeds[0])
+    return None
+
+
+def _place(stream: Stream, value: float, words: str, mapping: str, *, is_fact: bool = True) -> Finding:
+    return Finding(
+        "place",
+        stream.topic,
+        "latitude_deg",
+        value,
+        f"{stream.topic}: {words}",
+        mapping=mapping,
+        sure="fact" if is_fact else "likely",
+    )

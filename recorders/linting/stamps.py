@@ -1,0 +1,205 @@
+"""Checks of stamps: their unit, order, regularity, and how they stand to the recorder's clock."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from recorders.plausibility.finding import Finding, digits
+from recorders.plausibility.stamps import FEWEST, REGULARS, losses
+
+YEAR_2100_NS = 4_102_444_800 * 10**9
+JITTER = 0.2  # of the usual step
+SLOWEST_HZ, FASTEST_HZ = 0.5, 2e4  # of inertial units
+FASTEST_FIX_HZ = 500.0
+LEAP_TOLERANCE_S, ZONE_TOLERANCE_S = 0.6, 1.0
+FAR_H = 14  # that clocks of places are from UTC at most
+# Since when (Unix time in s) GPS time runs ahead of UTC by so many seconds.
+GPS_LEAPS = {
+    915148800: 13,
+    1136073600: 14,
+    1230768000: 15,
+    1341100800: 16,
+    1435708800: 17,
+    1483228800: 18,
+}
+TAI_LESS_GPS_S = 19
+DRIFT, FACT = 1e-5, 1e-3
+LONG_S, SURE = 100.0, 6.0
+# What a sensor's own clock drives; fixes and poses may come as they can be computed.
+_CLOCKED = {
+    schemas.INERTIAL_SAMPLE.full_name,
+    schemas.MAGNETIC_FIELD.full_name,
+    schemas.ODOMETRY.full_name,
+}
+_FIXES = {schemas.GEODETIC_FIX.full_name, schemas.POSITION_FIX.full_name, schemas.VELOCITY_FIX.full_name}
+
+
+def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Stamps whose decade is another unit's: beyond 2100, or at a rate that no such sensor has."""
+    last_ns = int(stream.publish_time_ns.max())
+    if last_ns > YEAR_2100_NS:
+        year = 1970 + last_ns / 1e9 / 31_556_952
+        yield _stamps(
+            stream,
+            year,
+            f"its stamps reach the year {year:.0f}",
+            'time = { unit = "ms" }, or "us", "ns"',
+        )
+        return
+    name = stream.schema.full_name
+    if len(stream) < FEWEST or name not in REGULARS:
+        return
+    rate_hz = 1e9 / max(float(np.median(_steps_ns(stream))), 1e-3)
+    fastest_hz = FASTEST_FIX_HZ if name in _FIXES else FASTEST_HZ
+    is_slow = name == schemas.INERTIAL_SAMPLE.full_name and rate_hz < SLOWEST_HZ
+    if not is_slow and rate_hz <= fastest_hz:
+        return
+    power = 0
+    while (rate_hz * 10.0**power < SLOWEST_HZ) if is_slow else (rate_hz * 10.0**power > fastest_hz):
+        power += 3 if is_slow else -3
+    how = "large" if is_slow else "small"
+    yield _stamps(
+        stream,
+        10.0**power,
+        f"its stamps are {10 ** abs(power):.0e} times too {how}, by their unit: it would come at "
+        f"{rate_hz:.3g} Hz",
+        'time = { unit = "ms" }, or "s", "us", "ns", whichever the column has',
+    )
+
+
+def order(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Stamps that go back from message to message, and equal ones of what is measured once at a time."""
+    rows = np.argsort(stream.position, kind="stable")
+    stamps_ns = stream.publish_time_ns[rows]
+    back = np.diff(stamps_ns) < 0
+    is_late = not np.array_equal(stream.publish_time_ns, stream.log_time_ns)
+    if back.any():
+        count, first_s = int(back.sum()), _since_s(stream, int(stamps_ns[int(np.argmax(back))]))
+        yield Finding(
+            "stamps",
+            stream.topic,
+            "",
+            float(count),
+            f"{stream.topic}: {count} of its {len(stream)} stamps go back, the first "
+            f"{first_s:.4g} s after "
+            f"the earliest{'; messages overtook one another' if is_late else ''}",
+            mapping="--late says what becomes of them"
+            if is_late
+            else "sort them where the log is written",
+            sure="hint" if is_late else "fact",
+        )
+        return
+    same = np.diff(stamps_ns) == 0
+    if same.any() and stream.schema.full_name in REGULARS:
+        first_s = _since_s(stream, int(stamps_ns[int(np.argmax(same))]))
+        yield Finding(
+            "stamps",
+            stream.topic,
+            "",
+            float(same.sum()),
+            f"{stream.topic}: {int(same.sum())} of its {len(stream)} messages have the stamp of the one "
+            f"before, the first {first_s:.4g} s after its first stamp: both are used, in "
+            f"the file's order",
+            mapping="leave one of them out where the log is written",
+            sure="fact",
+        )
+
+
+def jitter(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Steps that scatter, of what should be regular and loses nothing."""
+    if len(stream) < FEWEST or stream.schema.full_name not in _CLOCKED:
+        return
+    steps_s = 1e-9 * _steps_ns(stream)
+    usual_s = float(np.median(steps_s))
+    scatter = 1.4826 * float(np.median(np.abs(steps_s - usual_s)))
+    if scatter > JITTER * usual_s > 0.0 and not any(losses(stream, streams)):
+        yield _stamps(
+            stream,
+            scatter / usual_s,
+            f"its steps scatter by {100 * scatter / usual_s:.2g} % of the usual "
+            f"{usual_s:.3g} s: they say "
+            "when it was written rather than measured",
+            "time = { column = ... } of the sensor's own clock",
+        )
+
+
+def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Stamps that are leap seconds or a time zone off the recorder's clock."""
+    ahead_s = _ahead_s(stream)
+    name = _named_offset(ahead_s, int(stream.log_time_ns[0]) / 1e9)
+    if not name or stream.schema.full_name == schemas.TRUTH_STATE.full_name:
+        return
+    others_s = [_ahead_s(each) for each in streams.values() if each.topic != stream.topic]
+    is_alone = any(abs(each - ahead_s) > LEAP_TOLERANCE_S for each in others_s)
+    value = float(round(ahead_s))
+    yield Finding(
+        "delay",
+        stream.topic,
+        "",
+        value,
+        f"{stream.topic}: its stamps are {abs(value):g} s "
+        f"{'ahead of' if value > 0 else 'behind'} the clock "
+        f"of the recorder: {name}{'' if is_alone else ', as are those of all topics'}",
+        f"{stream.topic}.delay_s",
+        digits(value),
+        "time = { leap_seconds = ... } or { utc_offset_h = ... } in the mapping",
+        "likely" if is_alone else "hint",
+    )
+
+
+def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+    """A clock that is a little fast or slow, as most are; more than 1e-3 is told by plausibility."""
+    if len(stream) < FEWEST or np.array_equal(stream.publish_time_ns, stream.log_time_ns):
+        return
+    measured_s = 1e-9 * (stream.publish_time_ns - stream.publish_time_ns[0])
+    span_s = float(np.ptp(measured_s))
+    if span_s < LONG_S:
+        return
+    ahead_s = 1e-9 * (stream.publish_time_ns - stream.log_time_ns)
+    centred_s = measured_s - measured_s.mean()
+    gain = float(centred_s @ ahead_s / (centred_s @ centred_s))
+    rest_s = ahead_s - ahead_s.mean() - gain * centred_s
+    error = float(np.std(rest_s) / np.sqrt(centred_s @ centred_s))
+    if max(DRIFT, SURE * error) < abs(gain) < FACT:
+        yield Finding(
+            "clock",
+            stream.topic,
+            "",
+            gain,
+            f"{stream.topic}: its clock {'gains' if gain > 0 else 'loses'} {1e6 * abs(gain):.3g} us a "
+            f"second on the recorder's, in {span_s:.4g} s {1e3 * abs(gain) * span_s:.3g} ms",
+            f"{stream.topic}.clock_gain",
+            digits(gain),
+            sure="hint",
+        )
+
+
+def _stamps(stream: Stream, value: float, words: str, mapping: str) -> Finding:
+    return Finding("stamps", stream.topic, "", value, f"{stream.topic}: {words}", mapping=mapping)
+
+
+def _steps_ns(stream: Stream) -> NDArray[np.int64]:
+    steps_ns: NDArray[np.int64] = np.diff(np.sort(stream.publish_time_ns)).astype(np.int64)
+    return steps_ns
+
+
+def _since_s(stream: Stream, stamp_ns: int) -> float:
+    return (stamp_ns - int(stream.publish_time_ns.min())) * 1e-9
+
+
+def _ahead_s(stream: Stream) -> float:
+    return float(np.median(stream.publish_time_ns - stream.log_time_ns)) * 1e-9
+
+
+def _named_offset(offset_s: float, unix_s: float) -> str:
+    """What differs by so many seconds at a time; empty where nothing does."""
+    gps_s = next((leap for since, leap in reversed(GPS_LEAPS.items()) if unix_s >= since), 0)
+    for name, leap_s in (("GPS time", gps_s), ("TAI", gps_s + TAI_LESS_GPS_S)):
+        if gps_s and abs(abs(offset_s) - leap_s) < LEAP_TOLERANCE_S:
+            return f"{name} runs {leap_s} s ahead of UTC then"
+    hours = round(offset_s / 3600.0)
+    if 0 < abs(hours) <= FAR_H and abs(offset_s - 3600.0 * hours) <= ZONE_TOLERANCE_S:
+        return f"a time zone {abs(hours)} h from UTC"
+    return ""

@@ -1,0 +1,251 @@
+"""What `lint` finds in a log as it is written: the sheet of sensors, section 5.
+
+`python -m tests.recorders.test_linting` counts over 100 seeds what the tests here see in two.
+"""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.command_line import main
+from recorders.linting.lint import lint
+from recorders.log import RunMetadata, Stream, make_stream, schemas, write_log
+
+IMU, FIX, MAG = "/imu", "/fix", "/mag"
+BEGIN_NS = 1_700_000_000 * 10**9
+Streams = dict[str, Stream]
+
+
+def clean(seed: int) -> Streams:
+    """The sheet's unit at rest, and beside it fixes and a compass that turns once round."""
+    rng = np.random.Generator(np.random.Philox(key=900 + seed))
+    n = 6000
+    t = 0.01 * np.arange(n) + 1e-4 * rng.standard_normal(n)
+    force = np.array([0.0, 0.0, 9.81]) + 0.05 * rng.standard_normal((n, 3))
+    angle = 2.0 * np.pi * np.arange(600) / 599
+    field = np.stack([20.0 * np.cos(angle), -20.0 * np.sin(angle), np.full(600, -40.0)], axis=1)
+    stamps_ns = BEGIN_NS + np.rint(1e9 * t).astype(np.int64)
+    slow_ns = BEGIN_NS + 10**8 * np.arange(600)
+    found = [
+        make_stream(
+            IMU,
+            schemas.INERTIAL_SAMPLE,
+            stamps_ns,
+            specific_force_mps2=force,
+            turn_rate_radps=0.01 * rng.standard_normal((n, 3)),
+            magnetic_field_ut=np.empty((n, 0)),
+        ),
+        make_stream(
+            FIX,
+            schemas.GEODETIC_FIX,
+            slow_ns,
+            latitude_deg=49.0 + 1e-6 * rng.standard_normal(600),
+            longitude_deg=8.4 + 1e-6 * rng.standard_normal(600),
+            altitude_m=115.0 + rng.standard_normal(600),
+            covariance_m2=np.tile(np.diag([0.01, 0.01, 1.0]).ravel(), (600, 1)),
+        ),
+        make_stream(
+            MAG,
+            schemas.MAGNETIC_FIELD,
+            slow_ns,
+            magnetic_field_ut=field + 0.3 * rng.standard_normal((600, 3)),
+            covariance_ut2=np.tile(0.09 * np.eye(3).ravel(), (600, 1)),
+        ),
+    ]
+    return {each.topic: each for each in found}
+
+
+def column(topic: str, name: str, change: Callable[[Any], Any]) -> Callable[[Streams], Streams]:
+    """One column in place of another; `change` may write into its argument."""
+
+    def put(streams: Streams) -> Streams:
+        values = streams[topic][name].copy()
+        made = change(values)
+        columns = {**streams[topic].columns, name: values if made is None else made}
+        return {**streams, topic: replace(streams[topic], columns=columns)}
+
+    return put
+
+
+def stamps(
+    topic: str, change: Callable[[Any], Any], *, logged: bool = True
+) -> Callable[[Streams], Streams]:
+    """Other stamps, since the begin; of the recorder too, unless its clock is right."""
+
+    def put(streams: Streams) -> Streams:
+        own = streams[topic]
+        made = BEGIN_NS + np.asarray(change(own.publish_time_ns - BEGIN_NS)).astype(np.int64)
+        log_time_ns = made if logged else own.log_time_ns
+        return {**streams, topic: replace(own, publish_time_ns=made, log_time_ns=log_time_ns)}
+
+    return put
+
+
+def rows(topic: str, taken: Callable[[int], Any]) -> Callable[[Streams], Streams]:
+    """Some messages of a topic."""
+    return lambda streams: {**streams, topic: streams[topic].take(taken(len(streams[topic])))}
+
+
+def setting(begin: int, end: int, value: float, axis: int | None = None) -> Callable[[Any], None]:
+    """Rows of a column, or of one of its axes, are one value."""
+
+    def put(values: Any) -> None:
+        values[(slice(begin, end), *([] if axis is None else [axis]))] = value
+
+    return put
+
+
+def ellipse(x: float, y: float, wide: float) -> Callable[[Any], Any]:
+    """A compass on board with iron: another centre, or one axis longer."""
+    return lambda field: field * [wide, 1.0, 1.0] + [x, y, 0.0]
+
+
+def asymmetric(values: Any) -> None:
+    """One entry off the diagonal alone."""
+    values[:, 1] = 0.005
+
+
+def indefinite(values: Any) -> None:
+    """A correlation above 1."""
+    values[:, [1, 3]] = 0.02
+
+
+def scattered(since_ns: Any) -> Any:
+    """Stamps when a busy computer wrote."""
+    return since_ns + np.random.default_rng(0).uniform(-3e6, 3e6, len(since_ns)) + 10**8
+
+
+def saturating(rate: Any) -> None:
+    """Turns that a unit of 250 deg/s cannot follow."""
+    rate[1000:1400:3, 2] = np.radians(250.0)
+
+
+force = partial(column, IMU, "specific_force_mps2")
+variance = partial(column, FIX, "covariance_m2")
+field = partial(column, MAG, "magnetic_field_ut")
+# What is put in: how; then the topic, cause, and the words that are to be said.
+FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
+    "stamps in ms, read as s": (stamps(IMU, lambda t: 1000 * t), IMU, "stamps", "too large"),
+    "stamps in s, read as ms": (stamps(FIX, lambda t: t // 1000), FIX, "stamps", "too small"),
+    "after 2100": (stamps(IMU, lambda t: t + 3 * 10**18), IMU, "stamps", "reach the year"),
+    "rows out of order": (
+        stamps(IMU, lambda t: t[np.r_[0:50, 51, 50, 52 : len(t)]]),
+        IMU,
+        "stamps",
+        "go back",
+    ),
+    "rows twice": (rows(IMU, lambda n: np.r_[0:50, 49, 50:n]), IMU, "stamps", "there twice"),
+    "half lost": (
+        rows(IMU, lambda n: np.random.default_rng(0).random(n) < 0.5),
+        IMU,
+        "lost messages",
+        "",
+    ),
+    "jitter": (stamps(IMU, scattered), IMU, "stamps", "scatter"),
+    "clock 2 % fast": (stamps(IMU, lambda t: 1.02 * t, logged=False), IMU, "clock", "gains"),
+    "leap seconds": (stamps(FIX, lambda t: t + 18 * 10**9, logged=False), FIX, "delay", "GPS time"),
+    "TAI": (stamps(FIX, lambda t: t + 37 * 10**9, logged=False), FIX, "delay", "TAI"),
+    "time zone": (stamps(FIX, lambda t: t + 7200 * 10**9, logged=False), FIX, "delay", "time zone 2 h"),
+    "rate in deg/s": (column(IMU, "turn_rate_radps", lambda w: 57.3 * (w + 1.0)), IMU, "unit", "deg/s"),
+    "force in g": (force(lambda f: f / 9.80665), IMU, "gravity", "in g"),
+    "force in mg": (force(lambda f: f / 9.80665e-3), IMU, "gravity", "in mg"),
+    "z down": (force(lambda f: f * [1, -1, -1]), IMU, "gravity", "z axis is down"),
+    "upright": (force(lambda f: f[:, [2, 1, 0]]), IMU, "mounting", "x axis up"),
+    "variance -1": (variance(setting(0, 600, -1.0, 0)), FIX, "covariance", "-1"),
+    "variance 0": (variance(setting(0, 9, 0.0)), FIX, "covariance", "zero in 9"),
+    "variance < 0": (variance(lambda p: -p), FIX, "covariance", "negative"),
+    "one number": (variance(setting(0, 600, 1.0)), FIX, "covariance", "one number"),
+    "not symmetric": (variance(asymmetric), FIX, "covariance", "not symmetric"),
+    "indefinite": (variance(indefinite), FIX, "covariance", "indefinite"),
+    "field in G": (field(lambda m: m / 100.0), MAG, "magnetometer", "in G"),
+    "field in T": (field(lambda m: m / 1e6), MAG, "magnetometer", "in T"),
+    "hard iron": (field(ellipse(8.0, 0.0, 1.0)), MAG, "magnetometer", "hard"),
+    "soft iron": (field(ellipse(0.0, 0.0, 1.3)), MAG, "magnetometer", "soft"),
+    "latitude 139": (column(FIX, "latitude_deg", lambda x: x + 90.0), FIX, "place", "exchanged"),
+    "at 0, 0": (
+        lambda s: column(FIX, "latitude_deg", setting(0, 9, 0.0))(
+            column(FIX, "longitude_deg", setting(0, 9, 0.0))(s)
+        ),
+        FIX,
+        "place",
+        "9 of 600 fixes are at 0, 0",
+    ),
+    "integers": (column(FIX, "latitude_deg", lambda x: 1e7 * x), FIX, "place", "integers of 1e-7"),
+    "frozen": (force(setting(100, 300, 0.1, 0)), IMU, "values", "frozen at 0.1 for 200"),
+    "saturated": (column(IMU, "turn_rate_radps", saturating), IMU, "values", "end of a range"),
+    "rounded": (force(lambda f: np.round(f / 0.2) * 0.2), IMU, "values", "rounded to 0.2"),
+}
+
+
+def missed(name: str, seed: int) -> str:
+    """What is said of a fault that is put in, where it is not what is to be said; else nothing."""
+    put, topic, cause, words = FAULTS[name]
+    found = lint([put(clean(seed))])
+    is_told = any((each.cause, each.topic) == (cause, topic) and words in each.words for each in found)
+    return "" if is_told else f"{name}, seed {seed}: {[each.words for each in found]}"
+
+
+def test_clean_logs_have_no_finding() -> None:
+    for seed in (1, 2, 3):
+        assert lint([clean(seed)]) == []
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_fault_is_found(name: str) -> None:
+    assert missed(name, 1) == ""
+
+
+def test_the_share_that_is_lost_is_the_sheets() -> None:
+    streams = {IMU: clean(1)[IMU]}
+    rng = np.random.Generator(np.random.Philox(key=901))
+    rng.standard_normal(6000), rng.standard_normal((6000, 3))
+    [found] = lint([{IMU: streams[IMU].take(rng.random(6000) < 0.5)}])
+    assert (found.cause, round(found.value, 6)) == ("lost messages", 0.512641)
+
+
+def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
+    """From the file, as the command's --set reads it."""
+    advised = 0
+    for name, (put, topic, cause, words) in FAULTS.items():
+        run = put(clean(1))
+        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
+        write_log(path, list(run.values()), RunMetadata("made", epoch_ns=BEGIN_NS))
+        told = [
+            each for each in fl.lint(path) if each.cause == cause and words in each.words and each.key
+        ]
+        if not told:
+            continue
+        advised += 1
+        mended = fl.lint(path, set={told[0].key: told[0].setting})
+        assert not [each for each in mended if each.cause == cause and each.topic == topic], name
+    assert advised == 11
+
+
+def test_the_command_says_by_its_exit_code_what_it_found(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    good, bad = tmp_path / "good.mcap", tmp_path / "bad.mcap"
+    write_log(good, list(clean(1).values()))
+    write_log(bad, list(FAULTS["force in g"][0](clean(1)).values()))
+    assert (main(["lint", str(good)]), main(["lint", str(tmp_path / "no.mcap")])) == (0, 2)
+    capsys.readouterr()
+    assert main(["lint", str(bad), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["findings"][0]["setting"] == 9.807
+    assert main(["info", str(bad)]) == 0
+    assert "implausible: /imu: specific_force_mps2 is in g" in capsys.readouterr().out
+
+
+if __name__ == "__main__":
+    for seed in range(1, 101):
+        for each in lint([clean(seed)]):
+            print("clean", seed, each.words)
+    for name in FAULTS:
+        misses = list(filter(None, (missed(name, seed) for seed in range(1, 101))))
+        print(f"{name}: {100 - len(misses)} of 100 {misses[:1]}")
