@@ -157,6 +157,8 @@ def _tried(
     one, other = (_metrics(each, at) for each, at in ((before, row), (done, run)))
     moved = {key: other[key] - value for key, value in one.items() if key in other}
     main = _main([key[1] for key in one])
+    if largest is None and not main:
+        return Tried(name, why="no estimate is one Gaussian, and no error is known")
     is_beyond = any(
         abs(by) > MARGIN * abs(one[key]) for key, by in moved.items() if key[1] == main and main
     )

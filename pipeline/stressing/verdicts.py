@@ -151,7 +151,7 @@ class Stressed:
         """The verdict, with the numbers of the change that decides it."""
         own = [name for name in self.tried if self.verdict(name) == self.worst]
         if self.worst == "not tried":
-            return f"{self.estimator} of {self.run}: no change could be tried"
+            return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
         name = max(own, key=lambda each: self.tried[each].largest)
         each, parting = self.tried[name], self.tried[name].parting
         far = "the metric moves" if parting is None else f"at most {each.largest:.3g} sigma"

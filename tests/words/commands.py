@@ -36,6 +36,8 @@ diagnose run.mcap -e ekf
 diagnose run.mcap -e ekf --set /robot1/odometry.forward_mps_scale=1.3 --tried
 stress run.mcap -e ekf
 observability run.mcap
+explore run.mcap -e ekf -e ukf -e iekf
+explore run.mcap -e network
 tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz
