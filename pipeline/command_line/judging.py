@@ -142,6 +142,11 @@ def evaluate(
 )
 @click.option("--out", type=RESULT, help="Write a result folder: tables, figures, the timeline.")
 @click.option("--save", type=TIMELINE, help="Write the timeline, side by side, to this .rrd file.")
+@click.option(
+    "--stress",
+    is_flag=True,
+    help="Withhold verdicts on differences below what changes do that should not matter.",
+)
 @recover_option
 @gap_option
 @json_option
@@ -183,6 +188,32 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
     from pipeline.diagnosing.command import diagnose_log
 
     diagnose_log(logs, **options)
+
+
+@command(
+    "Say whether a result is one: replay under changes that should not matter.",
+    "fuselog stress run.mcap -e ekf",
+)
+@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=ANY_PATH)
+@click.option(
+    "-e", "--estimator", "labels", multiple=True, required=True, help="Which estimators (repeatable)."
+)
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of signs, and of what is dropped.")
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option("estimators")
+def stress(logs: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
+    """Replay LOG with stamps, order, inputs, start and parameters changed by next to nothing.
+
+    The verdict comes first: harmless, sensitive (half the change does half as much), or discontinuous
+    or chaotic (it does not). An estimator takes at most twelve replays.
+    """
+    from pipeline.stressing.command import stress_logs
+
+    stress_logs(logs, labels, **options)
 
 
 @command(

@@ -9,6 +9,7 @@ from pipeline.comparing.comparing import compare
 from pipeline.output.outputs import check_outputs
 from pipeline.output.terminal import print_json, print_table, progress, say, warn
 from pipeline.runs.settings import settings_of_estimators, split_texts
+from pipeline.stressing.verdicts import NOT_TESTED
 
 COLUMNS = {
     "quantity": "metric",
@@ -34,6 +35,7 @@ def compare_candidates(
     out: Path | None,
     save: Path | None,
     recover: bool,
+    stress: bool,
     gap_limit_s: float,
     as_json: bool,
     settings_file: Path | None,
@@ -52,6 +54,7 @@ def compare_candidates(
         gap_limit_s=gap_limit_s,
         set=alterations,
         recover=recover,
+        stress=stress,
         progress=progress,
     )
     written = []
@@ -68,6 +71,7 @@ def compare_candidates(
                 "differences": found.table.replace({np.nan: None}).to_dict("records"),
                 "sentences": found.sentences,
                 "notes": found.notes,
+                "stress": [NOT_TESTED] if found.stress is None else found.stress.sentences,
                 "coverage": [row._asdict() for row in found.coverage],
                 "written": [str(path) for path in written],
             }
@@ -79,6 +83,8 @@ def compare_candidates(
         title = " ".join(filter(None, (str(case_), f"{second} against {first}")))
         print_table(columns, rows[list(COLUMNS)].to_numpy().tolist(), title)
     for sentence in found.sentences:
+        say(sentence)
+    for sentence in [NOT_TESTED] if found.stress is None else found.stress.sentences:
         say(sentence)
     for path in written:
         say(str(path))

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,19 +13,28 @@ import pandas as pd
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Kind
 from pipeline.comparing.candidates import Candidate
-from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, table_of_runs, unlike_runs
+from pipeline.comparing.groups import (
+    comparable_groups,
+    inputs_of,
+    kind_of,
+    runs_of,
+    table_of_runs,
+    unlike_runs,
+)
+from pipeline.comparing.paired import ALL, Paired, under_stress
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.runs.ensemble import Progress, judge_logs, no_progress
 from pipeline.runs.estimates import hash_files
+from pipeline.stressing.stressing import stress as stress_logs
+from pipeline.stressing.verdicts import Stress
 from recorders.errors import BadInput
-from recorders.log import RunMetadata
+from recorders.log import RunMetadata, open_log
 from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.errors.differences import (
-    FEWEST_RUNS,
     NATS,
     Difference,
     Target,
@@ -36,51 +45,6 @@ from replay.judging.errors.differences import (
 MARGIN = 0.02
 # The differences over time have at most so many spans.
 SPANS = 32
-ALL = "all"
-
-
-class Paired(NamedTuple):
-    """A metric of two candidates.
-
-    Attributes:
-        first, second: the candidates' names.
-        quantity: the metric.
-        case: of what; `all` is the mean over the cases of each run.
-        target: what it should be.
-        found: the difference over the runs.
-        where: when it is, from and to, in seconds since the epoch; None where it is no more at one time.
-    """
-
-    first: str
-    second: str
-    quantity: str
-    case: str
-    target: Target
-    found: Difference
-    where: tuple[float, float] | None = None
-
-    @property
-    def sentence(self) -> str:
-        """The verdict in words."""
-        found = self.found
-        of = f" of {self.case}" if self.case else ""
-        values = f"{found.second:.4g} against {found.first:.4g}"
-        if isinstance(self.target, float):
-            values += f", where {self.target:g} is right"
-        if found.runs < FEWEST_RUNS and np.isnan(found.low):
-            return (
-                f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
-                f"and this is of {runs_of(found.runs)}"
-            )
-        interval = f"difference {found.difference:.3g}, 95 % from {found.low:.3g} to {found.high:.3g}"
-        margin = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
-        verdict = f"{self.second} is {found.verdict} than {self.first}"
-        if found.verdict == "unclear":
-            verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
-        elif found.verdict == "no difference":
-            verdict = f"no difference beyond the margin between {self.second} and {self.first}"
-        when = f"; most from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
-        return f"{self.quantity}{of}: {verdict}: {values}; {interval} ({margin}){when}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,6 +58,7 @@ class Differences:
         notes: sentences on what is not alike, and what was left out.
         paired: every metric of every pair.
         times: a row per pair, case, quantity and span of time: the difference and its interval.
+        stress: what changes that should not matter do; None where that was not asked for.
     """
 
     groups: Sequence[Sequence[Candidate]]
@@ -102,6 +67,7 @@ class Differences:
     notes: Sequence[str]
     paired: Sequence[Paired]
     times: pd.DataFrame = field(default_factory=pd.DataFrame)
+    stress: Stress | None = None
 
     @cached_property
     def table(self) -> pd.DataFrame:
@@ -114,6 +80,8 @@ class Differences:
             about = {"quantity": each.quantity, "case": each.case, "aim": _target_text(each.target)}
             values = {"first_mean": found.pop("first"), "second_mean": found.pop("second")}
             when = {"most_from_s": begin_s, "most_to_s": end_s}
+            if each.is_withheld:
+                found["verdict"] = "withheld"
             rows.append({"first": first, "second": second, **about, **values, **found, **when})
         return pd.DataFrame(rows)
 
@@ -241,6 +209,7 @@ def compare(
     gap_limit_s: float = 0.2,
     set: Mapping[str, Any] | None = None,  # noqa: A002
     recover: bool = False,
+    stress: bool = False,
     progress: Progress = no_progress,
 ) -> Differences:
     """Compare estimators over the same runs, each other one with the first.
@@ -257,6 +226,8 @@ def compare(
         set: how topics are altered, and parameters of estimators, of logs that are replayed; as for
             `replay`.
         recover: read what is whole of logs that were cut off or damaged.
+        stress: withhold verdicts on differences below what changes do that should not matter; see
+            `stress`. It takes logs and `estimators`.
         progress: is told how a replay of results goes.
 
     Raises BadInput where there are not two candidates, or they have nothing in common.
@@ -282,13 +253,22 @@ def compare(
     for group in groups:
         for second in group[1:]:
             notes += unlike_runs(group[0], second)
-            found, over_time = _compared(group[0], second, margin, notes)
-            paired += found
+            own, over_time = _compared(group[0], second, margin, notes)
+            paired += own
             times.append(over_time)
     filled = [each for each in times if len(each)]
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
+    found = None
+    if stress:
+        if {kind_of(path, recover=recover) for path in paths} != {"log"}:
+            raise BadInput(
+                f"--stress: {paths[0]} is no log to replay; give logs, and estimators with -e"
+            )
+        sources = [LogSource(open_log(path, recover=recover)) for path in paths]
+        found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
+        paired = under_stress(paired, found)
     notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
-    return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table)
+    return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
 
 
 def _labels(each: str | Mapping[str, Kind]) -> list[str]:

@@ -46,7 +46,7 @@ def inputs_of(
     recover: bool,
 ) -> list[Given]:
     """Read what every path stands for; logs without estimates are replayed together."""
-    kinds = [_kind_of(path, recover=recover) for path in paths]
+    kinds = [kind_of(path, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
     if logs and len(logs) < len(paths):
         raise BadInput(f"{logs[0]}: is a log without estimates; make them with fuselog replay")
@@ -79,7 +79,8 @@ def inputs_of(
     return [found[number] for number in range(len(paths))]
 
 
-def _kind_of(path: Path, *, recover: bool) -> str:
+def kind_of(path: Path, *, recover: bool) -> str:
+    """What stands at a path: "result", "estimates", "log" or "trajectory"."""
     if path.is_dir():
         return "result" if (path / RESULT_FILE).is_file() else "estimates"
     try:

@@ -34,6 +34,7 @@ compare est.mcap sure.mcap
 compare est.mcap wide.mcap -e ekf
 diagnose run.mcap -e ekf
 diagnose run.mcap -e ekf --set /robot1/odometry.forward_mps_scale=1.3 --tried
+stress run.mcap -e ekf
 observability run.mcap
 explore run.mcap -e ekf -e ukf -e iekf
 explore run.mcap -e network

@@ -1,0 +1,82 @@
+"""A metric of two candidates, and the verdict on it; withheld where stress moves it further."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.comparing.groups import runs_of
+from pipeline.stressing.verdicts import Stress
+from replay.judging.errors.differences import FEWEST_RUNS, Difference, Target
+
+ALL = "all"
+DECIDED = ("worse", "better", "higher", "lower")
+
+
+class Paired(NamedTuple):
+    """A metric of two candidates.
+
+    Attributes:
+        first, second: the candidates' names.
+        quantity: the metric.
+        case: of what; `all` is the mean over the cases of each run.
+        target: what it should be.
+        found: the difference over the runs.
+        where: when it is, from and to, in seconds since the epoch; None where it is no more at one time.
+        stressed: how far changes that should not matter move it, of either candidate at most.
+    """
+
+    first: str
+    second: str
+    quantity: str
+    case: str
+    target: Target
+    found: Difference
+    where: tuple[float, float] | None = None
+    stressed: float = 0.0
+
+    @property
+    def is_withheld(self) -> bool:
+        """Whether changes that should not matter move the metric further than the difference."""
+        return self.found.verdict in DECIDED and abs(self.found.difference) < self.stressed
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        found = self.found
+        of = f" of {self.case}" if self.case else ""
+        values = f"{found.second:.4g} against {found.first:.4g}"
+        if isinstance(self.target, float):
+            values += f", where {self.target:g} is right"
+        if found.runs < FEWEST_RUNS and np.isnan(found.low):
+            return (
+                f"{self.quantity}{of}: {values}; an interval takes {FEWEST_RUNS} runs or more, "
+                f"and this is of {runs_of(found.runs)}"
+            )
+        interval = f"difference {found.difference:.3g}, 95 % from {found.low:.3g} to {found.high:.3g}"
+        margin = f"{runs_of(found.runs)}, margin {found.margin:.3g}"
+        verdict = f"{self.second} is {found.verdict} than {self.first}"
+        if found.verdict == "unclear":
+            verdict = f"{self.second} and {self.first} may differ by more than the margin or not"
+        elif found.verdict == "no difference":
+            verdict = f"no difference beyond the margin between {self.second} and {self.first}"
+        if self.is_withheld:
+            return (
+                f"{self.quantity}{of}: verdict withheld: {values}; {interval}: changes that should not "
+                f"matter move it by up to {self.stressed:.3g}"
+            )
+        when = f"; most from {self.where[0]:.1f} to {self.where[1]:.1f} s" if self.where else ""
+        return f"{self.quantity}{of}: {verdict}: {values}; {interval} ({margin}){when}"
+
+
+def under_stress(paired: Sequence[Paired], stress: Stress) -> list[Paired]:
+    """Each metric with the largest change that stress makes to it, of either candidate."""
+    return [
+        each._replace(
+            stressed=max(
+                stress.moved(name, each.quantity, None if each.case == ALL else each.case)
+                for name in (each.first, each.second)
+            )
+        )
+        for each in paired
+    ]

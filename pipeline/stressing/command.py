@@ -1,0 +1,66 @@
+"""The command `fuselog stress`: it prints whether a result is one, and by what it changes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.output.terminal import print_json, print_table, say, status
+from pipeline.runs.settings import settings_of_estimators, split_texts
+from pipeline.stressing.changes import CHANGES
+from pipeline.stressing.stressing import stress
+from recorders.log import open_log
+from replay.engine.streams.sources import LogSource
+
+COLUMNS = {
+    "verdict": "verdict",
+    "amplification": "sigmas",
+    "metres": "m",
+    "degrees": "deg",
+    "growth": "growth",
+    "halved": "for half",
+    "parted_s": "part at (s)",
+    "topic": "by",
+    "note": "note",
+}
+
+
+def stress_logs(
+    logs: Sequence[Path],
+    labels: Sequence[str],
+    *,
+    model: str | None,
+    seed: int,
+    recover: bool,
+    gap_limit_s: float,
+    as_json: bool,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Stress, and print the verdicts first, then a table for each run and estimator."""
+    alterations, own = split_texts(settings)
+    chosen = settings_of_estimators(labels, own, settings_file, model=model)
+    with status() as show:
+        show("replaying under changes that should not matter")
+        found = stress(
+            [LogSource(open_log(log, recover=recover)) for log in logs],
+            [{label: values} for label, values in chosen.items()],
+            seed=seed,
+            gap_limit_s=gap_limit_s,
+            set=alterations,
+        )
+    if as_json:
+        rows = found.table.replace({np.nan: None}).to_dict("records")
+        print_json({"sentences": found.sentences, "changes": rows})
+        return
+    for sentence in found.sentences:
+        say(sentence)
+    for each in found.stressed:
+        shown = [
+            [CHANGES[row["change"]].words, *(_shown(row[name]) for name in COLUMNS)] for row in each.rows
+        ]
+        print_table(["change", *COLUMNS.values()], shown, f"{each.estimator} of {each.run}")
+
+
+def _shown(value: object) -> object:
+    return None if isinstance(value, float) and np.isnan(value) else value

@@ -1,0 +1,178 @@
+"""How far two replays are apart: in sigmas of the first, in metres and degrees, and since when.
+
+A(t) = sqrt(d' P^-1 d / n), with the difference d of n components and the covariance P of the unchanged
+replay. A moved start never grows in A where the filter is linear: d' P^-1 d does not rise (Deyst and
+Price, Conditions for asymptotic stability of the discrete minimum-variance linear estimator, 1968).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from replay.engine.vectors.covariances import normalized_error_squared
+from replay.engine.vectors.tangent import difference, tangent_components
+
+Floats = NDArray[np.float64]
+PARTED = 10.0  # copies part where A is that many times its first value
+LEAST = 1e-6  # below this share of a sigma, copies have not parted
+AXES = ("x_m", "y_m", "z_m")
+
+
+class Parting(NamedTuple):
+    """Two replays of one estimate.
+
+    Attributes:
+        topic: the estimate's.
+        stamps_ns: (n,) of the unchanged replay.
+        amplification: (n,) A.
+        metres, degrees: (n,) of positions and of angles; NaN where the state has none.
+        spread: how much the standard deviations differ at most, as a share of them.
+    """
+
+    topic: str
+    stamps_ns: NDArray[np.int64]
+    amplification: Floats
+    metres: Floats
+    degrees: Floats
+    spread: float
+
+    @property
+    def growth(self) -> float:
+        """The largest A for the first one that is not zero."""
+        there = self.amplification[self.amplification > 0.0]
+        return float(np.max(there) / there[0]) if len(there) else 1.0
+
+    @property
+    def parted(self) -> int | None:
+        """The row where the copies part; None where they do not."""
+        there = np.flatnonzero(self.amplification > 0.0)
+        if not len(there):
+            return None
+        limit = PARTED * max(self.amplification[there[0]], LEAST)
+        beyond = np.flatnonzero(self.amplification > limit)
+        return int(beyond[0]) if len(beyond) else None
+
+
+def partings(base: Mapping[str, Stream], copy: Mapping[str, Stream], within_ns: int) -> list[Parting]:
+    """Compare all estimates of two replays.
+
+    Args:
+        base: the estimates of the unchanged replay, by topic.
+        copy: those of the other.
+        within_ns: how much later the copy's estimate of a stamp may be, or how much earlier.
+    """
+    return [
+        _parting(stream, copy[topic], within_ns)
+        for topic, stream in base.items()
+        if stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
+        and len(stream)
+        and len(copy.get(topic, ()))
+        and np.all(np.diff(stream.publish_time_ns) > 0)  # of several things at once none is the same
+    ]
+
+
+def _parting(base: Stream, copy: Stream, within_ns: int) -> Parting:
+    stamps_ns = base.publish_time_ns
+    row = np.searchsorted(copy.publish_time_ns, stamps_ns + within_ns, side="right") - 1
+    both = (row >= 0) & (copy.publish_time_ns[np.maximum(row, 0)] >= stamps_ns - within_ns)
+    here, there = base.take(both), copy.take(row[both])
+    kinds = base.metadata["kinds"].split(",")
+    names = tangent_components(base.metadata["components"].split(","), kinds)
+    apart = difference(there["mean"], here["mean"], kinds)
+    covariance = covariances(here)
+    amplification = np.sqrt(normalized_error_squared(apart, covariance) / max(1, apart.shape[1]))
+    sigmas, others = (np.sqrt(np.einsum("rii->ri", covariances(each))) for each in (here, there))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = np.abs(others / sigmas - 1.0)
+    return Parting(
+        base.topic,
+        here.publish_time_ns,
+        np.nan_to_num(amplification),
+        _norm(apart, [name in AXES for name, _ in names]),
+        np.degrees(_norm(apart, [kind in ("angle", "rotation") for _, kind in names])),
+        float(np.max(np.nan_to_num(spread, posinf=0.0), initial=0.0)),
+    )
+
+
+def covariances(stream: Stream) -> Floats:
+    """The covariances (rows, n, n) of Gaussian estimates."""
+    n = int(np.sqrt(stream["covariance"].shape[1]))
+    return stream["covariance"].reshape(len(stream), n, n)
+
+
+def _norm(apart: Floats, is_in: Sequence[bool]) -> Floats:
+    if not any(is_in):
+        return np.full(len(apart), np.nan)
+    return np.asarray(np.linalg.norm(apart[:, np.array(is_in)], axis=1), np.float64)
+
+
+class Undetermined(NamedTuple):
+    """A direction of the state that the measurements do not determine.
+
+    Attributes:
+        components: their names, all of one unit.
+        direction: (n,) of length one, its largest entry positive.
+        sigma: along it, at the end.
+        next_sigma: the largest across it.
+        since_ns: when a measurement narrowed it last.
+    """
+
+    components: tuple[str, ...]
+    direction: Floats
+    sigma: float
+    next_sigma: float
+    since_ns: int
+
+    @property
+    def words(self) -> str:
+        """The direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
+        parts = [
+            f"{'-' if value < 0 else '+'} {abs(value):.2g} {name}"
+            for name, value in zip(self.components, self.direction, strict=True)
+            if abs(value) >= 0.1
+        ]
+        return " ".join(parts).removeprefix("+ ")
+
+
+def undetermined(stream: Stream, row: int = -1, least: float = 3.0) -> Undetermined | None:
+    """Find the worst direction among components of one unit, where one is known far worse than others.
+
+    Components of different units have no common length, so that only those of one are compared.
+
+    Args:
+        stream: Gaussian estimates.
+        row: of which of them.
+        least: how many times the standard deviation is that of the other directions, at least.
+    """
+    kinds = stream.metadata["kinds"].split(",")
+    names = [name for name, _ in tangent_components(stream.metadata["components"].split(","), kinds)]
+    units = [name.rpartition("_")[2] for name in names]
+    all_, found = covariances(stream), list[Undetermined]()
+    for unit in dict.fromkeys(units):
+        places = [place for place, each in enumerate(units) if each == unit]
+        own = all_[:, places][:, :, places]
+        if len(places) < 2 or not np.isfinite(own[row]).all():
+            continue
+        values, vectors = np.linalg.eigh(own[row])
+        if values[-1] <= 0.0 or values[-1] < least**2 * values[-2]:
+            continue
+        direction = vectors[:, -1] * np.sign(vectors[np.argmax(np.abs(vectors[:, -1])), -1])
+        variances = np.einsum("i,rij,j->r", direction, own[: row + 1 or None], direction)
+        found.append(
+            Undetermined(
+                tuple(names[place] for place in places),
+                direction,
+                float(np.sqrt(values[-1])),
+                float(np.sqrt(max(values[-2], 0.0))),
+                int(stream.publish_time_ns[_last_narrowed(variances)]),
+            )
+        )
+    return max(found, key=lambda each: each.sigma / max(each.next_sigma, 1e-300), default=None)
+
+
+def _last_narrowed(variances: Floats) -> int:
+    """The row that is the last one narrower than all before it since the variance was that small."""
+    return int(np.flatnonzero(variances <= variances.min())[-1])

@@ -1,0 +1,225 @@
+"""What changes that should not matter did to a result: harmless, sensitive, discontinuous or chaotic."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pipeline.stressing.changes import CHANGES
+from pipeline.stressing.partings import Parting, Undetermined, undetermined
+from recorders.log import Stream
+
+Verdict = Literal["harmless", "sensitive", "discontinuous or chaotic", "not tried"]
+ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
+HARMLESS = 0.1  # A below this
+MARGIN = 0.02  # of the metric, as compare's
+HALVES = (1.9, 2.1)  # how many times less half of a change does, where it is in proportion
+ONE_SIGMA = 1.0  # A of a change that has no half: beyond it the copies are two results
+PER_PREDICTION = 1e-4  # the share by which moved stamps change a sigma, from which on half is tried
+SHRINKS = 1.5  # of a sigma: noise per prediction does not shrink with the shift, 1; per second 2
+NOT_TESTED = "not stress-tested: --stress says whether changes that should not matter change a verdict"
+
+
+class Tried(NamedTuple):
+    """One change to one run, as replayed.
+
+    Attributes:
+        name: a key of `CHANGES`.
+        parting: of the estimate that it moves most; None where no estimate is a Gaussian.
+        moved: by (case, metric) how far a metric is from that of the unchanged replay.
+        is_beyond: whether the main metric moved beyond the margin.
+        why: why it was not tried.
+    """
+
+    name: str
+    parting: Parting | None = None
+    moved: Mapping[tuple[str, str], float] = {}
+    is_beyond: bool = False
+    why: str = ""
+
+    @property
+    def largest(self) -> float:
+        """The largest A."""
+        return float(self.parting.amplification.max(initial=0.0)) if self.parting else 0.0
+
+    @property
+    def is_wider(self) -> bool:
+        """Whether moved stamps change a covariance by more than noise per second mostly does."""
+        return (
+            self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Stressed:
+    """One estimator over one run, stressed.
+
+    Attributes:
+        run: the run's name.
+        estimator: the label.
+        epoch_ns: the run's time zero.
+        tried: each change, whole; halves: those that were halved.
+        sensors: the stamps of each topic that was sensed.
+        estimates: those of the unchanged replay.
+    """
+
+    run: str
+    estimator: str
+    epoch_ns: int
+    tried: Mapping[str, Tried]
+    halves: Mapping[str, Tried]
+    sensors: Mapping[str, Any]
+    estimates: Mapping[str, Stream]
+
+    def ratio(self, name: str) -> float:
+        """How many times more the whole change does than half of it, in A; NaN where none was halved."""
+        half = self.halves.get(name)
+        return self.tried[name].largest / half.largest if half and half.largest > 0.0 else np.nan
+
+    def verdict(self, name: str) -> Verdict:
+        """What a change does."""
+        each = self.tried[name]
+        if each.why:
+            return "not tried"
+        if each.largest < HARMLESS and not each.is_beyond:
+            return "harmless"
+        if CHANGES[name].is_scaled:
+            is_in_proportion = HALVES[0] <= self.ratio(name) <= HALVES[1]
+            return "sensitive" if is_in_proportion else "discontinuous or chaotic"
+        return "sensitive" if each.largest < ONE_SIGMA else "discontinuous or chaotic"
+
+    @property
+    def worst(self) -> Verdict:
+        """The worst of all verdicts."""
+        return max((self.verdict(name) for name in self.tried), key=ORDER.index)
+
+    @property
+    def is_per_prediction(self) -> bool:
+        """Whether a microsecond changes a covariance: one more prediction brings noise of its own."""
+        whole, half = self.tried["stamps"], self.halves.get("stamps")
+        if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
+            return False
+        return whole.parting.spread < SHRINKS * half.parting.spread
+
+    @cached_property
+    def undetermined(self) -> Undetermined | None:
+        """The direction that measurements do not determine, of the estimate that moves most."""
+        moved = max(self.tried.values(), key=lambda each: each.largest).parting
+        return None if moved is None else undetermined(self.estimates[moved.topic])
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row for each change."""
+        found = []
+        for name, each in self.tried.items():
+            row: dict[str, Any] = {
+                "run": self.run,
+                "estimator": self.estimator,
+                "change": name,
+                "verdict": self.verdict(name),
+                "amplification": each.largest if each.parting else np.nan,
+                **dict.fromkeys(("metres", "degrees", "growth", "parted_s"), np.nan),
+                "halved": self.ratio(name),
+                "topic": "",
+                "note": each.why,
+            }
+            if each.parting is not None:
+                row["metres"] = _largest(each.parting.metres)
+                row["degrees"] = _largest(each.parting.degrees)
+                row["growth"] = each.parting.growth
+                if (at := each.parting.parted) is not None:
+                    stamp_ns = int(each.parting.stamps_ns[at])
+                    row["parted_s"] = (stamp_ns - self.epoch_ns) * 1e-9
+                    row["topic"] = self._message_at(stamp_ns)
+            found.append(row)
+        return found
+
+    def _message_at(self, stamp_ns: int) -> str:
+        """The topic whose message is the last one until then."""
+        last = {
+            topic: int(stamps_ns[np.searchsorted(stamps_ns, stamp_ns, side="right") - 1])
+            for topic, stamps_ns in self.sensors.items()
+            if len(stamps_ns) and stamps_ns[0] <= stamp_ns
+        }
+        return max(last, key=lambda topic: last[topic], default="")
+
+    @property
+    def sentence(self) -> str:
+        """The verdict, with the numbers of the change that decides it."""
+        own = [name for name in self.tried if self.verdict(name) == self.worst]
+        if self.worst == "not tried":
+            return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
+        name = max(own, key=lambda each: self.tried[each].largest)
+        each, parting = self.tried[name], self.tried[name].parting
+        far = "the metric moves" if parting is None else f"at most {each.largest:.3g} sigma"
+        sizes = () if parting is None else ((parting.metres, "m"), (parting.degrees, "deg"))
+        far += "".join(f", {_largest(size):.3g} {unit}" for size, unit in sizes if np.any(size >= 0.0))
+        begin = f"{self.worst}: {self.estimator} of {self.run}: {CHANGES[name].words}: {far}"
+        if self.worst == "harmless":
+            return f"{begin}; so does every other change that was tried less"
+        if self.worst == "sensitive":
+            how = f"; half the change does {1.0 / self.ratio(name):.2g} of it"
+            return begin + (how if name in self.halves else "")
+        how = f"; half the change does {1.0 / self.ratio(name):.2g} of it: it does not shrink with it"
+        return begin + (how if name in self.halves else "")
+
+    @property
+    def sentences(self) -> list[str]:
+        """The verdict first, then what explains it."""
+        said = [self.sentence]
+        if self.is_per_prediction:
+            said.append(
+                "noise per prediction, not per second: a microsecond makes one prediction two, and "
+                "that changes the covariance; scale the noise with the duration"
+            )
+        if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
+            least = self.undetermined
+            since_s = (least.since_ns - self.epoch_ns) * 1e-9
+            said.append(
+                f"from {since_s:.1f} s on {least.words} is not determined: its sigma is "
+                f"{least.sigma:.3g}, across it {least.next_sigma:.3g}"
+            )
+        return said
+
+
+def _largest(values: Any) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else np.nan
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Stress:
+    """Estimators over runs, stressed: one of `Stressed` for each."""
+
+    stressed: Sequence[Stressed]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """Return a row per run, estimator and change: A, metres, degrees, growth, verdict."""
+        return pd.DataFrame([row for each in self.stressed for row in each.rows])
+
+    @property
+    def sentences(self) -> list[str]:
+        """Return the verdicts in words, the worst first."""
+        by_weight = sorted(self.stressed, key=lambda each: -ORDER.index(each.worst))
+        return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
+
+    def moved(self, estimator: str, quantity: str, case: str | None) -> float:
+        """The largest change of a metric, as a mean over runs; of all cases where none is named."""
+        own = [each for each in self.stressed if each.estimator == estimator]
+        largest = 0.0
+        for name in CHANGES:
+            found = [
+                by
+                for each in own
+                for key, by in each.tried.get(name, Tried(name)).moved.items()
+                if key[1] == quantity and case in (None, key[0])
+            ]
+            largest = max(largest, abs(float(np.mean(found)))) if found else largest
+        return largest
+
+    def __repr__(self) -> str:
+        return "\n".join(self.sentences)
