@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # commands are started some hundred times: what they import is compiled once, whatever is usual here
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast coverage fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -49,6 +49,10 @@ pipeline-lane: .venv/with-test
 rooms-lane: .venv/with-test
 	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \
 		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py
+
+# what no test runs, by lines and branches; kernels are machine code, of which no line is seen
+coverage: .venv/with-test
+	$(BIN)/pytest --cov --cov-branch --cov-context=test --cov-report=html:build/coverage --cov-report=term $(TESTS)
 
 lint: .venv/with-test
 	$(BIN)/ruff format --check .

@@ -23,6 +23,7 @@ from pipeline.comparing.comparing import Differences as Differences
 from pipeline.comparing.comparing import compare as compare
 from pipeline.diagnosing.diagnosis import Diagnosis as Diagnosis
 from pipeline.diagnosing.diagnosis import diagnose as diagnose
+from pipeline.exploring.explore import explore as explore
 from pipeline.logs.edit import constrain as constrain
 from pipeline.logs.edit import cut as cut
 from pipeline.logs.edit import merge as merge

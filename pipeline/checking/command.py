@@ -41,7 +41,8 @@ def check_path(
         )
         streams = sum(len(run["streams"]) for run in made["runs"].values())
         size_kb = golden.stat().st_size / 1e3
-        say(f"{golden}: {len(made['runs'])} runs, {streams} streams, {size_kb:.0f} kB")
+        runs = len(made["runs"])
+        say(f"{golden}: {runs} run{'s' * (runs != 1)}, {streams} streams, {size_kb:.0f} kB")
         return True
     if labels or settings or settings_file or late or arrival_order or columns or tolerances:
         raise BadInput(

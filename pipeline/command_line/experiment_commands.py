@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.api.api import run, sweep
-from pipeline.output.results import RESULT_FILE, RUNS, read_table, split_metric
+from pipeline.output.results import RESULT_FILE, RUNS, keep_causes, read_table, split_metric
 from pipeline.output.terminal import (
     has_many_cases,
     print_claims,
@@ -44,6 +44,7 @@ def run_named(
     out: Path | None,
     workers: int | None,
     scheduler: str | None,
+    diagnose: bool,
     tells_parameters: bool,
     as_json: bool,
     settings_file: Path | None,
@@ -74,14 +75,20 @@ def run_named(
         progress=progress,
     )
     result = done.result
+    if diagnose:
+        from pipeline.diagnosing.likeliest import likeliest_causes
+
+        result = keep_causes(done.folder, result, likeliest_causes(done.folder, result))
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
     print_worst(result.alarms)
+    for cause in result.causes:
+        say(f"likeliest cause of {cause.estimator}: {cause.words} {cause.mended}".rstrip())
     if result.claims or has_many_cases(result.metrics):
-        from pipeline.output.report.verdict import verdict  # it takes long to import
+        from pipeline.output.report.kinds import said  # it takes long to import
 
-        say(" ".join(verdict(result)))
+        say(" ".join(said(result, done.folder)))
     runs = done.folder / RUNS
     details = done.folder / (
         "tables/summary.csv" if "tables/summary.csv" in result.files else RESULT_FILE

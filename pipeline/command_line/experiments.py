@@ -23,6 +23,10 @@ from pipeline.command_line.options import (
 )
 from recorders.errors import printable
 
+diagnose_option = click.option(
+    "--diagnose", is_flag=True, help="Say why an estimator is inconsistent, by its first run."
+)
+
 
 @command(
     "Run an experiment: record, replay, evaluate, draw.",
@@ -44,6 +48,7 @@ from recorders.errors import printable
 @click.option("--out", type=RESULT, help="The result folder [default: out/EXPERIMENT].")
 @workers_option
 @scheduler_option
+@diagnose_option
 @parameters_alone_option
 @json_option
 @settings_option
@@ -126,11 +131,17 @@ def sweep(
 @click.argument("results", nargs=-1, required=True, type=ANY_PATH)
 @click.option("-o", "--out", type=PAGE, default=Path("report.html"), show_default=True)
 @click.option("--viewer", is_flag=True, help="Show the first runs in the viewer; takes 15 s each.")
-def report(results: tuple[Path, ...], out: Path, viewer: bool) -> None:
+@diagnose_option
+def report(results: tuple[Path, ...], out: Path, viewer: bool, diagnose: bool) -> None:
     """Render RESULTS, folders that `fuselog run` wrote, as one self-contained HTML page."""
     from pipeline.output.outputs import REPORT, check_files
     from pipeline.output.report import write_report
 
     check_files([(out, REPORT)], {"result": [path for each in results for path in each.rglob("*")]})
-    write_report(list(results), out, viewer=viewer)
+    seek = None
+    if diagnose:
+        from pipeline.diagnosing.likeliest import likeliest_causes
+
+        seek = likeliest_causes
+    write_report(list(results), out, viewer=viewer, diagnose=seek)
     click.echo(printable(f"{out}: {out.stat().st_size / 1e6:.1f} MB"))

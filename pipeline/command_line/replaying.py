@@ -93,6 +93,32 @@ def replay(logs: tuple[Path, ...], names: tuple[str, ...], **options: Any) -> No
 
 
 @command(
+    "Drag parameters of an estimator, and see at once what that changes.",
+    "fuselog explore run.mcap -e ekf",
+    "fuselog explore run.mcap -e ekf -e ukf --set gate_probability=1",
+)
+@click.argument("log", type=ANY_PATH)
+@click.option(
+    "-e", "--estimator", "names", multiple=True, required=True, help="An estimator, or two (repeatable)."
+)
+@click.option("--model", help="The model to estimate, where several fit the log.")
+@click.option("--no-browser", is_flag=True, help="Print the page's address, and open nothing.")
+@recover_option
+@gap_option
+@settings_option
+@set_option("estimators")
+def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
+    """Serve a page on which LOG is replayed while parameters are dragged.
+
+    The page is served to this machine only, at an address that cannot be guessed. The command ends when
+    the page is closed, or by Ctrl-C.
+    """
+    from pipeline.exploring.command import explore_log
+
+    explore_log(log, list(names), **options)
+
+
+@command(
     "Search the parameters of an estimator that explain logs best.",
     "fuselog tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad",
     "fuselog tune train -e ekf --free sigma_range_m --validate test",

@@ -13,7 +13,7 @@ import pandas as pd
 from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Kind
 from pipeline.comparing.candidates import Candidate
-from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, unlike_runs
+from pipeline.comparing.groups import comparable_groups, inputs_of, runs_of, table_of_runs, unlike_runs
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -171,7 +171,8 @@ class Differences:
         inputs = self.inputs
         check_folder(place, {"input": inputs})
         names = [[candidate.name for candidate in candidates] for candidates in self.groups]
-        outcome = Outcome(tables={"differences": self.table}, figures=dict(self.charts()))
+        tables = {"differences": self.table, "runs": table_of_runs(self.groups)}
+        outcome = Outcome(tables=tables, figures=dict(self.charts()))
         if self.coverage:
             outcome.tables["coverage"] = coverage_table(self.coverage)
         if len(self.times):

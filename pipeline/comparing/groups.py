@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from pipeline.api.planning import Kind
 from pipeline.api.replays import replay
 from pipeline.comparing.candidates import (
@@ -188,3 +190,14 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""
         what = ", ".join(differing[:NAMED])
         yield f"settings differ between {first.name} and {second.name}: {what}{more}"
+
+
+def table_of_runs(groups: Sequence[Sequence[Candidate]]) -> pd.DataFrame:
+    """A row per candidate, case and run, with all its metrics."""
+    keys = ["case", "run"]
+    found = {each.name: each.rows for group in groups for each in group}
+    tables = [
+        rows.pivot_table("value", keys, "quantity", sort=False).reset_index().assign(estimator=name)
+        for name, rows in found.items()
+    ]
+    return pd.concat(tables, ignore_index=True)

@@ -30,8 +30,7 @@ from pipeline.diagnosing.findings import (
     of_plausibility,
     without_filter,
 )
-from pipeline.diagnosing.outputs import Outputs
-from pipeline.diagnosing.portion import first_part, on_the_rest
+from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest
 from pipeline.diagnosing.sentences import Sentence, ranked
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import TIMELINE, check_files, check_folder

@@ -129,7 +129,7 @@ def of_innovations(
         locked_out = _long_runs(~is_in, LOCKED_OUT)
         if locked_out:
             begin, end = locked_out[0]
-            more = f" and {len(locked_out) - 1} times more" if len(locked_out) > 1 else ""
+            more = f" and {_times(len(locked_out) - 1)} again" if len(locked_out) > 1 else ""
             yield Finding(
                 "gate",
                 topic,
@@ -222,7 +222,7 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
                 "lost messages",
                 stream.topic,
                 f"{stream.topic}: silent for {steps[longest] * 1e-9:.3g} s from "
-                f"{_at(stamps_ns[longest], epoch_ns)} on, where {usual * 1e-9:.3g} s are usual",
+                f"{_at(stamps_ns[longest], epoch_ns)} on, where the usual step is {usual * 1e-9:.3g} s",
                 int(stamps_ns[longest]),
             )
     repeated = _repeated(stream)
@@ -230,8 +230,8 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
         yield Finding(
             "stamps",
             stream.topic,
-            f"{stream.topic}: {repeated} messages are there twice, with equal stamp and content, and "
-            "count twice; leave them out where the log is written",
+            f"{stream.topic}: {repeated} message{' is' if repeated == 1 else 's are'} there twice, "
+            "with equal stamp and content; leave the second of each out where the log is written",
         )
     in_order = stream.publish_time_ns[np.argsort(stream.log_time_ns, kind="stable")]
     behind = np.maximum.accumulate(in_order) - in_order
@@ -314,3 +314,7 @@ def of_estimates(estimates: Mapping[str, Stream]) -> Iterator[Finding]:
 
 def _at(time_ns: int, epoch_ns: int) -> str:
     return f"{(int(time_ns) - epoch_ns) * 1e-9:.4g} s"
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

@@ -1,21 +1,49 @@
 """Long logs: causes are sought in their first part, and tried on the rest."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.altering.sources import alter, split_settings
-from pipeline.api.replays import replay
+from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import number
-from pipeline.diagnosing.outputs import Outputs
-from recorders.log import RunMetadata, Stream, schemas
+from recorders.log import RunMetadata, Schema, Stream, schemas
 from recorders.log.streams import concatenate
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import Bound
 from replay.engine.streams.sources import LogSource, MemorySource
 
 MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
+
+
+class Outputs(Mapping[str, Stream]):
+    """The outputs of a replay that have a schema, by topic: each is read anew when it is asked for.
+
+    Of a long log they are much.
+    """
+
+    def __init__(self, done: Replay, schema: Schema) -> None:
+        self._estimates = done.estimates[0]
+        self._topics = [
+            name
+            for name, topic in self._estimates.topics.items()
+            if topic.schema_name == schema.full_name and topic.messages
+        ]
+
+    def __getitem__(self, topic: str) -> Stream:
+        return self._estimates[topic]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._topics)
+
+    def __len__(self) -> int:
+        return len(self._topics)
+
+    def state(self, column: str) -> bool:
+        """Whether all of them have a column."""
+        firsts = (next(iter(self._estimates.blocks([topic], "publish_time", 1))) for topic in self)
+        return all(column in stream.columns for first in firsts for stream in first.values())
 
 
 class Portion(NamedTuple):

@@ -1,4 +1,7 @@
-"""Defines an alarm: what makes a replay's numbers doubtful; `pipeline.output.alarming` finds them."""
+"""Defines what makes a replay's numbers doubtful, and why: alarms and their likeliest causes.
+
+`pipeline.output.alarming` finds the alarms, `fuselog run --diagnose` the causes.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -22,3 +25,22 @@ class Alarm:
     case: str
     excess: float
     words: str
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Why an estimator is likeliest inconsistent, as a diagnosis found it.
+
+    Attributes:
+        estimator: whose.
+        words: the sentence.
+        short: the same in a few words, for the report's first sentence.
+        setting: what undoes it, as `--set` has it; empty where none does.
+        mended: what came of the same runs with that; empty where they were not replayed.
+    """
+
+    estimator: str
+    words: str
+    short: str
+    setting: str = ""
+    mended: str = ""

@@ -26,11 +26,13 @@ COLOURS = (
     *("#138f97", "#d0459a", "#9c6b3f", "#878a12", "#5f78a8"),
 )
 REFERENCE_COLOUR = "#808080"
+OUTSIDE_COLOUR = "#d6336c"
 
 
 Numbers = list[float | None]
 Places = list[float | None] | list[str]
-Style = Literal["line", "dashed", "markers", "dots", "line+markers"]
+# Triangles are landmarks, an area is closed, what is outside is red.
+Style = Literal["line", "dashed", "markers", "dots", "line+markers", "triangles", "area", "outside"]
 
 
 class Axis(Parameters):
@@ -95,18 +97,29 @@ class Panel(Parameters):
 
 
 class Chart(Parameters):
-    """Panels in rows of so many columns, with one legend."""
+    """Panels in rows of so many columns, with one legend unless their titles say what is drawn."""
 
     panels: list[Panel]
     title: str = ""
     columns: PositiveInt = 1
+    legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
         """Return the colour of every label; charts that begin with the same labels agree on theirs."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
-        own = dict.fromkeys([*first, *(each.label for each in drawn if not each.reference)])
+        own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
-        return {each.label: REFERENCE_COLOUR for each in drawn if each.reference} | colours
+        outside = {
+            each.label: OUTSIDE_COLOUR
+            for panel in self.panels
+            for each in panel.series
+            if each.style == "outside"
+        }
+        return {each.label: REFERENCE_COLOUR for each in drawn if each.reference} | colours | outside
+
+
+def _has_own_colour(drawn: Drawn) -> bool:
+    return not drawn.reference and not (isinstance(drawn, Series) and drawn.style == "outside")
 
 
 def thinned(count: int) -> slice:
@@ -173,7 +186,7 @@ def draw(chart: Chart) -> "Figure":
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    if handles:
+    if handles and chart.legend:
         columns = min(len(handles), 5)
         figure.legend(
             handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8
@@ -187,6 +200,9 @@ STYLES: dict[Style, dict[str, Any]] = {
     "markers": {"linestyle": "", "marker": "o", "markersize": 4},
     "dots": {"linestyle": "", "marker": "o", "markersize": 1, "alpha": 0.5},
     "line+markers": {"marker": "o", "markersize": 3},
+    "triangles": {"linestyle": "", "marker": "^", "markersize": 5, "fillstyle": "none"},
+    "area": {"alpha": 0.7},
+    "outside": {"linestyle": "", "marker": "s", "markersize": 2.5, "clip_on": False},
 }
 
 
@@ -214,3 +230,19 @@ def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
 def _known(values: Places) -> list[Any]:
     """Values as matplotlib has them: NaN where there is none."""
     return [math.nan if value is None else value for value in values]
+
+
+def show_names_as_they_are(figure: "Figure") -> None:
+    """Titles, labels and stated ticks hold names from logs: a dollar sign in them begins no formula."""
+    from matplotlib.ticker import FixedFormatter, FuncFormatter
+
+    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
+    texts = [text for legend in legends for text in legend.get_texts()]
+    for axes in figure.axes:
+        texts.append(axes.title)
+        for axis in (axes.xaxis, axes.yaxis):
+            texts.append(axis.label)
+            if isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter):
+                texts += axis.get_ticklabels()
+    for text in texts:
+        text.set_parse_math(False)

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from urllib.parse import quote
 
 from pipeline.output import RESULT_FILE as RESULT_FILE
-from pipeline.output.alarms import Alarm
-from pipeline.output.charts import Chart, draw
+from pipeline.output.alarms import Alarm, Cause
+from pipeline.output.charts import Chart, draw, show_names_as_they_are
 from pipeline.output.claims import Claim, known
-from recorders.atomic import whole_folder
+from recorders.atomic import whole_file, whole_folder
 from recorders.errors import BadInput, check_format
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
@@ -49,7 +49,8 @@ class Outcome:
     `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one lies with
     95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
     a hash of the data that went in, `parameters` are those of all estimators, defaults included,
-    `alarms` what makes the metrics doubtful.
+    `alarms` what makes the metrics doubtful, `causes` why an estimator is inconsistent, where it was
+    diagnosed.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -61,6 +62,7 @@ class Outcome:
     bounds: dict[str, Bounds] = field(default_factory=dict)
     intervals: dict[str, Bounds] = field(default_factory=dict)
     alarms: list[Alarm] = field(default_factory=list)
+    causes: list[Cause] = field(default_factory=list)
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
         """Keep a metric with its 95 % interval."""
@@ -73,7 +75,7 @@ class Result(Parameters):
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
     without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
     lies with 95 % if all is well, `intervals` where the true one lies with 95 %; `alarms` are what makes
-    the metrics doubtful, the worst first.
+    the metrics doubtful, the worst first; `causes` why estimators are inconsistent, by a diagnosis.
     """
 
     format: int = FORMAT
@@ -87,6 +89,7 @@ class Result(Parameters):
     bounds: dict[str, Bounds] = {}
     intervals: dict[str, tuple[float | None, float | None]] = {}
     alarms: list[Alarm] = []
+    causes: list[Cause] = []
 
     @property
     def contents(self) -> list[str]:
@@ -322,7 +325,7 @@ def write_outcome(
             path.with_suffix(".json").write_text(figure.model_dump_json() + "\n", encoding="utf-8")
             figure = draw(figure)
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
-            _show_names_as_they_are(figure)
+            show_names_as_they_are(figure)
             figure.savefig(path, metadata={"Date": None})
     written = sorted(path for path in folder.rglob("*") if path.is_file())
     result = _sealed(
@@ -338,6 +341,7 @@ def write_outcome(
             },
             claims=[known(claim) for claim in outcome.claims],
             alarms=outcome.alarms,
+            causes=outcome.causes,
             files={
                 path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else hash_of(path)
                 for path in written
@@ -348,20 +352,12 @@ def write_outcome(
     return result
 
 
-def _show_names_as_they_are(figure: "Figure") -> None:
-    """Titles, labels and stated ticks hold names from logs: a dollar sign in them begins no formula."""
-    from matplotlib.ticker import FixedFormatter, FuncFormatter
-
-    legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]
-    texts = [text for legend in legends for text in legend.get_texts()]
-    for axes in figure.axes:
-        texts.append(axes.title)
-        for axis in (axes.xaxis, axes.yaxis):
-            texts.append(axis.label)
-            if isinstance(axis.get_major_formatter(), FixedFormatter | FuncFormatter):
-                texts += axis.get_ticklabels()
-    for text in texts:
-        text.set_parse_math(False)
+def keep_causes(folder: Path, result: Result, causes: Sequence[Cause]) -> Result:
+    """Write the causes that a diagnosis found into a result's folder."""
+    told = _sealed(result.model_copy(update={"causes": [*causes]}))
+    with whole_file(folder / RESULT_FILE) as new:
+        new.write_text(_text(told), encoding="utf-8")
+    return told
 
 
 def read_result(folder: Path) -> Result:

@@ -6,13 +6,15 @@ from typing import Any
 import pandas as pd
 
 from pipeline.output.alarming import alarms_of
-from pipeline.output.charts import Axis, Chart, Panel, Style, band, curve, thinned
+from pipeline.output.charts import Axis, Chart, Panel, Series, Style, band, curve, thinned
 from pipeline.output.coverage import coverage_table
 from pipeline.output.results import MetricValue, Outcome, split_metric
 from replay.engine.replaying.usage import Row
 from replay.judging.errors.evaluation import Errors
 from replay.judging.judge import Judge
 from replay.judging.metrics.means import INSERTED
+
+MOST_COLUMNS = 3
 
 
 def summarise(
@@ -71,27 +73,93 @@ def summary_table(metrics: Mapping[str, MetricValue]) -> pd.DataFrame:
 
 
 def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
-    """RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent."""
+    """RMSE and NEES over time, all runs together, and where each lies with 95 % if consistent.
+
+    A panel shows one estimator, a row of them has one pair of axes: curves never lie on one another.
+    """
     first, table = judged[0]
-    named = {"position_rmse_m": "position RMSE (m)", "orientation_rmse_deg": "orientation RMSE (deg)"}
-    main = named.get(first.main.rmse, f"RMSE {first.components[0]}")
-    rmse = Panel(x=Axis(label="time (s)"), y=Axis(label=main, log=True))
-    nees = Panel(x=Axis(label="time (s)"), y=Axis(label="mean NEES", log=True))
+    named = {
+        "position_rmse_m": "position error, RMS (m)",
+        "orientation_rmse_deg": "orientation error (°)",
+    }
+    main = named.get(first.main.rmse, f"error of {first.components[0]}, RMS")
+    bounds = [
+        curve(errors.estimator, rows["elapsed_s"], rows[errors.main.rmse], "dashed")
+        for errors, steps in judged
+        if errors.is_bound and len(rows := steps.iloc[thinned(len(steps))])
+    ]
+    rmse_axis = _log_axis(main, [of for _, of in judged], first.main.rmse)
+    nees_axis = _log_axis(
+        "mean NEES",
+        [of for errors, of in judged if not errors.is_bound],
+        "nees",
+        "nees_low",
+        "nees_high",
+    )
+    rmse, nees = [], []
     for errors, of_all in judged:
-        steps = of_all.iloc[thinned(len(of_all))]
-        label, time_s, quantity = errors.estimator, steps["elapsed_s"], errors.main.rmse
-        rmse.series.append(curve(label, time_s, steps[quantity]))
         if errors.is_bound:
             continue
-        rmse.bands.append(band(label, time_s, steps[f"{quantity}_low"], steps[f"{quantity}_high"]))
-        nees.series.append(curve(label, time_s, steps["nees"]))
+        steps = of_all.iloc[thinned(len(of_all))]
+        label, time_s, quantity = errors.estimator, steps["elapsed_s"], errors.main.rmse
+        x, ends = Axis(label="time (s)"), (steps[f"{quantity}_low"], steps[f"{quantity}_high"])
+        panel = Panel(x=x, y=rmse_axis, title=_title(label, of_all, quantity, f"{quantity}_low"))
+        panel.bands.append(band(label, time_s, *ends))
+        panel.series.append(curve(label, time_s, steps[quantity]))
+        panel.series.extend(bounds)
+        panel.series.extend(_outside(steps, quantity, *ends, rmse_axis))
+        rmse.append(panel)
+        panel = Panel(x=x, y=nees_axis, title=_title(label, of_all, "nees", "nees_low"))
         consistent = f"95 % if consistent ({len(errors.components)} components)"
-        if consistent not in {each.label for each in nees.bands}:
-            interval = steps["nees_low"], steps["nees_high"]
-            nees.bands.append(band(consistent, time_s, *interval, reference=True))
+        panel.bands.append(
+            band(consistent, time_s, steps["nees_low"], steps["nees_high"], reference=True)
+        )
+        panel.series.append(curve(label, time_s, steps["nees"]))
+        panel.series.extend(_outside(steps, "nees", steps["nees_low"], steps["nees_high"], nees_axis))
+        nees.append(panel)
     runs = int(table["runs"].max())
     what = f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}"
-    return Chart(title=f"{what}; bands: the RMSE's 95 % if consistent", panels=[rmse, nees])
+    panels = [*rmse, *nees]
+    title = f"{what}; tinted: where 95 % lie if the estimator's covariance is right"
+    return Chart(title=title, panels=panels, columns=max(1, min(len(rmse), MOST_COLUMNS)), legend=False)
+
+
+def _log_axis(label: str, tables: Sequence[pd.DataFrame], *columns: str) -> Axis:
+    """One axis for all tables: from below the least to above the greatest, none of them zero."""
+    values = pd.concat([table[name] for table in tables for name in columns if name in table])
+    positive = values[(values > 0) & (values < float("inf"))]
+    if positive.empty:
+        return Axis(label=label, log=True)
+    low, high = positive.quantile(0.001), positive.max()
+    return Axis(label=label, log=True, limits=(float(low) / 1.5, float(high) * 1.2))
+
+
+def _title(label: str, steps: pd.DataFrame, quantity: str, low: str) -> str:
+    """An estimator's name, and at how many of the steps it is outside."""
+    known = steps[[quantity, low, low.replace("_low", "_high")]].dropna()
+    if known.empty:
+        return label
+    is_out = (known.iloc[:, 0] < known.iloc[:, 1]) | (known.iloc[:, 0] > known.iloc[:, 2])
+    share = float(is_out.mean())
+    where = (
+        "never"
+        if not share
+        else "always"
+        if share == 1.0
+        else f"at {100 * max(share, 0.01):.0f} % of steps"
+    )
+    return f"{label}: outside {where}"
+
+
+def _outside(
+    steps: pd.DataFrame, quantity: str, low: "pd.Series[float]", high: "pd.Series[float]", axis: Axis
+) -> list[Series]:
+    """A strip along the foot where a curve is outside."""
+    is_out = (steps[quantity] < low) | (steps[quantity] > high)
+    if not is_out.any() or axis.limits is None:
+        return []
+    times_s = steps["elapsed_s"][is_out]
+    return [curve("outside", times_s, [1.03 * axis.limits[0]] * len(times_s), "outside")]
 
 
 def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> dict[str, Chart]:

@@ -19,6 +19,7 @@ from pipeline.output.results import (
     split_metric,
     write_outcome,
 )
+from pipeline.output.words import label_of
 from pipeline.runs.campaigns import judge_all
 from pipeline.runs.checkpoints import checkpoints_of
 from pipeline.runs.ensemble import Progress, no_progress
@@ -38,6 +39,7 @@ MOST_POINTS = 100_000
 # Where the middle of the runs lies: nine in ten of them.
 LOW, HIGH = 0.05, 0.95
 # What is drawn, of what a result has; the rest is in the table.
+MOST_TICKS = 10
 DRAWN = ("position_rmse_m", "orientation_rmse_deg", "nees", "position_nees", "nis_per_component")
 
 
@@ -208,8 +210,16 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """A row per metric: its value over all runs, and between what nine in ten runs lie."""
-    runs = judge.runs_table
+    """A row per metric: its value over all runs, and between what nine in ten runs lie.
+
+    Of NEES and NIS also what it should be, and where it lies with 95 % if the estimator is consistent.
+    """
+    runs, bounds = judge.runs_table, judge.bounds
+    sizes = {
+        metric_key(each.estimator, name, each.case): float(size)
+        for each in judge.judged.values()
+        for name, size in (("nees", len(each.components)), ("position_nees", len(each.position)))
+    }
     rows = []
     for key, value in judge.metrics.items():
         estimator, quantity, case = split_metric(key)
@@ -218,7 +228,11 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
             is_own = (runs["estimator"] == estimator) & (runs["case"] == case)
             low, high = runs.loc[is_own, quantity].quantile([LOW, HIGH])
         said = {"estimator": estimator, "quantity": quantity, "case": case}
-        rows.append({"point": number, **point, **said, "value": value, "low": low, "high": high})
+        bound_low, bound_high = bounds.get(key, (math.nan, math.nan))
+        aim = sizes.get(key, 1.0) if key in bounds else math.nan
+        told = {"value": value, "low": low, "high": high}
+        consistent = {"aim": aim, "bound_low": bound_low, "bound_high": bound_high}
+        rows.append({"point": number, **point, **said, **told, **consistent})
     return pd.DataFrame(rows)
 
 
@@ -242,15 +256,22 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
         changes = rows.groupby("estimator")["value"].transform(np.ptp) > 0
         shown = rows[changes] if changes.any() else rows  # what is the same everywhere is no picture
         is_map = len(over) == 2 and numbers and grid
-        figures[name] = heat_maps(shown, over, name) if is_map else curves(shown, over, name)
+        drawn_as = (
+            heat_maps(shown, over, name) if is_map else curves(shown, over, str(quantity), str(case))
+        )
+        figures[name] = drawn_as
     return figures
 
 
-def curves(rows: pd.DataFrame, over: Sequence[Over], name: str) -> Chart:
+def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = "") -> Chart:
     """The quantity over each parameter; where others are swept too, the mean over them."""
     panels = []
     for each in over:
-        panel = Panel(x=Axis(label=each.key, log=each.is_log), y=Axis(label=name))
+        numbers = all(isinstance(value, int | float) for value in each.taken)
+        few = numbers and len(each.taken) <= MOST_TICKS
+        ticks = {float(value): f"{value:.3g}" for value in each.taken} if few else {}
+        x = Axis(label=each.key, log=each.is_log, ticks=ticks)
+        panel = Panel(x=x, y=Axis(label=label_of(quantity)))
         for label, own in rows.groupby("estimator", sort=False):
             means = own.groupby(each.key)[["value", "low", "high"]].mean()
             places = means.index.to_numpy()
@@ -259,7 +280,9 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], name: str) -> Chart:
                 panel.bands.append(band(str(label), places, means["low"], means["high"]))
         panels.append(panel)
     shared = ", means over the others" if len(over) > 1 else ""
-    return Chart(title=f"{name}{shared}; bands: nine in ten runs", panels=panels)
+    of = f" of {case}" if case else ""
+    title = f"{label_of(quantity)}{of}{shared}; bands: nine in ten runs"
+    return Chart(title=title, panels=panels)
 
 
 def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":

@@ -213,15 +213,7 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
         least, greatest = bounds_of(type(parameters), name)
     except BadInput as error:
         raise BadInput(f"--free {name}: {error}") from None
-    start: Any = parameters
-    for part in name.split("."):
-        start = start.get(part) if isinstance(start, Mapping) else getattr(start, part, None)
-    is_assumed = start is None and isinstance(bound, Recursive) and name in bound.assumed
-    if isinstance(bound, Recursive) and is_assumed:
-        start = bound.assumed[name]
-    elif start is None:
-        read = [source.topics[topic] for topic in (*bound.streams, *bound.static)]
-        start = stated(read, name, type(parameters))
+    start, is_assumed = value_at_start(name, source, bound)
     is_positive = least >= 0.0 or (given is not None and given[0] > 0.0)
     if is_positive and start <= 0.0:
         raise BadInput(
@@ -235,6 +227,23 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
             f"{' two numbers above zero' if is_positive else ''}; give other bounds, or --set {name}=..."
         )
     return Free(name, start, low, min(high, greatest), is_positive, is_assumed)
+
+
+def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool]:
+    """The value that an estimator has on a log of a number, by its full name, and whether it is assumed.
+
+    Raises BadInput where neither the settings nor the log's channels state it.
+    """
+    value: Any = bound.parameters
+    for part in name.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else getattr(value, part, None)
+    if value is not None:
+        return value, False
+    if isinstance(bound, Recursive) and name in bound.assumed:
+        return bound.assumed[name], True
+    read = [source.topics[topic] for topic in (*bound.streams, *bound.static)]
+    kind = None if bound.parameters is None else type(bound.parameters)
+    return stated(read, name, kind), False
 
 
 def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:

@@ -132,7 +132,8 @@ def _users(parameters: BiometricScoresParameters, rng: np.random.Generator) -> U
     share = parameters.poor_fingers_share
     quantile = norm.cdf(genuine[:, FINGERS])
     low = (LOWEST - share) / (1 - share)
-    others = np.where(quantile < low, quantile * LOWEST / low, LOWEST + (quantile - low) * (1 - share))
+    below = quantile * LOWEST / (low or 1.0)  # at the greatest share there are none
+    others = np.where(quantile < low, below, LOWEST + (quantile - low) * (1 - share))
     poor = np.zeros((parameters.users, 1), bool)
     poor[rng.permutation(parameters.users)[: round(share * parameters.users)]] = True
     mixed = np.where(poor, rng.uniform(0, LOWEST, quantile.shape), others)

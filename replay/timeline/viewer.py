@@ -78,17 +78,27 @@ def screenshot(
     return [f"{view.name}: {report}" for view in views for report in view.reports]
 
 
-def view(rrd: Path) -> None:
+def view(rrd: Path, *, at_s: float | None = None) -> None:
     """Open a timeline in the desktop viewer and wait until it is closed.
+
+    Args:
+        rrd: the timeline.
+        at_s: where the cursor stands, in seconds since the run's epoch; None leaves that to the viewer.
 
     Raises BadInput where there is no such file, no screen, or the viewer cannot run.
     """
     _require_timeline(rrd)
     if sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
         raise BadInput("there is no screen to show a timeline on; give --screenshot FILE.png")
-    options = [str(rrd), "--port", str(_free_port()), "--bind", "127.0.0.1"]
+    port = _free_port()
+    options = [str(rrd), "--port", str(port), "--bind", "127.0.0.1"]
     with scratch_folder("fuselog-viewer") as folder:
         with _running(folder, options, _private_environment(folder)) as process:
+            if at_s is not None:
+                _await_port(process, port)
+                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+                _await_loaded(client)
+                _set_cursor(client, rrd, at_s)
             process.wait()
         if process.returncode != 0:
             raise _why_ended(folder)
@@ -227,6 +237,10 @@ def _require_timeline(rrd: Path) -> None:
 
 def _load(client: ViewerClient, rrd: Path) -> None:
     client.open(rerun_path(rrd.resolve()))
+    _await_loaded(client)
+
+
+def _await_loaded(client: ViewerClient) -> None:
     end = time.monotonic() + _LOAD_S
     while client.get_state().loading and time.monotonic() < end:
         time.sleep(0.1)

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 
 from pipeline.output.terminal import print_table
+from tests.mutants.drawn import DRAWN
 from tests.mutants.faults import FAULTS, Fault, faulty
 
 ROOT = Path(__file__).parents[2]
@@ -28,7 +30,9 @@ TESTS_FAILED = 1  # pytest's exit code; others say that it could not run them
 def main() -> None:
     """Try the faults and print which were caught; exit code 1 where fewer than wanted were."""
     words = sys.argv[1:]
-    chosen = [each for each in FAULTS if not words or any(word in " ".join(each) for word in words)]
+    chosen = [
+        each for each in FAULTS + DRAWN if not words or any(word in " ".join(each) for word in words)
+    ]
     cores = os.cpu_count() or 1
     deadline = time.monotonic() + WHOLE_LIMIT_S
     with TemporaryDirectory(prefix="fuselog-mutants-") as folder:
@@ -47,11 +51,20 @@ def main() -> None:
 
         with ThreadPoolExecutor(cores) as pool:
             found = list(pool.map(attempt, chosen))
-    counts = {what: found.count(what) for what in dict.fromkeys(found)}
-    print_table(["outcome", "faults"], [[what, count] for what, count in counts.items()])
-    share = counts.get("caught", 0) / max(len(chosen), 1)
-    print(f"{counts.get('caught', 0)} of {len(chosen)} faults caught, {100 * share:.0f} %")
+    outcomes = list(dict.fromkeys(found))
+    rows = Counter((_room(fault), what) for fault, what in zip(chosen, found, strict=True))
+    rooms = sorted({_room(fault) for fault in chosen})
+    print_table(
+        ["room", *outcomes], [[room, *(rows[room, what] for what in outcomes)] for room in rooms]
+    )
+    share = found.count("caught") / max(len(chosen), 1)
+    print(f"{found.count('caught')} of {len(chosen)} faults caught, {100 * share:.0f} %")
     sys.exit(share < WANTED_SHARE)
+
+
+def _room(fault: Fault) -> str:
+    """The replay's rooms are rooms of their own."""
+    return "/".join(fault.path.split("/")[: 2 if fault.path.startswith("replay/") else 1])
 
 
 def _copy_of_the_tree(place: Path) -> Path:

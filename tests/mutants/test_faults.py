@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from tests.mutants.drawn import DRAWN
 from tests.mutants.faults import FAULTS, Fault, faulty
 
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: f"{fault.path}:{fault.old[:40]!r}")
+@pytest.mark.parametrize("fault", FAULTS + DRAWN, ids=lambda fault: f"{fault.path}:{fault.old[:40]!r}")
 def test_a_fault_stands_in_its_file_and_is_python(fault: Fault):
     sound = (ROOT / fault.path).read_text(encoding="utf-8")
     assert ast.dump(ast.parse(faulty(fault, sound))) != ast.dump(ast.parse(sound))
@@ -18,8 +19,8 @@ def test_a_fault_stands_in_its_file_and_is_python(fault: Fault):
 
 
 def test_faults_are_many_and_in_all_rooms():
-    assert len(set(FAULTS)) == len(FAULTS) >= 60
-    rooms = {fault.path.partition("/")[0] for fault in FAULTS}
-    assert rooms == {"recorders", "replay", "pipeline"}
+    for faults in (FAULTS, DRAWN):
+        assert len(set(faults)) == len(faults) >= 60
+        assert {"recorders", "replay", "pipeline"} <= {fault.path.partition("/")[0] for fault in faults}
     with pytest.raises(ValueError, match=r"README.md has 'no such text' 0 times; state it anew"):
         faulty(Fault("README.md", "no such text", "", ""), (ROOT / "README.md").read_text("utf-8"))

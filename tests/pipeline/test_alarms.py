@@ -71,7 +71,7 @@ def test_the_worst_is_said_first(
         assert worst["excess"] > 1000
     page = tmp_path / "page.html"
     assert fuselog("report", tmp_path / "result", "-o", page).code == 0
-    assert "Doubtful: ekf robot1: the gate keeps out 9" in page.read_text(encoding="utf-8")
+    assert "<li>ekf robot1: the gate keeps out 9" in page.read_text(encoding="utf-8")
     assert "<li>ekf robot1: NEES is" in page.read_text(encoding="utf-8")
     done = replay(log, "ekf", set={"sigma_range_m": 1e-4})
     assert done.alarms[0].words in repr(done)

@@ -11,7 +11,8 @@ import pytest
 
 from pipeline.comparing.comparing import _chart as difference_chart
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, draw
-from pipeline.output.report.first_run import plan_of_first_run
+from pipeline.output.report.first_run import first_run
+from pipeline.output.report.scene import plan
 from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
 from pipeline.runs.sweeps import Over, figures_of
 from pipeline.tuning.outcome import Tuning
@@ -66,7 +67,9 @@ def test_errors_and_nees_are_of_their_estimators_in_their_unit() -> None:
     plane = ("x_m", "y_m")
     judged = [(errors("ekf", *plane), ekf), (errors("bound", *plane, is_bound=True), bound)]
     chart = error_chart(judged, "robot1")
-    assert chart.title == "robot1, 7 runs; bands: the RMSE's 95 % if consistent"
+    assert chart.title == (
+        "robot1, 7 runs; tinted: where 95 % lie if the estimator's covariance is right"
+    )
     assert all(panel.y.log for panel in chart.panels)
     rmse = {
         "ekf": [TIMES, ekf["position_rmse_m"]],
@@ -77,11 +80,15 @@ def test_errors_and_nees_are_of_their_estimators_in_their_unit() -> None:
         "ekf": [TIMES, ekf["nees"]],
         "95 % if consistent (2 components) band": [TIMES, ekf["nees_low"], ekf["nees_high"]],
     }
-    same(held(chart), {"position RMSE (m) over time (s)": rmse, "mean NEES over time (s)": nees})
+    own = held(chart)
+    assert all(of.pop("outside") for of in own.values())  # the strip along the foot
+    name = "ekf: outside always: "
+    axes_of = {f"{name}position error, RMS (m) over time (s)": rmse}
+    same(own, {**axes_of, f"{name}mean NEES over time (s)": nees})
     turned = ("body_x_rad", "body_y_rad", "body_z_rad")
     axes = {
-        "orientation_rmse_deg": (turned, "orientation RMSE (deg)"),
-        "rmse_room_degC": (("room_degC",), "RMSE room_degC"),
+        "orientation_rmse_deg": (turned, "orientation error (°)"),
+        "rmse_room_degC": (("room_degC",), "error of room_degC, RMS"),
     }
     for quantity, (components, label) in axes.items():
         chart = error_chart([(errors("ekf", *components), steps(1.0, quantity))], "")
@@ -159,10 +166,10 @@ def test_a_sweep_is_curves_over_what_is_swept() -> None:
     values = np.array([[3.0, 1.0, 2.0], [4.0, 6.0, 5.0]])
     [(name, chart)] = figures_of(swept(over, values), over).items()
     assert name == "position_rmse_m-robot1"
-    assert chart.title == "position_rmse_m-robot1; bands: nine in ten runs"
+    assert chart.title == "position error, RMS (m) of robot1; bands: nine in ten runs"
     wanted = {label: [over[0].taken, own] for label, own in zip(("ekf", "ukf"), values, strict=True)}
     bands = {f"{label} band": [x, 0.9 * own, 1.2 * own] for label, (x, own) in wanted.items()}
-    same(held(chart), {"position_rmse_m-robot1 over ekf.sigma_m": {**wanted, **bands}})
+    same(held(chart), {"position error, RMS (m) over ekf.sigma_m": {**wanted, **bands}})
     assert chart.panels[0].x.log
     mixed = [Over("kind", ("a", "b")), over[0]]
     values = np.arange(12.0).reshape(2, 2, 3)
@@ -258,7 +265,7 @@ def test_the_first_picture_has_the_paths_in_the_plane(tmp_path) -> None:
             stamps,
             metadata={**metadata, "truth": "/robot1/truth"},
             mean=state + off,
-            covariance=np.tile(np.eye(3).ravel(), (4, 1)),
+            covariance=np.tile(1e-6 * np.eye(3).ravel(), (4, 1)),
         )
         for name, off in (("ekf", 0.5), ("ukf", 0.25))
     ]
@@ -267,8 +274,9 @@ def test_the_first_picture_has_the_paths_in_the_plane(tmp_path) -> None:
         (tmp_path / folder).mkdir()
     write_log(tmp_path / "logs/run-0000.mcap", [truth], run)
     write_log(tmp_path / "estimates/run-0000.mcap", made, run)
-    chart = plan_of_first_run(tmp_path)
-    assert chart is not None
+    found = first_run(tmp_path)
+    assert found is not None
+    chart = plan(found)
     assert chart.title == "robot1, first run from above"
     paths = {
         name: [state[:, 2] + off, state[:, 0] + off]
@@ -277,7 +285,7 @@ def test_the_first_picture_has_the_paths_in_the_plane(tmp_path) -> None:
     same(held(chart), {"y (m) over x (m)": paths})
     [panel] = chart.panels
     assert panel.plane
-    assert [each.reference for each in panel.series] == [False, False, True]
+    assert [each.reference for each in panel.series] == [True, False, False]
 
 
 def test_a_figure_has_what_its_chart_says() -> None:

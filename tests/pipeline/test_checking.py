@@ -12,8 +12,10 @@ import pytest
 
 import fuselog as fl
 from fuselog.testing import assert_golden
-from pipeline.checking.discrepancies import discrepancies
+from pipeline.checking.checking import Checked
+from pipeline.checking.discrepancies import Discrepancy, discrepancies
 from pipeline.checking.golden import Replayed, checksums
+from pipeline.checking.junit import write_junit
 from pipeline.checking.stored import read, write
 from recorders.log import LogWriter
 
@@ -122,6 +124,16 @@ def test_a_result_and_its_logs(tmp_path: Path, fuselog: Fuselog) -> None:
     said = fuselog("check", result / "logs" / "run-0000.mcap", "--against", golden)
     assert said.code == 2
     assert "the golden is of run-0000.mcap, run-0001.mcap" in said.err
+
+
+def test_junit_has_a_run_s_failures_in_its_own_cases(tmp_path: Path) -> None:
+    """The topic is one; run b alone differs there."""
+    found = [Discrepancy("b", "/x", "mean", 1.0, 0.1)]
+    write_junit(tmp_path / "j.xml", "g", Checked({("a", "/x"): 1, ("b", "/x"): 1}, found, []))
+    [suite] = ElementTree.parse(tmp_path / "j.xml").getroot()
+    failed = {case.get("name"): case.find("failure") is not None for case in suite}
+    assert failed == {"a /x": False, "b /x": True}
+    assert suite.get("failures") == "1"
 
 
 def test_junit(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from pipeline.output.charts import Chart
 from pipeline.output.claims import Claim
 from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.output.summary import summarise
+from pipeline.output.words import number
 from pipeline.runs.estimates import hash_files, hash_streams
 from pipeline.runs.experiment import (
     Experiment,
@@ -100,7 +101,7 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
     values = json.loads(text)
     assert list(values) == [
         *["format", "experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"],
-        *["bounds", "intervals", "alarms"],
+        *["bounds", "intervals", "alarms", "causes"],
     ]
     assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
     assert values["experiment"] == "landmarks"
@@ -156,7 +157,7 @@ def test_the_report_is_one_page_with_all_numbers(result: Path, tmp_path: Path, f
     page = tmp_path / "page.html"
     assert fuselog("report", str(result), str(result), "--out", str(page)).code == 0
     text = page.read_text()
-    assert text.count('class="plot"') == 4  # of each the first run and its errors; see test_report
+    assert text.count('class="plot"') == 6  # of each the first run, errors, NIS; see test_report
     assert text.count("position_rmse_m") >= 2
     assert "seed 5" in text
 
@@ -491,6 +492,7 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
         expected = f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim 3"
         assert expected in printed
     fuselog("report", out, "-o", tmp_path / "five.html")
+    expected = f"NEES {number(mean)}, 95 % {number(low)} to {number(high)}; 3 is right"
     assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
     assert printed.splitlines()[-1] == f"{out}: figures, tables, timeline.rrd, result.json"
     assert {path.name for path in out.iterdir()} == {"figures", "tables", "timeline.rrd", "result.json"}

@@ -206,7 +206,7 @@ def test_a_result_with_notes_or_edits_stays(
 def test_a_page_with_notes_stays(here: Path, before: Path) -> None:
     _place_ours(before, "report --out", Path("out.html"))
     page = Path("out.html")
-    page.write_text(page.read_text().replace("<h1>", "<p>mine</p><h1>"))
+    page.write_text(page.read_text().replace("<main>", "<p>mine</p><main>"))
     _check_refusal(_run(COMMANDS["report --out"], page), here, _state(here), "a report of fuselog")
 
 

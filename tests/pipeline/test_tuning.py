@@ -21,6 +21,7 @@ from pipeline.output.results import read_result
 from pipeline.runs.executors import InlineExecutor
 from pipeline.tuning.objective import Best
 from pipeline.tuning.search import Cost, curvature
+from pipeline.tuning.tuning import ENOUGH
 from recorders.log import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import memory_source
@@ -522,10 +523,14 @@ def test_a_start_ten_times_off_leads_to_the_same_optimum(
     log = fl.record(scenario, seed=1, **duration)
     near = fl.tune(log, estimator, free)
     starts = near.parameters.set_index("parameter")["start"]
-    bounds = {each.name: (each.low, each.high) for each in near.found.coordinates.free}
+    searched = near.found.coordinates.free  # but what the log tells nothing of, which stays
+    bounds = {each.name: (each.low, each.high) for each in searched if each.low < each.high}
     for factor in factors:
         far = fl.tune(log, estimator, free, set=dict(factor * starts), bounds=bounds)
-        assert far.costs[1] == pytest.approx(near.costs[1], abs=0.01), factor
+        # what a log does not determine stays where it began or goes to its bound, as rounding has it
+        is_open = any("not at all" in note or "bound" in note for note in near.notes_of_search)
+        within = ENOUGH if is_open else 0.01
+        assert far.costs[1] == pytest.approx(near.costs[1], abs=within), factor
         for row in near.parameters.assign(far=far.found.optimum).to_dict("records"):
             is_said = any(row["parameter"] in note for note in near.notes_of_search)
             assert row["low"] <= row["far"] <= row["high"] or is_said, (factor, row)

@@ -521,10 +521,11 @@ def test_a_euroc_folder(imported: Callable[..., Any], tmp_path: Path) -> None:
 def test_stamps_that_go_back_and_rows_that_are_cut(imported: Callable[..., Any], tmp_path: Path) -> None:
     """What repeats or goes back is kept, told, and in order where a log is read; a cut row is told."""
     mapping = FIX.replace('time = { column = "t" }', 'time = { column = "t", zero = "2026-01-01" }')
-    text = "t,lat,lon,h\n1,50,8,100\n3,50,8.001,100\n2,50.001,8,110\n3,,8,100\n4,50\n"
+    text = "t,lat,lon,h\n1,50,8,100\n3,50,8.001,100\n2,50.001,8,110\n3,,8,100\n3,,8,100\n4,50\n"
     _, notes = imported(text, mapping)
     assert notes["table.csv: stamps go back, and are sorted"] == "1"
-    assert notes["/fix: messages left out: NaN or infinite"] == "1"
+    assert notes["table.csv: stamps repeat, and are kept"] == "1"
+    assert notes["/fix: messages left out: NaN or infinite"] == "2"
     assert notes["table.csv: rows left out, of another number of cells than 4"] == "1"
     import_log(
         "table",

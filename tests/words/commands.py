@@ -35,6 +35,8 @@ compare est.mcap wide.mcap -e ekf
 diagnose run.mcap -e ekf
 diagnose run.mcap -e ekf --set /robot1/odometry.forward_mps_scale=1.3 --tried
 observability run.mcap
+explore run.mcap -e ekf -e ukf -e iekf
+explore run.mcap -e network
 tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz

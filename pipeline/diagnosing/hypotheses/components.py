@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import AXES, bare, entry_of
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
-from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, Kind, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import IS_SO, Hypothesis, Kind, in_sense, in_topic
 from recorders.importers.units import unit_of
 from recorders.log import Stream
 from recorders.parameters import Parameters
@@ -217,10 +217,11 @@ def _sign(topic: str, entry: Entry) -> Hypothesis:
 
 def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
     def words(at: float, low: float, high: float) -> str:
-        size = f"{topic}: {entry.name} is too large by {number(at)} ({number(low)} to {number(high)})"
+        is_so, size, least, most = in_sense(at, low, high)
+        said = f"{topic}: {entry.name} is {is_so} by {number(size)} ({number(least)} to {number(most)})"
         if not entry.is_angle:
-            return size
-        return f"{size}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
+            return said
+        return f"{said}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
 
     def mend(at: float) -> Advice:
         if own and own.bias:
@@ -252,8 +253,9 @@ def _growing(
     topic: str, name: str, tried: tuple[float, ...], alteration: alter.Alteration
 ) -> Hypothesis:
     def words(at: float, low: float, high: float) -> str:
+        is_so, at, low, high = in_sense(at, low, high)
         return (
-            f"{topic}: {name} is too large by {number(at)} ({number(low)} to {number(high)}) more each "
+            f"{topic}: {name} is {is_so} by {number(at)} ({number(low)} to {number(high)}) more each "
             "second"
         )
 
@@ -302,8 +304,9 @@ def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis
 
     def words(at: float, low: float, high: float) -> str:
         at, low, high = (float(np.degrees(each)) for each in (at, low, high))
+        is_so, at, low, high = in_sense(at, low, high)
         return (
-            f"{topic}: the heading is too large by {at:.3g} ({low:.3g} to {high:.3g}) deg: an offset, "
+            f"{topic}: the heading is {is_so} by {at:.3g} ({low:.3g} to {high:.3g}) deg: an offset, "
             "the magnetic declination or how the sensor is mounted, which are the same"
         )
 

@@ -125,6 +125,19 @@ def size_of(at: float) -> str:
     return "small" if at > 0.0 else "large"
 
 
+def in_sense(
+    at: float, low: float, high: float, words: tuple[str, str] = ("too large", "too small")
+) -> tuple[str, float, float, float]:
+    """The word for a number's sign, the number's size, and its interval in that sense.
+
+    >>> in_sense(-0.3, -0.4, -0.2)
+    ('too small', 0.3, 0.2, 0.4)
+    """
+    if at < 0.0:
+        return words[1], -at, min(-low, -high), max(-low, -high)
+    return words[0], at, low, high
+
+
 def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
     """What undoing faults of these numbers, each by itself, gains over a trial."""
     [before] = likelihood([now])

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic
 from recorders.log import Stream
 from replay.engine.replaying.estimator import Reading
 
@@ -38,18 +38,20 @@ def of_stamps(
 
     def late(at: float, low: float, high: float) -> str:
         about = f", {SPECIAL_S[at]}" if at in SPECIAL_S else ""
+        sense, at, low, high = in_sense(at, low, high, ("late", "early"))
         size, least, most = (f"{number(1e3 * each)} ms" for each in (at, low, high))
-        if abs(at) >= 1.0:
+        if at >= 1.0:
             size, least, most = (f"{number(each)} s" for each in (at, low, high))
-        if at < 0.0:
-            return f"{topic}: its stamps are {size[1:]} early ({least} to {most}){about}"
+        if sense == "early":
+            return f"{topic}: its stamps are {size} early ({least} to {most}){about}"
         return f"{topic}: comes {size} late ({least} to {most}) by its stamps{about}"
 
     def mend_late(at: float) -> Advice:
         return Advice(own or f"{topic}.delay_s", precise(at))
 
     def gaining(at: float, low: float, high: float) -> str:
-        return f"{topic}: its clock gains {at:.3g} s a second ({low:.3g} to {high:.3g})"
+        does, at, low, high = in_sense(at, low, high, ("gains", "loses"))
+        return f"{topic}: its clock {does} {at:.3g} s a second ({low:.3g} to {high:.3g})"
 
     def mend_gaining(at: float) -> Advice:
         return Advice(f"{topic}.clock_gain", precise(at))

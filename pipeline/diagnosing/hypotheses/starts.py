@@ -7,7 +7,7 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import bare
 from pipeline.diagnosing.advice import Advice, precise
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_topic
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, in_sense, in_topic
 from recorders.log import Stream
 from replay.engine.vectors.components import components_of, stated_components
 
@@ -42,10 +42,9 @@ def _start(
     topic: str, name: str, alteration: alter.Alteration, sigma: float, unit: str, limit: float
 ) -> Hypothesis:
     def words(at: float, low: float, high: float) -> str:
+        is_so, at, low, high = in_sense(at, low, high)
         size = f"{at:.3g} ({low:.3g} to {high:.3g}){' ' if unit else ''}{unit}"
-        return (
-            f"{topic}: {name} at the start is too large by {size}, {abs(at) / sigma:.2g} of its sigmas"
-        )
+        return f"{topic}: {name} at the start is {is_so} by {size}, {at / sigma:.2g} of its sigmas"
 
     def mend(at: float) -> Advice:
         wider = f"a prior whose sigma of {name} is at least {abs(at):.2g}"

@@ -1,6 +1,6 @@
 """The report: result folders as one HTML page that fetches nothing and runs only our scripts.
 
-Begin here; `verdict` has the sentences that a section opens with.
+Begin here; `kinds` has what a section opens with, `story` the cards, `scene` the pictures of a run.
 
 Plotly draws the charts: its bundle of basic traces, which is small enough to be in every page, lies here
 as its publisher gives it (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
@@ -9,21 +9,28 @@ as its publisher gives it (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).
 import base64
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from urllib.parse import unquote
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, select_autoescape
-from markupsafe import Markup
+from markdown_it import MarkdownIt
+from markupsafe import Markup, escape
 
+from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
-from pipeline.output.report.first_run import picture_of_timeline, plan_of_first_run
-from pipeline.output.report.naming import distinct_names
-from pipeline.output.report.verdict import verdict
-from pipeline.output.results import MetricTable, Result, metric_tables, read_result, read_table
+from pipeline.output.report.colours import text_colours
+from pipeline.output.report.first_run import first_run, picture_of_timeline
+from pipeline.output.report.glossary import Term, glossary
+from pipeline.output.report.kinds import Opening, opening
+from pipeline.output.report.naming import distinct_names, title_of
+from pipeline.output.report.scene import lens, nis_chart, plan
+from pipeline.output.report.sheet import Sheet, sheets
+from pipeline.output.results import Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
@@ -33,6 +40,7 @@ from recorders.parsing import parse_json
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
 _SIGNATURE = b"<!-- fuselog "
+_MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
 
 @dataclass(frozen=True)
@@ -48,26 +56,44 @@ class Shown:
 
 @dataclass(frozen=True)
 class Section:
-    """Holds what the page shows of one result folder; `lead` is what one sees at once."""
+    """Holds what the page shows of one result folder, from above to below."""
 
     name: str
+    title: str
     result: Result
-    verdict: tuple[str, str]
-    lead: list[Shown]
-    metrics: list[MetricTable]
+    labels: list[str]
+    opening: Opening
+    text: Markup
+    looks: list[Shown]
+    over_time: list[Shown]
+    sheet: Sheet | None
+    sheets: list[Sheet]
     tables: dict[str, pd.DataFrame]
     figures: list[Shown]
+    glossary: list[Term] = field(default_factory=list)
 
 
-def write_report(folders: Sequence[Path], page: Path, *, viewer: bool = False) -> None:
+def write_report(
+    folders: Sequence[Path],
+    page: Path,
+    *,
+    viewer: bool = False,
+    diagnose: Callable[[Path, Result], Sequence[Cause]] | None = None,
+) -> None:
     """Render result folders, in the order given, as one HTML page.
 
     The same folders give the same bytes, but for the pictures that `viewer` takes of their timelines.
+    `diagnose` finds the likeliest causes of a result that has none yet.
 
     Raises BadInput where a folder holds no result or a damaged one, the page cannot be written, or the
     viewer has no driver.
     """
     results = [read_result(folder) for folder in folders]
+    if diagnose is not None:
+        results = [
+            each if each.causes else each.model_copy(update={"causes": [*diagnose(folder, each)]})
+            for folder, each in zip(folders, results, strict=True)
+        ]
     names = distinct_names(results, folders)
     sections = [_section(*each, viewer=viewer) for each in zip(folders, results, names, strict=True)]
     environment = Environment(
@@ -76,11 +102,19 @@ def write_report(folders: Sequence[Path], page: Path, *, viewer: bool = False) -
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"value": format_value, "drawn": _as_json, "hashes": _hashes}
+    environment.filters |= {
+        "value": format_value,
+        "drawn": _as_json,
+        "hashes": _hashes,
+        "named": _named,
+        "hues": _hues,
+    }
     text = environment.get_template("page.html").render(
+        text_colours=text_colours(),
         sections=sections,
         style=_asset("page.css"),
         scripts=[_asset("plotly-basic.min.js"), _asset("page.js")],
+        terms=list(dict.fromkeys(term for section in sections for term in section.glossary)),
     )
     with whole_file(page) as new:
         new.write_bytes(_signed(text.encode(errors="backslashreplace")))
@@ -113,6 +147,24 @@ def _as_json(chart: Chart, estimators: Iterable[str]) -> Markup:
     return Markup(json.dumps(values, separators=(",", ":")).replace("<", "\\u003c"))
 
 
+def _hues(labels: Sequence[str]) -> dict[str, str]:
+    """The class by which the page colours the name of an estimator."""
+    return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
+
+
+def _named(text: str, labels: Sequence[str]) -> Markup:
+    """A sentence in which estimators have their colours."""
+    hues = _hues(labels)
+    if not hues:
+        return escape(text)
+    longest = sorted(map(re.escape, hues), key=len, reverse=True)
+    parts = re.split(rf"(?<![\w:.-])({'|'.join(longest)})(?![\w:-]|\.\w)", text)
+    return Markup("").join(
+        Markup('<b class="{}">{}</b>').format(hues[part], part) if place % 2 else escape(part)
+        for place, part in enumerate(parts)
+    )
+
+
 def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Section:
     for each in result.files:
         if each.startswith(("figures/", "tables/")) and not (folder / each).is_file():
@@ -124,21 +176,52 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         raise BadInput(
             f"{folder}: a table or figure is damaged ({error}); run the experiment again"
         ) from error
+    begun = opening(result, tables)
+    labels = [*(result.settings.get("estimators") or {}), *begun.found.labels, *begun.found.bounds]
+    labels = list(dict.fromkeys(map(str, labels)))
+    looks = [_chart("", begun.chart)] if begun.chart else []
+    order = [card.estimator for card in begun.story.cards] or labels
+    looks += _first_run(folder, order, viewer=viewer)
+    if "sweep" in result.settings or not looks:
+        looks, figures = [*looks, *figures[:2]], figures[2:]
+    over_time = [each for each in figures if each.name.startswith("errors")][:1]
+    nis = nis_chart(folder, [label for label in labels if label in begun.found.labels])
+    figures = [each for each in figures if each not in over_time]
+    sheet, each_case = sheets(begun.found)
     short = {
-        name: table
-        for name, table in tables.items()
-        if len(table) <= LONGEST_TABLE and name != "summary"
+        key: table
+        for key, table in tables.items()
+        if len(table) <= LONGEST_TABLE and key not in ("summary", "runs")
     }
-    lead = [*_first_run(folder, viewer=viewer), *figures[:1]]
-    metrics = metric_tables(result.metrics, result.bounds, tables.get("runs"))
-    return Section(name, result, verdict(result), lead, metrics, short, figures[1:])
+    keys = {split_metric(key)[1] for key in result.metrics} | {
+        row.key for rows in (sheet.groups.values() if sheet else ()) for row in rows
+    }
+    return Section(
+        name,
+        title_of(result, labels, begun.found.runs),
+        result,
+        labels,
+        begun,
+        Markup(_MARKDOWN.render(str(result.settings.get("text") or ""))),  # which lets no HTML through
+        looks,
+        [*over_time, *([_chart("nis", nis)] if nis else [])],
+        sheet,
+        each_case,
+        short,
+        figures,
+        glossary(keys, draws=bool(begun.story.draws)),
+    )
 
 
 def _rank(shown: Shown) -> tuple[bool, bool, int]:
     """Errors come first, then what is drawn with its intervals; of these, what compares the most."""
     chart = shown.chart or Chart(panels=[])
     has_bands = any(panel.bands for panel in chart.panels)
-    return not shown.name.startswith("errors"), not has_bands, -len(chart.colours())
+    return (
+        "rmse" not in shown.name and not shown.name.startswith("errors"),
+        not has_bands,
+        -len(chart.colours()),
+    )
 
 
 def _figure(path: Path) -> Shown:
@@ -155,17 +238,21 @@ def _figure(path: Path) -> Shown:
 
 def _chart(name: str, chart: Chart) -> Shown:
     axes = [f"{panel.y.label} over {panel.x.label}" for panel in chart.panels]
-    what = f"Chart: {'; '.join(dict.fromkeys(axes))}; {', '.join(chart.colours())}"
+    titles = filter(None, (panel.title for panel in chart.panels))
+    what = f"Chart: {'; '.join(dict.fromkeys([*axes, *titles]))}; {', '.join(chart.colours())}"
     return Shown(name, chart.title or name, what, chart)
 
 
-def _first_run(folder: Path, *, viewer: bool) -> list[Shown]:
-    """The first run in space: as the viewer shows it, or from above where it has paths."""
+def _first_run(folder: Path, order: Sequence[str], *, viewer: bool) -> list[Shown]:
+    """The first run in space: as the viewer shows it, or from above where it has paths, and a lens."""
     if viewer:
         address = _address("webp", picture_of_timeline(folder / "timeline.rrd"))
         return [Shown("", "first run, in the viewer", "The first run in the viewer", picture=address)]
-    plan = plan_of_first_run(folder)
-    return [] if plan is None else [_chart("", plan)]
+    run = first_run(folder)
+    if run is None:
+        return []
+    near = lens(run, order)
+    return [_chart("scene", plan(run)), *([_chart("lens", near)] if near else [])]
 
 
 def _address(kind: str, image: bytes) -> str:

@@ -1,97 +1,149 @@
-"""Shows the first run of a result: a plan of its paths and particles, or its timeline."""
+"""Reads the first run of a result, and shows its timeline."""
 
 import io
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.output.charts import Axis, Chart, Panel, Series, path, thinned
 from recorders.atomic import scratch_folder
-from recorders.log import Stream, open_log, read_streams, schemas
-from replay.engine.streams.sources import LogSource
-from replay.judging.errors.evaluation import split_topic
+from recorders.log import open_log, schemas
+from replay.engine.replaying.replaying import BLOCK_MESSAGES
+from replay.engine.streams.sources import LogSource, ensemble_of
+from replay.judging.errors.evaluation import Innovations, split_topic
+from replay.judging.judge import Judge
 
+Floats = NDArray[np.float64]
 PLANE = ("x_m", "y_m")
 PICTURE_PX = (1280, 800)
-# Particles are drawn at so many times, and of each cloud so many of equal weight.
-CLOUDS, CLOUD_POINTS = 6, 150
+# The innovations of so many runs are read: their mean over time is no surer of more.
+MOST_RUNS = 20
+GAP_LIMIT_S = 0.2
 
 
-def plan_of_first_run(folder: Path) -> Chart | None:
-    """Truth, estimates and particles of the first run over the plane; None where its logs hold none.
+@dataclass(frozen=True)
+class Followed:
+    """What an estimator said of a place over time, beside the truth.
 
-    Of several things that are estimated, such as robots, it shows the first. Raises BadInput where a log
+    Attributes:
+        time_s: (n,) since the first.
+        truth, error: (n, 2) over the plane; the estimate is their sum.
+        covariance: (n, 2, 2) as the estimator claims.
+    """
+
+    time_s: Floats
+    truth: Floats
+    error: Floats
+    covariance: Floats
+
+    @property
+    def estimate(self) -> Floats:
+        """(n, 2) where the estimator says that it is."""
+        return self.truth + self.error
+
+    @property
+    def squared(self) -> Floats:
+        """(n,) the squared error over what is claimed; NaN where the covariance is none."""
+        found = np.full(len(self.error), np.nan)
+        sound = np.linalg.det(self.covariance) > 0.0
+        solved = np.linalg.solve(self.covariance[sound], self.error[sound, :, None])[..., 0]
+        found[sound] = np.sum(self.error[sound] * solved, axis=1)
+        return found
+
+
+@dataclass(frozen=True)
+class FirstRun:
+    """The first run of a result: its log, what was estimated, and of the first case how well."""
+
+    source: LogSource
+    output: LogSource
+    case: str
+    followed: Mapping[str, Followed]
+
+
+def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None:
+    """The first run whose log has a truth over the plane, and estimates of it; None where none has.
+
+    Of several things that are estimated, such as robots, it is of the first. Raises BadInput where a log
     is damaged.
     """
     for log in sorted(folder.rglob("logs/run-0000.mcap")):
         estimates = log.parent.parent / "estimates" / log.name
-        if estimates.is_file() and (
-            plan := _plan(LogSource(open_log(log)), LogSource(open_log(estimates)))
-        ):
-            return plan
+        if estimates.is_file():
+            source, output = LogSource(open_log(log)), LogSource(open_log(estimates))
+            found = _followed(source, output, gap_limit_s)
+            if found:
+                case = next(iter(found))[1]
+                own = {label: each for (label, of), each in found.items() if of == case}
+                return FirstRun(source, output, case, own)
     return None
 
 
-def _plan(source: LogSource, output: LogSource) -> Chart | None:
-    places = [
-        topic
-        for topic, found in output.topics.items()
-        if found.schema_name == schemas.GAUSSIAN_ESTIMATE.full_name
-        and set(PLANE) <= set(output.empty(topic).components)
-    ]
-    if not places:
-        return None
-    case = split_topic(places[0])[1]
-    streams = output.read([topic for topic in places if split_topic(topic)[1] == case])
-    paths = [_path_of(split_topic(topic)[0], stream, "mean") for topic, stream in streams.items()]
-    truth = streams[places[0]].metadata.get("truth", "")
-    if truth in source.topics:
-        whole = _path_of("truth", source.read([truth])[truth], "state")
-        paths.append(whole.model_copy(update={"style": "dashed", "reference": True}))
-    clouds = [
-        cloud
-        for topic, found in output.topics.items()
-        if found.schema_name == schemas.DENSITY_ESTIMATE.full_name
-        and split_topic(topic)[1] == case
-        and set(PLANE) <= set(output.empty(topic).components)
-        and (cloud := _cloud_of(output, topic))
-    ]
-    panel = Panel(x=Axis(label="x (m)"), y=Axis(label="y (m)"), series=[*clouds, *paths], plane=True)
-    drawn = f", with particles at {CLOUDS} times" if clouds else ""
-    return Chart(title=f"{case or 'paths'}, first run from above{drawn}", panels=[panel])
+def _followed(
+    source: LogSource, output: LogSource, gap_limit_s: float
+) -> dict[tuple[str, str], Followed]:
+    """By estimator and case, what has errors over the plane."""
+    topics = {
+        topic: each.metadata.get("truth", "")
+        for topic, each in ((topic, output.empty(topic)) for topic in output.topics)
+        if each.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
+        and set(PLANE) <= {*each.components}
+    }
+    judge = Judge([source], {}, gap_limit_s=gap_limit_s)
+    parts: dict[tuple[str, str], list[Followed]] = {}
+    truths = {topics[topic] for topic in topics} & source.topics.keys()
+    paths = {truth: source.read([truth])[truth] for truth in truths}
+    named = {split_topic(topic): truth for topic, truth in topics.items() if truth in paths}
+    for block in (
+        ensemble_of([output]).blocks([*topics], "publish_time", BLOCK_MESSAGES) if named else ()
+    ):
+        for errors in judge.add(block).errors:
+            what = errors.estimator, errors.case
+            if errors.is_bound or what not in named or not set(PLANE) <= {*errors.components}:
+                continue
+            path = paths[named[what]]
+            at = [path.components.index(name) for name in PLANE]
+            of = [errors.components.index(name) for name in PLANE]
+            times = errors.time_ns.astype(float)
+            truth = np.column_stack(
+                [
+                    np.interp(times, path.publish_time_ns.astype(float), path["state"][:, each])
+                    for each in at
+                ]
+            )
+            covariance = errors.covariance[:, of][:, :, of]
+            parts.setdefault(what, []).append(
+                Followed(errors.elapsed_s, truth, errors.error[:, of], covariance)
+            )
+    return {what: _joined(each) for what, each in parts.items()}
 
 
-def _path_of(label: str, stream: Stream, column: str) -> Series:
-    columns = [stream.components.index(name) for name in PLANE]
-    return path(label, stream[column][thinned(len(stream))][:, columns])
+def _joined(parts: list[Followed]) -> Followed:
+    columns = ("time_s", "truth", "error", "covariance")
+    return Followed(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
 
-def _cloud_of(output: LogSource, topic: str) -> Series | None:
-    """Particles of a density at a few times spread over the run; None where it has none.
-
-    They are drawn systematically, so that a particle's chance to be shown is its weight.
-    """
-    estimator, case = split_topic(topic)
-    sizes = [
-        name
-        for name, found in output.topics.items()
-        if found.schema_name == schemas.ESTIMATE_SIZE.full_name
-        and split_topic(name) == (estimator, case)
-    ]
-    stamps = [time for each in output.read(sizes).values() for time in each.publish_time_ns.tolist()]
-    if not stamps:
-        return None
-    points = []
-    for row in np.linspace(0, len(stamps) - 1, CLOUDS).round().astype(int).tolist():
-        time_ns = stamps[row]
-        [cloud] = read_streams(output.log, [topic], start_ns=time_ns, end_ns=time_ns + 1).values()
-        if len(cloud):
-            ends = np.cumsum(cloud["weight"])
-            positions = (np.arange(CLOUD_POINTS) + 0.5) / CLOUD_POINTS * ends[-1]
-            columns = [cloud.components.index(name) for name in PLANE]
-            points.append(cloud["mean"][np.searchsorted(ends, positions)][:, columns])
-    return path(f"{estimator}, particles", np.concatenate(points), "dots") if points else None
+def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats, Innovations]]]:
+    """By estimator and case the innovations of runs whose estimates are kept, with their times in s."""
+    found: dict[tuple[str, str], list[tuple[Floats, Innovations]]] = {}
+    for path in sorted(folder.glob("estimates/run-*.mcap"))[:MOST_RUNS]:
+        output = LogSource(open_log(path))
+        topics = [
+            topic
+            for topic, each in output.topics.items()
+            if each.schema_name == schemas.INNOVATION.full_name
+        ]
+        judge = Judge([output], {}, gap_limit_s=GAP_LIMIT_S)
+        for block in (
+            ensemble_of([output]).blocks(topics, "publish_time", BLOCK_MESSAGES) if topics else ()
+        ):
+            for each in judge.add(block).innovations:
+                elapsed_s: Floats = 1e-9 * (each.time_ns - output.epoch_ns).astype(np.float64)
+                found.setdefault((each.estimator, each.case), []).append((elapsed_s, each))
+    return found
 
 
 def picture_of_timeline(timeline: Path) -> bytes:

@@ -6,6 +6,7 @@ from typing import Any
 
 from pipeline.output.results import Result
 from pipeline.output.terminal import format_value
+from pipeline.output.words import count, listed
 
 
 def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[str]:
@@ -46,3 +47,14 @@ def _flat(
             yield from _flat(value, (*path, name))
         else:
             yield (*path, name), value
+
+
+def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
+    """What a person reads as a heading: the experiment's title, or what was done with whose logs."""
+    settings = result.settings
+    title = str(settings.get("title") or result.experiment)
+    if "sides" in settings:
+        return f"{listed(list(labels))}, compared"
+    if isinstance(settings.get("logs"), Mapping):
+        return f"{title}: {listed(list(labels)) or count(runs, 'run')}"
+    return f"{title}, swept" if "sweep" in settings else title

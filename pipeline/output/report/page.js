@@ -40,7 +40,7 @@ for (const place of document.querySelectorAll(".plot")) {
   sized.observe(place);
 }
 dark.addEventListener("change", () => [...drawn.keys()].forEach(draw));
-addEventListener("beforeprint", () => document.querySelectorAll(".plot").forEach(draw));
+addEventListener("beforeprint", () => document.querySelectorAll(".plot").forEach((place) => place.clientWidth && draw(place)));
 
 function draw(place) {
   near.unobserve(place);
@@ -57,7 +57,9 @@ function draw(place) {
     named.add(trace.legendgroup);
   }
   place.style.height = `${height}px`;
-  const options = { displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d"] };
+  // tools stand where a mouse can ask for them, and only while it does
+  const hovers = matchMedia("(hover: hover)").matches && !matchMedia("print").matches;
+  const options = { displaylogo: false, showTips: false, displayModeBar: hovers ? "hover" : false, scrollZoom: false, modeBarButtonsToRemove: ["select2d", "lasso2d"] };
   Plotly.react(place, [...bands, ...lines], layout, options);
 }
 
@@ -71,12 +73,19 @@ function axesOf(index) {
 }
 
 // What has one label is named once in the legend and hidden together.
+const MODES = { "line+markers": "lines+markers", markers: "markers", dots: "markers", triangles: "markers", outside: "markers" };
+const MARKERS = {
+  dots: { size: 2, opacity: 0.5 }, triangles: { size: 9, symbol: "triangle-up-open" }, outside: { size: 5, symbol: "square" },
+};
+
 function lineTrace(series, colour, index) {
+  const isOut = series.style === "outside";
   return {
     ...axesOf(index), x: series.x, y: series.y, name: escaped(series.label), legendgroup: series.label,
-    mode: { "line+markers": "lines+markers", markers: "markers", dots: "markers" }[series.style] ?? "lines",
-    line: { color: colour, width: 1.5, dash: series.style === "dashed" ? "dash" : "solid" },
-    marker: series.style === "dots" ? { color: colour, size: 2, opacity: 0.5 } : { color: colour, size: 5 },
+    mode: MODES[series.style] ?? "lines", cliponaxis: !isOut, ...(isOut && { hoverinfo: "skip" }),
+    ...(series.style === "area" && { fill: "toself", fillcolor: `${colour}33`, hoverinfo: "skip" }),
+    line: { color: colour, width: series.reference ? 1.8 : 1.5, dash: series.style === "dashed" ? "dash" : "solid" },
+    marker: { color: colour, size: 6, ...MARKERS[series.style] },
   };
 }
 
@@ -94,17 +103,20 @@ function bandTraces(band, colour, index) {
 function layoutOf(place) {
   const chart = chartOf(place);
   const style = getComputedStyle(document.body);
-  const [text, line] = ["--text", "--line"].map((name) => style.getPropertyValue(name).trim());
+  const [text, line] = ["--ink", "--grid"].map((name) => style.getPropertyValue(name).trim());
   const columns = Math.max(1, Math.min(chart.columns, Math.floor(place.clientWidth / NARROWEST_PANEL)));
   const rows = Math.ceil(chart.panels.length / columns);
-  const inLead = place.closest(".lead") !== null;
-  const row = chart.panels.some((panel) => panel.plane) ? 380 : rows === 1 ? 340 : inLead ? 215 : 260;
-  const height = rows * row + 90;
+  const planes = chart.panels.filter((panel) => panel.plane);
+  const isLens = planes.length > 0 && planes.every((panel) => panel.x.limits && panel.y.limits);
+  const row = isLens ? lensHeight(planes[0], (place.clientWidth - 70) / columns)
+    : planes.length ? 400 : rows === 1 ? 260 : 180;
+  const foot = chart.legend ? 90 : 66;
+  const height = rows * row + foot;
   const layout = {
     height, autosize: true, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: text, size: 12, family: style.fontFamily },
-    margin: { l: 60, r: 10, t: 22, b: 45 }, hovermode: "closest",
-    legend: { orientation: "h", y: -45 / (height - 67), yanchor: "top", x: 0 },
+    margin: { l: 60, r: 10, t: 22, b: 45 }, hovermode: "closest", showlegend: chart.legend, dragmode: "zoom",
+    hoverlabel: { font: { family: style.fontFamily } }, legend: { orientation: "h", y: -45 / (height - 67), yanchor: "top", x: 0 },
     annotations: [],
   };
   const gap = { x: columns > 1 ? 0.25 / columns : 0, y: 62 / (height - 67) };
@@ -121,21 +133,58 @@ function layoutOf(place) {
     if (panel.plane) Object.assign(layout[`yaxis${index ? index + 1 : ""}`], { scaleanchor: axesOf(index).xaxis, constrain: "domain" });
     layout.annotations.push({
       text: escaped(panel.title), showarrow: false, xref: `${axesOf(index).xaxis} domain`, yref: `${axesOf(index).yaxis} domain`,
-      x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: { size: 11 },
+      x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: { size: 12 },
     });
   });
   return { layout, height };
+}
+
+// A lens is as high as its limits ask for, within reason.
+function lensHeight(panel, width) {
+  const [wide, high] = [panel.x.limits, panel.y.limits].map(([low, top]) => top - low);
+  return Math.min(300, Math.max(130, width * high / wide)) + 40;
 }
 
 function axisOf(panel, name) {
   const axis = panel[name];
   const named = panel.series.some((series) => series[name].some((value) => typeof value === "string"));
   const places = Object.keys(axis.ticks).map(Number);
+  const ends = axis.limits ?? endsOf(panel, name);
+  const own = axis.log && !places.length ? decades(ends) : [];
   return {
-    title: { text: escaped(axis.label), standoff: 5 }, nticks: axis.log ? 5 : 7, type: axis.log ? "log" : named ? "category" : "linear", automargin: true,
+    title: { text: escaped(axis.label), standoff: 5 }, nticks: 7, type: axis.log ? "log" : named ? "category" : "linear", automargin: true,
+    exponentformat: "none", separatethousands: true,
     ...(axis.limits && { range: axis.log ? axis.limits.map(Math.log10) : axis.limits }),
     ...(places.length && { tickvals: places, ticktext: Object.values(axis.ticks).map(escaped) }),
+    ...(own.length > 1 && { tickvals: own, ticktext: own.map(written) }),
   };
+}
+
+function endsOf(panel, name) {
+  const values = panel.series.flatMap((series) => series[name]);
+  if (name === "y") values.push(...panel.bands.flatMap((band) => [...band.low, ...band.high]));
+  const known = values.filter((value) => typeof value === "number" && value > 0);
+  return [known.reduce((a, b) => Math.min(a, b), Infinity), known.reduce((a, b) => Math.max(a, b), 0)];
+}
+
+// The ticks that a person writes on a logarithmic axis: 1, 2, 5, or 1, 3, or 1 of each decade.
+function decades([low, high]) {
+  const [first, last] = [Math.floor(Math.log10(low)), Math.ceil(Math.log10(high))];
+  if (!Number.isFinite(first) || !Number.isFinite(last)) return [];
+  const span = Math.log10(high / low);
+  const digits = span < 1.6 ? [1, 2, 5] : span < 3.2 ? [1, 3] : [1];
+  const every = span > 8 ? Math.ceil(span / 8) : 1;
+  const found = [];
+  for (let power = first; power <= last; power += every) {
+    for (const digit of digits) found.push(Number(`${digit}e${power}`));
+  }
+  return found.filter((value) => value >= low / 1.001 && value <= high * 1.001);
+}
+
+function written(value) {
+  if (value >= 1e-4 && value < 1e7) return value.toLocaleString("en", { maximumFractionDigits: 6 });
+  const [digit, power] = value.toExponential(0).split("e");
+  return `${digit} × 10<sup>${Number(power)}</sup>`;
 }
 
 // Plotly reads some HTML in its texts; names from logs are none.

@@ -24,6 +24,7 @@ _PIECE_BYTES = 1 << 23
 _NUMBER_BYTES = 2
 _NEVER = 1 << 62
 _PASSED_OVER = "bytes that are no messages, and were passed over"
+_RECENT_US = 1_000_000
 _MONTH_US = 30 * 86_400_000_000
 _LEVELS = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
 
@@ -272,8 +273,10 @@ class UlogFile:
         if timed.all():
             return stamps
         last_us = self._last_us
-        known = np.concatenate([[0], stamps[timed] - last_us])
-        between = np.interp(at, np.concatenate([[-1], at[timed]]), known)
+        # Of a topic that stands still the stamp may be of long before.
+        recent = np.flatnonzero(timed & (stamps >= last_us - _RECENT_US))
+        known = np.concatenate([[0], stamps[recent] - last_us])
+        between = np.interp(at, np.concatenate([[-1], at[recent]]), known)
         return np.where(timed, stamps, last_us + np.rint(between).astype(np.int64))
 
     def _subscribe(self, body: bytes, position: int) -> None:

@@ -232,11 +232,18 @@ def configure(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
 def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], dict[str, Any]]:
     """Return the estimator of a label and the values of its parameters, which are not checked yet.
 
-    Raises BadInput where the name is unknown, or a foreign filter may not be run or does not answer.
+    Raises BadInput where the name is unknown or sets what a setting sets otherwise, or a foreign filter
+    may not be run or does not answer.
     """
     values = dict(settings)
     kind = values.pop("kind", label)
     estimator, variant = (kind, {}) if isinstance(kind, Estimator) else find_estimator(str(kind))
+    for name, value in variant.items():
+        if str(values.get(name, value)) != value:
+            raise BadInput(
+                f"estimator {label}: {kind} says {name} = {value}, and a setting {values[name]}; "
+                "give one of them"
+            )
     return estimator.specified(label, values), {**values, **variant}
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.testing import assert_allclose
 from scipy.special import i0e, i1e
 
 from recorders.errors import BadInput
@@ -362,3 +363,10 @@ def test_samples_have_the_second_moment_of_their_distribution():
 def test_bad_input_is_told(make, message):
     with pytest.raises(BadInput, match=message):
         make()
+
+
+def test_about_a_mode_all_may_be_alike_and_nothing_likelier() -> None:
+    """A concentration of zero is the least."""
+    assert_allclose(bingham.around([1.0, 0.0], [0.0]).concentrations, 0.0)
+    with pytest.raises(BadInput, match="must be at most 0"):
+        bingham.around([1.0, 0.0], [1e-9])

@@ -25,6 +25,7 @@ from replay.engine.replaying.replaying import Report, collect, replay
 from replay.engine.replaying.soundness import find_unsound
 from replay.engine.streams.blocks import Ragged, gather
 from replay.engine.streams.failures import Failure, failure_stream, sentences_of
+from replay.engine.streams.results import failures_of
 from replay.engine.streams.sources import LogSource, MemorySource, Source, memory_source
 from replay.judging.judge import Judge
 from replay.judging.metrics.measuring import Output
@@ -355,3 +356,11 @@ def test_what_a_covariance_is(covariance: list[list[float]], is_sound: bool) -> 
     )
     assert (found[0] < 0) == is_sound
     assert rows[0] == (9 if is_sound else 0)
+
+
+def test_a_failure_is_told_in_its_block_alone() -> None:
+    """Of four runs: well, failed before, failed in this block, failed in this block."""
+    before, after = np.array([-1, 0, -1, -1]), np.array([-1, 0, 1, 0])
+    found = failures_of("/estimates/x", before, after, np.arange(10, 14), ["lost", "blind"])
+    assert found.offsets.tolist() == [0, 0, 0, 1, 2]
+    assert found.stream.publish_time_ns.tolist() == [12, 13]

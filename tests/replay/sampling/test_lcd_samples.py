@@ -8,6 +8,7 @@ import pytest
 from recorders.errors import BadInput
 from replay.sampling import lcd_distance, lcd_samples, moment_corrected
 from replay.sampling.distance import lcd_distance_and_gradient
+from replay.sampling.lcd import check_count
 
 pytestmark = pytest.mark.paper
 
@@ -104,3 +105,12 @@ def test_sets_without_a_regular_covariance_are_refused(dimension, count, symmetr
 def test_flat_sets_cannot_be_corrected():
     with pytest.raises(BadInput, match="span fewer than 3 dimensions"):
         moment_corrected(np.random.default_rng(0).standard_normal((9, 3)) * [1, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("dimension", "least", "symmetric"), [(3, 4, False), (3, 6, True), (1, 2, True)]
+)
+def test_the_fewest_samples_are_enough(dimension: int, least: int, symmetric: bool) -> None:
+    check_count(dimension, least, symmetric)
+    with pytest.raises(BadInput, match=f"take {least} or more"):
+        check_count(dimension, least - 1, symmetric)

@@ -4,12 +4,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pipeline.output.claims import Claim
-from pipeline.output.report.verdict import verdict
+from pipeline.output.report.kinds import opening
 from pipeline.output.results import Result
 from replay.judging.diagnostics import LEAST_SHARE
 
 TWO = {"a.position_rmse_m": 0.5, "b.position_rmse_m": 0.25, "a.nees": 9.0}
 BOUNDS = {"b.nees": (2.0, 4.0)}
+
+
+def verdict(result: Result) -> tuple[str, str]:
+    """What was tried, and what came of it."""
+    begun = opening(result, {})
+    return begun.tried, " ".join(begun.story.verdict)
 
 
 def what_was_run() -> Iterator[str]:

@@ -1,0 +1,86 @@
+"""The likeliest cause of each inconsistent estimator of a result, and what its mend does to it."""
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.comparing.comparing import compare
+from pipeline.diagnosing.diagnosis import diagnose
+from pipeline.diagnosing.sentences import Sentence
+from pipeline.output.alarms import Cause
+from pipeline.output.report.evidence import findings
+from pipeline.output.results import RUNS, Result, read_table
+from pipeline.output.words import count, number, quantity, scale
+from recorders.errors import BadInput
+from recorders.parameters import merge, parse_settings
+
+MENDED = "mended"
+
+
+def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
+    """Diagnose each estimator of a result that is inconsistent, over its first run.
+
+    Nothing of what has no log, no innovations or no cause that is found.
+    """
+    logs = _logs(folder, result)
+    tables = {"runs": read_table(folder / RUNS)} if (folder / RUNS).is_file() else {}
+    found = findings(result, tables)
+    settings = result.settings.get("estimators") or {}
+    causes = []
+    for label, evidence in found.of.items():
+        if (
+            not logs
+            or label not in settings
+            or evidence.state(found.runs) not in ("too sure", "too careful")
+        ):
+            continue
+        own = {"kind": label, **settings[label]}
+        gap_limit_s = float(result.settings.get("gap_limit_s", 0.2))
+        try:
+            sentences = diagnose(logs[0], {label: own}, gap_limit_s=gap_limit_s).sentences
+        except BadInput:  # of an estimator without innovations nothing is known
+            continue
+        if sentences:
+            mended = _mended(logs, label, own, sentences[0], found.main)
+            causes.append(_cause(label, sentences[0], mended))
+    return causes
+
+
+def _logs(folder: Path, result: Result) -> list[Path]:
+    """The logs of the runs that are kept, or that were replayed."""
+    kept = sorted(folder.glob("logs/run-*.mcap"))
+    stated = result.settings.get("logs")
+    files = stated.get("files", []) if isinstance(stated, Mapping) else []
+    return kept or [Path(each) for each in files if Path(each).is_file()]
+
+
+def _cause(label: str, sentence: Sentence, mended: str) -> Cause:
+    words = sentence.words.partition("; try ")[0]
+    setting = sentence.setting
+    if setting and not setting.startswith("/"):
+        setting = f"{label}.{setting}"
+    short = words.partition(";")[0].partition(", so that")[0]
+    return Cause(label, f"{words}.", short, setting, mended)
+
+
+def _mended(logs: list[Path], label: str, own: dict[str, Any], sentence: Sentence, main: str) -> str:
+    """What the same runs give with the mend; nothing where no parameter of the estimator is one."""
+    if not sentence.setting or sentence.setting.startswith("/"):
+        return ""
+    mend = merge(own, parse_settings([sentence.setting]))
+    table = compare(*logs, estimators=[{label: own}, {MENDED: mend}]).table
+    told = []
+    for key in (main, "nees", "nis_per_component"):
+        rows = table[table["quantity"] == key].to_dict("records")[:1]
+        told += [_change(key, row) for row in rows if math.isfinite(row["second_mean"])]
+    if not told:
+        return ""
+    return f"Mended so, over {count(len(logs), 'run')}: {'; '.join(told)}."
+
+
+def _change(key: str, row: Mapping[Any, Any]) -> str:
+    words, second = quantity(key), float(row["second_mean"])
+    own = scale(words.unit, second)
+    aim = f", {number(float(row['aim']))} is right" if key.startswith("n") else ""
+    return f"{words.name} {own.with_unit(second)}{aim}"

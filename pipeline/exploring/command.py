@@ -1,0 +1,33 @@
+"""The command `fuselog explore`: it serves the page until that is closed."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.exploring.explore import explore
+from pipeline.output.terminal import say
+from pipeline.runs.settings import settings_of_estimators, split_texts
+from recorders.log import open_log
+from replay.engine.streams.sources import LogSource
+
+
+def explore_log(
+    log: Path,
+    names: Sequence[str],
+    *,
+    model: str | None,
+    no_browser: bool,
+    recover: bool,
+    gap_limit_s: float,
+    settings_file: Path | None,
+    settings: Sequence[str],
+) -> None:
+    """Serve the page, say where it is, and wait until it is closed."""
+    alterations, own = split_texts(settings)
+    chosen = settings_of_estimators(names, own, settings_file, model=model)
+    source = LogSource(open_log(log, recover=recover))
+    explorer = explore(source, chosen, set=alterations, gap_limit_s=gap_limit_s, show=not no_browser)
+    say(f"exploring {log} at {explorer.url}; close the page or press Ctrl-C to end")
+    try:
+        explorer.wait()
+    finally:
+        explorer.close()

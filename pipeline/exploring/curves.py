@@ -1,0 +1,245 @@
+"""What is drawn of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.log import Stream, schemas
+from replay.distributions import chi2
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.sources import MemorySource
+from replay.engine.vectors.tangent import tangent_components
+from replay.judging.consistency.whiteness import Whiteness, whitened, whiteness
+from replay.judging.errors.evaluation import POSITION, Errors, split_topic
+
+Floats = NDArray[np.float64]
+BIN_S = 1.0  # NIS is drawn as means over so long
+LINES = 400  # a curve has no more points than these, so that it follows the slider
+
+
+class Path(NamedTuple):
+    """Positions in the plane (n, 2), at times (n,) since the epoch."""
+
+    time_s: Floats
+    points: Floats
+
+
+class Nis(NamedTuple):
+    """Mean NIS per measured component of each span of time (n,), and where 95 % of these lie."""
+
+    time_s: Floats
+    mean: Floats
+    low: Floats
+    high: Floats
+
+    @property
+    def outside(self) -> float:
+        """The share of spans outside."""
+        return _share((self.mean < self.low) | (self.mean > self.high))
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is drawn of one thing that is estimated, such as `robot1`.
+
+    Attributes:
+        name: of it; may be empty.
+        components, kinds: of the state's tangent space.
+        path: of the estimate; None where that has no position.
+        covariance: (n, 2, 2) of the positions on the path.
+        sigma: (n, d) as the filter states it at `time_s` (n,).
+        errors: against truth; None without truth.
+        nis: by topic of the sensor or of the filter; None without innovations.
+        whiteness: by measured component.
+        log_likelihood: of all measurements; NaN where the filter states none.
+    """
+
+    name: str
+    components: tuple[str, ...]
+    kinds: tuple[str, ...]
+    time_s: Floats
+    sigma: Floats
+    path: Path | None = None
+    covariance: Floats = field(default_factory=lambda: np.empty((0, 2, 2)))
+    errors: Errors | None = None
+    nis: Nis | None = None
+    whiteness: Mapping[str, Whiteness] = field(default_factory=dict)
+    log_likelihood: float = np.nan
+
+    @property
+    def outside(self) -> Floats:
+        """The share of errors beyond 1.96 standard deviations (d,), where 5 % are right."""
+        assert self.errors is not None
+        sigma = np.sqrt(np.diagonal(self.errors.covariance, axis1=1, axis2=2))
+        return np.mean(np.abs(self.errors.error) > 1.96 * sigma, axis=0)
+
+    @property
+    def nees_interval(self) -> tuple[float, float]:
+        """Where 95 % of the NEES of a consistent filter lie."""
+        low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.components)))
+        return float(low), float(high)
+
+    @property
+    def nees_outside(self) -> float:
+        """The share of NEES outside that."""
+        assert self.errors is not None
+        low, high = self.nees_interval
+        return _share((self.errors.nees < low) | (self.errors.nees > high))
+
+
+def cases_of(outputs: Mapping[str, Ragged], errors: Sequence[Errors], epoch_ns: int) -> dict[str, Case]:
+    """What is drawn of a filter's outputs on one log, by the name of what is estimated.
+
+    Args:
+        outputs: by topic.
+        errors: of them, where there is truth.
+        epoch_ns: of the log.
+    """
+    of_case = {each.case: each for each in errors}
+    innovations = {
+        split_topic(topic)[1]: rows.stream
+        for topic, rows in outputs.items()
+        if rows.stream.schema.full_name == schemas.INNOVATION.full_name and len(rows)
+    }
+    found: dict[str, Case] = {}
+    for topic, rows in outputs.items():
+        stream = rows.stream
+        if stream.schema.full_name != schemas.GAUSSIAN_ESTIMATE.full_name or not len(rows):
+            continue
+        case = split_topic(topic)[1]
+        if case in found:  # the first of a filter's estimates is its own, others add to it
+            continue
+        found[case] = _case(case, stream, epoch_ns, of_case.get(case), innovations.get(case))
+    return found
+
+
+def _case(
+    name: str, stream: Stream, epoch_ns: int, errors: Errors | None, innovations: Stream | None
+) -> Case:
+    components, kinds = stream.components, stream.metadata.get("kinds", "").split(",")
+    tangent = tangent_components(components, kinds)
+    mean = stream["mean"].reshape(len(stream), len(components))
+    covariance = stream["covariance"].reshape(len(stream), len(tangent), len(tangent))
+    time_s = _elapsed_s(stream, epoch_ns)
+    with np.errstate(invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    plane = [components.index(each) for each in POSITION[:2] if each in components]
+    names = [each for each, _ in tangent]
+    rows = [names.index(each) for each in POSITION[:2] if each in names]
+    has_path = len(plane) == 2 and len(rows) == 2
+    nis, white, likelihood = _of_innovations(innovations, epoch_ns)
+    return Case(
+        name,
+        tuple(names),
+        tuple(kind for _, kind in tangent),
+        time_s,
+        sigma,
+        Path(time_s, mean[:, plane]) if has_path else None,
+        covariance[:, rows][:, :, rows] if has_path else np.empty((0, 2, 2)),
+        errors,
+        nis,
+        white,
+        likelihood,
+    )
+
+
+def _of_innovations(
+    stream: Stream | None, epoch_ns: int
+) -> tuple[Nis | None, dict[str, Whiteness], float]:
+    if stream is None:
+        return None, {}, np.nan
+    time_s = _elapsed_s(stream, epoch_ns)
+    degrees = np.isfinite(stream["innovation"]).sum(axis=1)
+    spans = np.floor(time_s / BIN_S).astype(np.int64)
+    starts, place = np.unique(spans, return_inverse=True)
+    squared = np.bincount(place, stream["normalised_innovation_squared"])
+    count = np.bincount(place, degrees)
+    known = count > 0
+    starts, squared, count = starts[known], squared[known], count[known]
+    low, high = (np.asarray(chi2.ppf(np.full(len(count), each), count)) for each in (0.025, 0.975))
+    nis = Nis(np.asarray((starts + 0.5) * BIN_S), squared / count, low / count, high / count)
+    series = whitened(stream).T
+    white = {name: whiteness([each]) for name, each in zip(stream.components, series, strict=True)}
+    stated = stream.columns.get("log_likelihood")
+    return nis, white, np.nan if stated is None else float(np.sum(stated))
+
+
+def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
+    """The rows that are drawn of so many: evenly chosen, with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
+
+
+def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
+    """The rows that are drawn of values (n,), the extremes of each span: no outlier is lost."""
+    count = len(values)
+    if count <= most:
+        return np.arange(count)
+    edges = np.linspace(0, count, most // 2 + 1).astype(np.int64)
+    safe = np.where(np.isfinite(values), values, 0.0)
+    pairs = [
+        (low + np.argmin(safe[low:high]), low + np.argmax(safe[low:high]))
+        for low, high in pairwise(edges.tolist())
+    ]
+    return np.unique(np.array(pairs))
+
+
+def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Floats:
+    """The outline (61, 2) of the region of the plane that holds the truth with this probability."""
+    values, vectors = np.linalg.eigh(covariance)
+    turn = np.linspace(0.0, 2.0 * np.pi, 61)
+    radius = np.sqrt(-2.0 * np.log1p(-probability))
+    unit = np.stack([np.cos(turn), np.sin(turn)], axis=1) * np.sqrt(np.maximum(values, 0.0)) * radius
+    return np.asarray(center + unit @ vectors.T)
+
+
+def typical_time_s(case: Case) -> float | None:
+    """The second whose share of truths outside is nearest the whole run's: there the lens looks.
+
+    Of several the one in the middle of the run; None without truth.
+    """
+    if case.errors is None or len(case.errors.nees) == 0:
+        return None
+    errors = case.errors
+    _, high = case.nees_interval
+    outside = errors.nees > high
+    spans = np.floor(errors.elapsed_s).astype(np.int64)
+    starts, place = np.unique(spans, return_inverse=True)
+    share = np.bincount(place, outside) / np.bincount(place)
+    away = np.abs(share - outside.mean())
+    near = starts[away <= away.min() + 1e-9]
+    return float(near[np.argmin(np.abs(near - np.median(starts)))])
+
+
+def true_path(source: MemorySource, topic: str) -> Path | None:
+    """The path of a truth of a log; None where it has no position."""
+    if topic not in source.topics:
+        return None
+    stream = source[topic]
+    components = stream.components
+    if not {*POSITION[:2]} <= {*components}:
+        return None
+    columns = [components.index(each) for each in POSITION[:2]]
+    state = stream["state"].reshape(len(stream), len(components))[:, columns]
+    return Path(_elapsed_s(stream, source.epoch_ns), state)
+
+
+def map_points(source: MemorySource) -> Floats:
+    """The points of the log's map in the plane (n, 2)."""
+    found = [
+        source[topic]["position_m"][:, :2]
+        for topic, stated in source.topics.items()
+        if stated.schema_name == schemas.LANDMARK.full_name
+    ]
+    return np.concatenate(found) if found else np.empty((0, 2))
+
+
+def _elapsed_s(stream: Stream, epoch_ns: int) -> Floats:
+    return np.asarray((stream.publish_time_ns - epoch_ns) * 1e-9, np.float64)
+
+
+def _share(outside: NDArray[np.bool_]) -> float:
+    return float(np.mean(outside)) if len(outside) else 0.0

@@ -1,0 +1,52 @@
+"""`fuselog explore` as a function: a page on which a filter's parameters are dragged."""
+
+import webbrowser
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from pipeline.api.planning import Log, Named
+from pipeline.exploring.session import open_session
+from recorders.errors import BadInput
+from replay.timeline import viewer
+
+if TYPE_CHECKING:
+    from pipeline.exploring.serving import Explorer
+
+
+def explore(
+    log: Log,
+    estimators: Named,
+    *,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+    gap_limit_s: float = 0.2,
+    show: bool = True,
+) -> "Explorer":
+    """Serve a page on which parameters are dragged while the log is replayed.
+
+    It is served to this machine only, under an address that cannot be guessed. In a notebook the page is
+    shown in the cell that this is the last line of.
+
+    Args:
+        log: a path, a log that was opened, or a recording.
+        estimators: one or two, as `replay` takes them.
+        set: parameters of the filters, and how topics are altered; as `replay` has it.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        show: open it in the browser, but in a notebook.
+
+    Returns what serves the page, until it is closed: `url` is its address, `wait()` waits until the last
+    page is closed, `close()` ends it.
+
+    Raises BadInput where there are several logs, more than two filters, one cannot follow the log, or
+    the extra `explore` is not installed.
+    """
+    session = open_session(log, estimators, set=set, gap_limit_s=gap_limit_s)
+    try:
+        from pipeline.exploring.serving import Explorer
+    except ModuleNotFoundError as error:
+        if error.name != "bokeh":
+            raise
+        raise BadInput('explore draws with Bokeh: pip install "fuselog[explore]"') from None
+    explorer = Explorer(session)
+    if show and not viewer.in_notebook():
+        webbrowser.open(explorer.url)
+    return explorer

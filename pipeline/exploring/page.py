@@ -1,0 +1,469 @@
+"""The page: sliders, plots and words, bound to a session. All replays run in the background."""
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from html import escape
+from typing import Any
+
+from bokeh.document import Document
+from bokeh.events import MouseMove
+from bokeh.layouts import column, row
+from bokeh.models import Button, Div, Range1d, Select, Span
+from bokeh.models import Slider as SliderWidget
+
+from pipeline.exploring.curves import true_path
+from pipeline.exploring.newest import NewestFirst
+from pipeline.exploring.plots import (
+    COLOURS,
+    PINNED,
+    QUIET,
+    Plot,
+    error_plot,
+    fit_errors,
+    instant_of,
+    lens_plot,
+    likelihood_plot,
+    ratio_plot,
+    scene_plot,
+    show_lens,
+    show_likelihood,
+    show_played,
+    whiteness_plot,
+)
+from pipeline.exploring.session import Played, Session
+from pipeline.exploring.sliders import STEPS, Slider, in_words
+from pipeline.exploring.verdict import Verdict, numbers_of
+from recorders.errors import BadInput
+from recorders.log import schemas
+from replay.inference.all_methods import METHODS
+
+NONE = "none"
+SIDE = 300  # the width of the sliders' column, in pixels
+WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
+GROW = {"flex": "1 1 350px"}
+A_ROW = 2  # buttons
+SPREAD = '<div style="display:flex;justify-content:space-between">'
+SLOW_S = 1.0  # a replay that takes longer is said to
+MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
+
+
+class Page:
+    """One page that looks at a session.
+
+    Attributes:
+        session: what it looks at.
+        values: of the parameters, where they are not the log's own.
+        played: what was replayed last, by filter (0, 1, or `PINNED`).
+    """
+
+    def __init__(self, session: Session, document: Document) -> None:
+        """Put the page into a document, and replay for the first time."""
+        self.session, self._document = session, document
+        self.values: dict[str, float] = {}
+        self.played: dict[int | str, Played] = {}
+        self._work = NewestFirst(self._say_error)
+        self._active = session.sliders[0] if session.sliders else None
+        self._at_s: float | None = None
+        self._case = ""
+        self._is_setting = False
+        self._make()
+        self._first()
+
+    def end(self) -> None:
+        """Replay nothing any more."""
+        self._work.end()
+
+    # What is on the page.
+
+    def _make(self) -> None:
+        log = self.session.log
+        self._head = Div(name="verdict", sizing_mode="stretch_width")
+        self._said = Div(name="said", sizing_mode="stretch_width")
+        self._saved = Div(name="saved", width=SIDE)
+        self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
+        time = Range1d(0.0, 1.0)  # of the estimates, once there are some
+        self.truths = [
+            name
+            for name, each in log.topics.items()
+            if each.schema_name == schemas.TRUTH_STATE.full_name
+        ]
+        self.plots: dict[str, Plot] = {
+            "scene": scene_plot(log, self.truths),
+            "lens": lens_plot(),
+            "whiteness": whiteness_plot(),
+            "likelihood": likelihood_plot(),
+            "error": error_plot(time, self._cursor),
+            "nees": ratio_plot("nees", "NEES", time, self._cursor),
+            "nis": ratio_plot("nis", "NIS per component, by second", time, self._cursor),
+        }
+        self._time = time
+        for name in ("error", "nees", "nis"):
+            self.plots[name].figure.on_event(MouseMove, self._move_cursor)
+        self._case_choice = Select(title="Of", name="case", width=SIDE // 2 - 10)
+        self._component = Select(title="Error of", name="component", width=SIDE // 2 - 10)
+        self._case_choice.on_change("value", self._choose)
+        self._component.on_change("value", self._choose)
+        self._side = column(width=SIDE, name="side")
+        figures = {name: plot.figure for name, plot in self.plots.items()}
+        plane = row(figures["scene"], figures["lens"], sizing_mode="stretch_width", styles=WRAP)
+        left = column(plane, figures["whiteness"], figures["likelihood"], sizing_mode="stretch_width")
+        right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
+        for each in (left, right):
+            each.styles = {"flex": "1 1 330px"}
+        both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
+        main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
+        self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
+        self._document.title = f"fuselog explore: {self.session.source.name}"
+        self._fill_side()
+
+    def _fill_side(self) -> None:
+        """All that is to the left: filters, buttons, sliders."""
+        session = self.session
+        heading = Div(text=f"<b>fuselog</b> explore<br>{escape(session.source.name)}", width=SIDE)
+        width = (SIDE - 20) // 2
+        names = list(dict.fromkeys([*session.filters, *(each for each in METHODS if each != "bound")]))
+        chosen = [*session.filters, NONE][:2]
+        choices = [
+            Select(title=title, name=title, options=options, value=value, width=width)
+            for title, options, value in (
+                ("Filter", names, chosen[0]),
+                ("Second", [NONE, *names], chosen[1]),
+            )
+        ]
+        for choice in choices:
+            choice.on_change("value", partial(self._choose_filters, choices))
+        acts: dict[str, Callable[[], None]] = {
+            "Tune": self._tune,
+            "Diagnose": self._diagnose,
+            "Pin": self._pin,
+            "Reset": self._reset,
+            "Estimate": self._estimate,
+            "Timeline": self._timeline,
+            "Save as TOML": self._save,
+            "Command": self._command,
+        }
+        self._widgets: dict[str, tuple[Slider, SliderWidget, Div]] = {}
+        shown: list[Any] = [
+            heading,
+            row(*choices),
+            row(self._case_choice, self._component),
+            *self._buttons(acts),
+        ]
+        group = ""
+        for slider in session.sliders:
+            if slider.group != group:
+                group = slider.group
+                shown.append(Div(text=f"<b>{escape(group)}</b>", width=SIDE, styles={"color": QUIET}))
+            label = Div(width=SIDE, name=f"label-{slider.name}", margin=(0, 5, 0, 5))
+            widget = SliderWidget(
+                start=0.0,
+                end=1.0,
+                step=1.0 / STEPS,
+                value=slider.place(self.values.get(slider.name, slider.own)),
+                title="",
+                show_value=False,
+                tooltips=False,
+                width=SIDE - 20,
+                margin=(0, 5, 0, 5),
+                name=slider.name,
+                bar_color=COLOURS[0],
+            )
+            widget.on_change("value", partial(self._dragged, slider))
+            self._widgets[slider.name] = slider, widget, label
+            shown += [label, widget]
+            self._label(slider)
+        shown.append(self._saved)
+        self._side.children = shown
+
+    def _buttons(self, acts: Mapping[str, Callable[[], None]]) -> list[Any]:
+        """Buttons in rows of `A_ROW`."""
+        made = []
+        for label, act in acts.items():
+            button = Button(label=label, name=label, width=(SIDE - 10 * A_ROW) // A_ROW)
+            button.on_click(act)
+            made.append(button)
+        return [row(*made[first : first + A_ROW]) for first in range(0, len(made), A_ROW)]
+
+    def _label(self, slider: Slider) -> None:
+        """The name of a slider, its value, its ends and the log's own value."""
+        value = self.values.get(slider.name, slider.own)
+        changed = "" if value == slider.own else f" color:{COLOURS[0]};"
+        mark = 100.0 * min(max(slider.place(slider.own), 0.0), 1.0)
+        self._widgets[slider.name][2].text = (
+            f'<div title="{escape(f"{slider.name}: {slider.meaning}")}" style="width:{SIDE - 20}px">'
+            f"{SPREAD}<span>{escape(slider.title)}</span>"
+            f'<b style="{changed}">{escape(slider.words(value))}</b></div>'
+            f'<div style="display:flex;justify-content:space-between;font-size:11px;color:{QUIET};'
+            f'position:relative"><span>{escape(slider.words(slider.low))}</span>'
+            f'<span style="position:absolute;left:{mark:.1f}%" title="the log\'s own, '
+            f'{escape(slider.words(slider.own))}">▾</span>'
+            f"<span>{escape(slider.words(slider.high))}</span></div></div>"
+        )
+
+    # What a person does.
+
+    def _choose(self, attr: str, old: str, new: str) -> None:  # noqa: ARG002
+        """Show another case or component."""
+        if 0 in self.played:
+            self._show()
+
+    def _choose_filters(self, choices: list[Any], attr: str, old: str, new: str) -> None:  # noqa: ARG002
+        """Look at other filters with the same values."""
+        first, second = (each.value for each in choices)
+        labels = [first] if second in (NONE, first) else [first, second]
+        own = self.session.filters
+        like = own[self._label_of(0)]
+        try:
+            session = self.session.with_filters(
+                {label: own.get(label, {**like, "kind": label}) for label in labels}
+            )
+        except BadInput as error:
+            self._tell(str(error))
+            return
+        self.session = session
+        self.played = {place: each for place, each in self.played.items() if place == PINNED}
+        self.values = {name: self.values[name] for name in self.values if session.has(name)}
+        for plot in self.plots.values():
+            plot.clear(1)
+        self._first()
+        self._fill_side()
+
+    def _dragged(self, slider: Slider, attr: str, old: float, new: float) -> None:  # noqa: ARG002
+        if self._is_setting:
+            return
+        value = slider.value(new)
+        if value == slider.own:
+            self.values.pop(slider.name, None)
+        else:
+            self.values[slider.name] = value
+        self._active = slider
+        self._label(slider)
+        self._replay()
+
+    def _move_cursor(self, event: MouseMove) -> None:
+        self._at_s = event.x
+        self._cursor.location = event.x
+        self._show_lens()
+
+    def _pin(self) -> None:
+        if 0 in self.played:
+            self.played[PINNED] = self.played[0]
+            self._show()
+
+    def _reset(self) -> None:
+        self._set({})
+
+    def _tune(self) -> None:
+        free = list(self.values) or ([self._active.name] if self._active else [])
+        values, label = dict(self.values), self._label_of(0)
+        self._tell(f"tuning {', '.join(free)} ...")
+
+        def work(_: Callable[[], bool]) -> None:
+            found = self.session.tuned(label, values, free)
+            said = ", ".join(f"{name} = {found[name]:.4g}" for name in free)
+
+            def show() -> None:
+                self._set(found)
+                self._tell(f"tuned by likelihood: {said}")
+
+            self._later(show)
+
+        self._work.ask(work)
+
+    def _diagnose(self) -> None:
+        values, label = dict(self.values), self._label_of(0)
+        self._tell("diagnosing ...")
+
+        def work(_: Callable[[], bool]) -> None:
+            told = self.session.diagnosed(label, values)
+            self._later(lambda: self._tell(*told))
+
+        self._work.ask(work)
+
+    def _estimate(self) -> None:
+        """Take the parameter that was dragged last into the state, or out of it again."""
+        if self._active is None:
+            return
+        name = self._active.name
+        names = {*self.session.estimated} ^ {name}
+        try:
+            self.session = self.session.with_estimated(sorted(names))
+        except BadInput as error:
+            self._tell(str(error))
+            return
+        self._tell(f"estimated beside the state: {', '.join(sorted(names)) or 'nothing'}")
+        self._replay()
+
+    def _save(self) -> None:
+        self._offer(lambda: self.session.toml(self.values))
+
+    def _command(self) -> None:
+        self._offer(lambda: self.session.command(self.values))
+
+    def _offer(self, text: Callable[[], str]) -> None:
+        try:
+            self._saved.text = (
+                f'<pre style="white-space:pre-wrap;width:{SIDE - 20}px">{escape(text())}</pre>'
+            )
+        except BadInput as error:
+            self._tell(str(error))
+
+    def _timeline(self) -> None:
+        values = dict(self.values)
+        self._tell("drawing the timeline ...")
+
+        def work(_: Callable[[], bool]) -> None:
+            self.session.view(values, self._at_s)
+            self._later(lambda: self._tell(""))
+
+        self._work.ask(work)
+
+    def _set(self, values: Mapping[str, float]) -> None:
+        """Put the sliders to values, and replay."""
+        self.values = dict(values)
+        self._is_setting = True
+        try:
+            for slider, widget, _ in self._widgets.values():
+                widget.value = min(max(slider.place(self.values.get(slider.name, slider.own)), 0.0), 1.0)
+                self._label(slider)
+        finally:
+            self._is_setting = False
+        self._replay()
+
+    # What follows from it.
+
+    def _first(self) -> None:
+        played: dict[int | str, Played] = {
+            place: self.session.play(label, self.values)
+            for place, label in enumerate(self.session.filters)
+        }
+        self._take(played)
+        self._at_s = instant_of(self.played[0], self._chosen_case())
+        self._cursor.location = self._at_s
+        times = [case.time_s for case in self.played[0].cases.values() if len(case.time_s)]
+        if times:
+            self._time.update(start=min(each[0] for each in times), end=max(each[-1] for each in times))
+        self._show()
+        self._replay()
+
+    def _replay(self) -> None:
+        """Replay with the values as they are; what is newer by then is replayed instead."""
+        values, session, active = dict(self.values), self.session, self._active
+
+        def work(is_newer: Callable[[], bool]) -> None:
+            played: dict[int | str, Played] = {}
+            for place, label in enumerate(session.filters):
+                played[place] = session.play(label, values)
+                if is_newer():
+                    break
+            else:
+                self._later(lambda: self._take_and_show(played))
+            if active is None:
+                return
+            points = []
+            for point in session.likelihoods(self._label_of(0), values, active.name):
+                if is_newer():
+                    return
+                points.append(point)
+            now = values.get(active.name, active.own)
+            self._later(lambda: show_likelihood(self.plots["likelihood"], active, points, now))
+
+        self._work.ask(work)
+
+    def _take_and_show(self, played: Mapping[int | str, Played]) -> None:
+        self._take(played)
+        self._show()
+
+    def _take(self, played: Mapping[int | str, Played]) -> None:
+        self.played |= played
+        names = list(self.played[0].cases)
+        self._case_choice.options = [(each, each or "the run") for each in names]
+        if names and self._case_choice.value not in names:
+            self._case_choice.value = names[0]
+        case = self.played[0].cases.get(self._chosen_case())
+        components = list(case.components) if case else []
+        self._component.options = components
+        if components and self._component.value not in components:
+            self._component.value = components[0]
+
+    def _show(self) -> None:
+        """Draw what was replayed, and say what it is worth."""
+        case = self._chosen_case()
+        options = self._component.options
+        component = options.index(self._component.value) if self._component.value in options else 0
+        for place, played in self.played.items():
+            show_played(self.plots, place, played, case, component)
+        self.plots["nees"].figure.visible = any(
+            one.errors is not None for each in self.played.values() for one in each.cases.values()
+        )
+        if self.played[0].cases:
+            fit_errors(self.plots["error"], self.played, case, component)
+        self._show_lens()
+        self._show_head()
+
+    def _show_lens(self) -> None:
+        if self._at_s is None:
+            return
+        case = self._chosen_case()
+        one = self.played[0].cases.get(case)
+        topics = [each for each in self.truths if one is not None and each.strip("/").startswith(case)]
+        truth = true_path(self.session.log, topics[0]) if topics else None
+        show_lens(self.plots["lens"], self.plots["scene"], self.played, case, truth, self._at_s)
+        self.plots["lens"].figure.title.text = f"Lens at {self._at_s:.1f} s"
+
+    def _show_head(self) -> None:
+        case = self._chosen_case()
+        parts = []
+        for place, label in enumerate(self.session.filters):
+            played = self.played[place]
+            verdict = played.verdicts.get(case, Verdict("failed", "It estimated nothing.", ""))
+            parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
+            if case in played.cases:
+                parts.append(_numbers_html(played, self.played.get(PINNED), case))
+            if played.seconds > SLOW_S:
+                parts.append(f"<p>One replay takes {played.seconds:.1f} s.</p>")
+        self._head.text = "".join(parts)
+
+    def _chosen_case(self) -> str:
+        return str(self._case_choice.value or "")
+
+    def _label_of(self, place: int) -> str:
+        return list(self.session.filters)[place]
+
+    def _tell(self, *sentences: str) -> None:
+        self._said.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
+
+    def _say_error(self, error: Exception) -> None:
+        said = str(error) if isinstance(error, BadInput) else f"this failed: {error!r}"
+        self._later(lambda: self._tell(said))
+
+    def _later(self, act: Callable[[], object]) -> None:
+        """Change the page from the thread that may."""
+        self._document.add_next_tick_callback(act)
+
+
+def _verdict_html(label: str, verdict: Verdict, colour: str) -> str:
+    mark = MARKS[verdict.level]
+    red = "" if verdict.level == "good" else "color:#b3123f;"
+    return (
+        f'<h2 style="margin:4px 0;font-weight:400"><b style="color:{colour}">{escape(label)}</b> '
+        f'<b class="headline" style="{red}">{mark} {escape(verdict.headline)}</b> '
+        f"{escape(verdict.detail)}</h2>"
+    )
+
+
+def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
+    cells = []
+    before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
+    for name, (value, unit) in numbers_of(played.cases[case]).items():
+        was = before.get(name)
+        ghost = f'<br><small style="color:{QUIET}">pinned {_number(name, *was)}</small>' if was else ""
+        cells.append(
+            f'<div style="margin-right:32px"><small style="color:{QUIET}">{escape(name)}</small><br>'
+            f'<b style="font-size:18px">{_number(name, value, unit)}</b>{ghost}</div>'
+        )
+    return f'<div class="numbers" style="display:flex">{"".join(cells)}</div>'
+
+
+def _number(name: str, value: float, unit: str) -> str:
+    return f"{value:,.0f}" if name == "log-likelihood" else escape(in_words(value, unit))

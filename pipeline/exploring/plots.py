@@ -1,0 +1,366 @@
+"""The plots of the page, and what fills them: Bokeh figures over sources that change while one drags."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from bokeh.models import (
+    BasicTickFormatter,
+    ColumnDataSource,
+    FixedTicker,
+    NumeralTickFormatter,
+    Range1d,
+    Span,
+)
+from bokeh.plotting import figure
+
+from pipeline.exploring.curves import (
+    Case,
+    Floats,
+    Path,
+    ellipse,
+    extremes,
+    fewer,
+    map_points,
+    true_path,
+    typical_time_s,
+)
+from pipeline.exploring.session import Played
+from pipeline.exploring.sliders import Slider
+from replay.engine.streams.sources import MemorySource
+
+# The report's ink, quiet grey and crimson; a filter has its own colour, what is pinned is a grey ghost.
+INK, QUIET, RED, GHOST, TINT = "#1c1f24", "#5b6470", "#b3123f", "#8b939e", "#e3e7eb"
+COLOURS = ("#a35c00", "#1f7a4d")
+PINNED = "pinned"
+SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # so that lags can be told apart
+HEIGHT = 220
+LEAST_DROP = 100.0  # of log-likelihood, that its plot shows at least
+Data = Mapping[str, Any]
+
+
+@dataclass
+class Plot:
+    """A figure with what changes in it.
+
+    Attributes:
+        figure: as Bokeh draws it.
+        sources: of what changes, by filter (0, 1, or `PINNED`) and by what it is, such as "line".
+    """
+
+    figure: Any
+    sources: dict[tuple[int | str, str], ColumnDataSource] = field(default_factory=dict)
+
+    def source(self, of: int | str, what: str, *columns: str) -> ColumnDataSource:
+        """A source that is empty still."""
+        made = ColumnDataSource({name: [] for name in columns}, name=f"{self.figure.name}-{what}-{of}")
+        self.sources[of, what] = made
+        return made
+
+    def clear(self, of: int | str) -> None:
+        """Draw nothing of a filter."""
+        for own, what in self.sources:
+            if own == of:
+                self.fill(of, what, **{name: [] for name in self.sources[own, what].data})
+
+    def fill(self, of: int | str, what: str, **columns: Any) -> None:
+        """Draw other values; nothing where there is no such source."""
+        if (of, what) in self.sources:
+            self.sources[of, what].data = {name: np.asarray(each) for name, each in columns.items()}
+
+
+def blank(name: str, title: str, *, over_time: Range1d | None = None, **options: Any) -> Plot:
+    """An empty figure of the page's look, without a tool bar."""
+    ranges = {} if over_time is None else {"x_range": over_time}
+    made = figure(
+        name=name,
+        title=title,
+        height=HEIGHT,
+        sizing_mode="stretch_width",
+        toolbar_location=None,
+        tools="",
+        output_backend="canvas",
+        **ranges,
+        **options,
+    )
+    made.outline_line_color = None
+    made.grid.grid_line_color = TINT
+    made.axis.axis_line_color = TINT
+    made.axis.major_tick_line_color = None
+    made.axis.minor_tick_line_color = None
+    made.axis.major_label_text_color = QUIET
+    made.title.text_color = INK
+    made.title.text_font_style = "normal"
+    made.axis.axis_label_text_font_style = "normal"
+    made.axis.axis_label_text_color = QUIET
+    made.background_fill_alpha = 0.0
+    made.border_fill_alpha = 0.0
+    return Plot(made)
+
+
+def error_plot(over_time: Range1d, cursor: Span) -> Plot:
+    """Errors of one component, tinted where the filter says that 95 % of them lie."""
+    plot = blank("error", "Error", over_time=over_time, y_range=Range1d(-1.0, 1.0))
+    for of in (1, 0):
+        plot.figure.varea("t", "low", "high", source=plot.source(of, "band", "t", "low", "high"),
+                          fill_color=COLOURS[of], fill_alpha=0.16)  # fmt: skip
+    _lines(plot)
+    plot.figure.add_layout(cursor)
+    _foot(plot)
+    return plot
+
+
+def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
+    """NEES or NIS over time on a logarithmic axis, grey where those of an honest filter lie."""
+    plot = blank(name, title, over_time=over_time, y_range=Range1d(0.1, 100.0), y_axis_type="log")
+    interval = plot.source(0, "interval", "t", "low", "high")
+    plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT, fill_alpha=1.0)
+    plot.figure.yaxis.formatter = BasicTickFormatter(use_scientific=False)
+    _lines(plot)
+    plot.figure.add_layout(cursor)
+    _foot(plot)
+    return plot
+
+
+def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
+    """The plane from above: map, truth, estimates."""
+    plot = blank("scene", "Scene from above", match_aspect=True)
+    points = map_points(log)
+    plot.figure.scatter(points[:, 0], points[:, 1], marker="triangle", size=8, line_color=QUIET,
+                        fill_color=None)  # fmt: skip
+    for topic in topics:
+        path = true_path(log, topic)
+        if path is not None:
+            rows = fewer(len(path.points))
+            plot.figure.line(*path.points[rows].T, line_color=INK, line_width=1.5)
+    _lines(plot, "x", "y")
+    plot.figure.scatter("x", "y", size=9, source=plot.source(0, "here", "x", "y"), line_color=RED,
+                        fill_color=None, line_width=2)  # fmt: skip
+    return plot
+
+
+def lens_plot() -> Plot:
+    """The scene at one instant, so near that errors of centimetres are seen."""
+    plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
+    plot.figure.match_aspect = True
+    plot.figure.line("x", "y", source=plot.source(0, "truth", "x", "y"), line_color=INK, line_width=2)
+    for of in (PINNED, 1, 0):
+        colour = GHOST if of == PINNED else COLOURS[int(of)]
+        plot.figure.patch("x", "y", source=plot.source(of, "ellipse", "x", "y"), line_color=colour,
+                          fill_color=colour, fill_alpha=0.16, line_width=1.5)  # fmt: skip
+    _lines(plot, "x", "y")
+    plot.figure.scatter("x", "y", size=9, source=plot.source(0, "here", "x", "y"), line_color=RED,
+                        fill_color=RED)  # fmt: skip
+    return plot
+
+
+def whiteness_plot() -> Plot:
+    """Autocorrelations of the component of the whitened innovations that is least white."""
+    plot = blank("whiteness", "Whiteness", y_range=Range1d(-0.25, 0.25))
+    interval = plot.source(0, "interval", "t", "low", "high")
+    plot.figure.varea("t", "low", "high", source=interval, fill_color=TINT)
+    for of in SHIFTS:
+        colour = GHOST if of == PINNED else COLOURS[int(of)]
+        source = plot.source(of, "line", "x", "y", "zero")
+        plot.figure.segment("x", "zero", "x", "y", source=source, line_color=colour, line_width=2)
+        plot.figure.scatter("x", "y", source=source, size=5, color=colour)
+    plot.figure.xaxis.axis_label = "lag, in measurements"
+    return plot
+
+
+def likelihood_plot() -> Plot:
+    """The log-likelihood of all measurements over the parameter that is dragged."""
+    plot = blank("likelihood", "Likelihood", y_range=Range1d(0.0, 1.0))
+    plot.figure.yaxis.formatter = NumeralTickFormatter(format="0,0")
+    source = plot.source(0, "line", "x", "y")
+    plot.figure.line("x", "y", source=source, line_color=QUIET, line_width=1.5)
+    plot.figure.scatter("x", "y", source=plot.source(0, "peak", "x", "y"), marker="diamond", size=9,
+                        color=INK)  # fmt: skip
+    plot.figure.scatter("x", "y", source=plot.source(0, "here", "x", "y"), size=10, color=COLOURS[0])
+    return plot
+
+
+def show_played(
+    plots: Mapping[str, Plot], of: int | str, played: Played, case: str, component: int
+) -> None:
+    """Draw one replay: errors, NEES, NIS, whiteness, path."""
+    one = played.cases.get(case)
+    if one is None:
+        for plot in plots.values():
+            plot.clear(of)
+        return
+    _show_errors(plots["error"], of, one, component)
+    _show_nees(plots["nees"], of, one)
+    _show_nis(plots["nis"], of, one)
+    _show_whiteness(plots["whiteness"], of, one)
+    if one.path is not None:
+        rows = fewer(len(one.path.points))
+        plots["scene"].fill(of, "line", x=one.path.points[rows, 0], y=one.path.points[rows, 1])
+
+
+def _show_errors(plot: Plot, of: int | str, case: Case, component: int) -> None:
+    if case.errors is None:
+        sigma, t = 1.96 * case.sigma[:, component], case.time_s
+        rows = fewer(len(t))
+        plot.fill(of, "band", t=t[rows], low=-sigma[rows], high=sigma[rows])
+        return
+    errors = case.errors
+    error, t = errors.error[:, component], errors.elapsed_s
+    sigma = 1.96 * np.sqrt(errors.covariance[:, component, component])
+    rows, even = extremes(error), fewer(len(t))
+    plot.fill(of, "line", x=t[rows], y=error[rows])
+    plot.fill(of, "band", t=t[even], low=-sigma[even], high=sigma[even])
+    _show_foot(plot, of, f"Error of {errors.components[component]}", t, np.abs(error) > sigma)
+
+
+def _show_nees(plot: Plot, of: int | str, case: Case) -> None:
+    if case.errors is None or len(case.errors.nees) == 0:
+        return
+    t, nees = case.errors.elapsed_s, case.errors.nees
+    low, high = case.nees_interval
+    rows = extremes(nees)
+    plot.fill(of, "line", x=t[rows], y=np.maximum(nees[rows], 1e-6))
+    plot.fill(of, "interval", t=t[[0, -1]], low=[low, low], high=[high, high])
+    _show_foot(plot, of, "NEES", t, (nees < low) | (nees > high))
+
+
+def _show_nis(plot: Plot, of: int | str, case: Case) -> None:
+    if case.nis is None:
+        return
+    nis = case.nis
+    rows = extremes(nis.mean)
+    plot.fill(of, "line", x=nis.time_s[rows], y=np.maximum(nis.mean[rows], 1e-6))
+    even = fewer(len(nis.time_s))
+    plot.fill(
+        of, "interval", t=nis.time_s[even], low=np.maximum(nis.low[even], 1e-6), high=nis.high[even]
+    )
+    _show_foot(
+        plot,
+        of,
+        "NIS per component, by second",
+        nis.time_s,
+        (nis.mean < nis.low) | (nis.mean > nis.high),
+    )
+
+
+def _show_whiteness(plot: Plot, of: int | str, case: Case) -> None:
+    if not case.whiteness:
+        return
+    name, white = min(
+        case.whiteness.items(), key=lambda each: np.nan_to_num(each[1].probability, nan=2.0)
+    )
+    lags = np.arange(1, len(white.correlation) + 1, dtype=float)
+    plot.fill(of, "line", x=lags + SHIFTS[of], y=white.correlation, zero=np.zeros(len(lags)))
+    ends = [0.0, len(lags) + 1.0]
+    plot.fill(of, "interval", t=ends, low=[-white.bound] * 2, high=[white.bound] * 2)
+    plot.figure.title.text = f"Whiteness of the innovations of {name}"
+
+
+def show_lens(
+    plot: Plot,
+    scene: Plot,
+    played: Mapping[int | str, Played],
+    case: str,
+    truth: Path | None,
+    at_s: float,
+) -> None:
+    """Look at one instant: truth, estimates and the ellipses that hold the truth with 95 %."""
+    first = played[0].cases.get(case) if 0 in played else None
+    if first is None or first.path is None or not len(first.path.points):
+        return
+    half = 0.0
+    for of, each in played.items():
+        one = each.cases.get(case)
+        if one is None or one.path is None:
+            continue
+        row = int(np.argmin(np.abs(one.path.time_s - at_s)))
+        outline = ellipse(one.path.points[row], one.covariance[row])
+        plot.fill(of, "ellipse", x=outline[:, 0], y=outline[:, 1])
+        near = np.abs(one.path.time_s - at_s) < 5.0
+        plot.fill(of, "line", x=one.path.points[near, 0], y=one.path.points[near, 1])
+        half = max(half, float(np.abs(outline - one.path.points[row]).max()))
+    center = first.path.points[int(np.argmin(np.abs(first.path.time_s - at_s)))]
+    scene.fill(0, "here", x=center[:1], y=center[1:])
+    if truth is not None:
+        there = np.array([np.interp(at_s, truth.time_s, each) for each in truth.points.T])
+        near = np.abs(truth.time_s - at_s) < 5.0
+        plot.fill(0, "truth", x=truth.points[near, 0], y=truth.points[near, 1])
+        plot.fill(0, "here", x=there[:1], y=there[1:])
+        half = max(half, float(np.abs(there - center).max()))
+    half = 1.4 * (half or 1.0)
+    plot.figure.x_range.update(start=center[0] - 1.6 * half, end=center[0] + 1.6 * half)
+    plot.figure.y_range.update(start=center[1] - half, end=center[1] + half)
+
+
+def show_likelihood(
+    plot: Plot, slider: Slider, points: Sequence[tuple[float, float]], now: float
+) -> None:
+    """Draw the likelihood along a parameter, its peak, and where its value is now."""
+    if not points:
+        return
+    places = np.array([slider.place(value) for value, _ in points])
+    likelihoods = np.array([each for _, each in points])
+    best = int(np.argmax(likelihoods))
+    plot.fill(0, "line", x=places, y=likelihoods)
+    plot.fill(0, "peak", x=places[[best]], y=likelihoods[[best]])
+    here = slider.place(now)
+    there = float(np.interp(here, places, likelihoods))
+    plot.fill(0, "here", x=[here], y=[there])
+    below = 1.3 * max(likelihoods[best] - there, LEAST_DROP)
+    plot.figure.y_range.update(start=likelihoods[best] - below, end=likelihoods[best] + 0.15 * below)
+    plot.figure.title.text = (
+        f"Likelihood over {slider.title}; greatest near {slider.words(points[best][0])}"
+    )
+    ticks = [0.0, 0.25, 0.5, 0.75, 1.0]
+    plot.figure.xaxis.ticker = FixedTicker(ticks=ticks)
+    plot.figure.xaxis.major_label_overrides = {each: slider.words(slider.value(each)) for each in ticks}
+
+
+def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: int) -> None:
+    """Choose the error's axis so that all but rare errors are seen, of what is pinned too."""
+    most = 0.0
+    for each in played.values():
+        one = each.cases.get(case)
+        if one is not None:
+            most = max(most, 1.96 * float(np.nanmedian(one.sigma[:, component])) * 2.0)
+            if one.errors is not None and len(one.errors.error):
+                most = max(most, float(np.quantile(np.abs(one.errors.error[:, component]), 0.995)))
+    if most > 0.0:
+        plot.figure.y_range.update(start=-1.1 * most, end=1.1 * most)
+
+
+def instant_of(played: Played, case: str) -> float:
+    """Where the lens looks at first: at a typical second, else in the middle."""
+    one = played.cases.get(case)
+    if one is None or not len(one.time_s):
+        return 0.0
+    found = typical_time_s(one)
+    return float(np.median(one.time_s)) if found is None else found
+
+
+def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
+    """A line for what is pinned and for each filter, the second dashed on top."""
+    for of in (PINNED, 0, 1):
+        colour, width = (GHOST, 1.0) if of == PINNED else (COLOURS[int(of)], 1.5)
+        source = plot.source(of, "line", x, y)
+        dash = "dashed" if of == 1 else "solid"  # so that two that coincide are both seen
+        plot.figure.line(x, y, source=source, line_color=colour, line_width=width, line_dash=dash)
+
+
+def _foot(plot: Plot) -> None:
+    """A strip of marks at the foot, where the first filter is outside."""
+    plot.figure.extra_y_ranges = {"foot": Range1d(0.0, 1.0)}
+    marks = plot.source(0, "outside", "t", "foot")
+    plot.figure.scatter("t", "foot", source=marks, marker="dash", angle=np.pi / 2, size=7, color=RED,
+                        y_range_name="foot")  # fmt: skip
+
+
+def _show_foot(plot: Plot, of: int | str, title: str, time_s: Floats, outside: Any) -> None:
+    if of == 0:
+        t = time_s[outside]
+        t = t[fewer(len(t))] if len(t) else t
+        plot.fill(0, "outside", t=t, foot=np.full(len(t), 0.02))
+        share = 100.0 * float(np.mean(outside)) if len(outside) else 0.0
+        shown = f"{share:.0f}" if share >= 10.0 else f"{share:.1f}"
+        plot.figure.title.text = f"{title}: outside {shown} %; 5 % is right"

@@ -1,0 +1,113 @@
+"""Shows the page to this machine alone: a server on the loopback interface, its address a secret.
+
+Whoever does not know the token in the address is refused, also by the WebSocket, which moreover takes
+connections of the page's own origin only. When the last page is closed the server ends.
+"""
+
+import asyncio
+import secrets
+from collections.abc import Callable
+from threading import Event, Thread
+
+from bokeh.application import Application
+from bokeh.application.application import SessionContext
+from bokeh.application.handlers.function import FunctionHandler
+from bokeh.document import Document
+from bokeh.server.server import Server
+from tornado.ioloop import IOLoop
+
+from pipeline.exploring.page import Page
+from pipeline.exploring.session import Session
+
+LOOPBACK = "127.0.0.1"
+TEMPLATE = """
+{% block preamble %}
+<meta name="referrer" content="no-referrer">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>
+  body { font: 14px/1.4 Inter, system-ui, sans-serif; margin: 16px; color: #1c1f24; }
+  @media (prefers-color-scheme: dark) {
+    html { background: #121417; }
+    body { filter: invert(.93) hue-rotate(180deg); }
+  }
+</style>
+{% endblock %}
+"""
+CLOSED_MS = 3000  # after a page is closed; one that is loaded again is back by then
+
+
+class Explorer:
+    """A page that is served.
+
+    Attributes:
+        session: what it looks at.
+        url: its address, which only this machine reaches.
+    """
+
+    def __init__(self, session: Session) -> None:
+        """Serve pages on a free port of the loopback interface, in a thread of its own."""
+        self.session = session
+        self._token = secrets.token_urlsafe(24)
+        self._pages: dict[str, Page] = {}
+        self._is_up, self._is_ended = Event(), Event()
+        self._stop: Callable[[], None] = lambda: None
+        self.url = ""
+        self._thread = Thread(target=self._serve, name="fuselog explore, server", daemon=True)
+        self._thread.start()
+        self._is_up.wait()
+
+    def close(self) -> None:
+        """End the server and what it is doing."""
+        self._stop()
+        self._thread.join(timeout=5.0)
+
+    def wait(self) -> None:
+        """Wait until the last page is closed."""
+        self._is_ended.wait()
+
+    def _repr_html_(self) -> str:
+        """The page within a notebook's cell."""
+        return f'<iframe src="{self.url}" width="100%" height="900" style="border:0"></iframe>'
+
+    def _serve(self) -> None:
+        asyncio.set_event_loop(asyncio.new_event_loop())
+        loop = IOLoop.current()
+        application = Application(FunctionHandler(self._fill))
+        server = Server(
+            {"/": application},
+            io_loop=loop,
+            address=LOOPBACK,
+            port=0,
+            prefix=f"/{self._token}",
+            allow_websocket_origin=["localhost:0"],
+            check_unused_sessions_milliseconds=1000,
+            unused_session_lifetime_milliseconds=CLOSED_MS,
+            use_index=False,
+            extra_patterns=[],
+        )
+        origin = f"{LOOPBACK}:{server.port}"
+        server._tornado.websocket_origins.clear()
+        server._tornado.websocket_origins.add(origin)
+        self.url = f"http://{origin}/{self._token}/"
+        self._stop = lambda: loop.add_callback(loop.stop)
+        server.start()
+        self._is_up.set()
+        try:
+            loop.start()
+        finally:
+            for page in self._pages.values():
+                page.end()
+            server.stop()
+            self._is_ended.set()
+
+    def _fill(self, document: Document) -> None:
+        document.template = TEMPLATE
+        identity = secrets.token_hex(8)
+        self._pages[identity] = Page(self.session, document)
+
+        def closed(_: SessionContext) -> None:
+            self._pages.pop(identity).end()
+            if not self._pages:
+                self._stop()
+
+        document.on_session_destroyed(closed)

@@ -1,0 +1,247 @@
+"""A log in memory and the filters on it: what a change of settings does, without server or browser."""
+
+import math
+import shlex
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import tomli_w
+
+from pipeline.altering.sources import setting_of, split_settings
+from pipeline.api.planning import Log, Named, settings_of, sources_of
+from pipeline.api.replays import replay as replayed
+from pipeline.diagnosing.diagnosis import diagnose
+from pipeline.exploring.curves import Case, cases_of
+from pipeline.exploring.sliders import Slider, setting_text, sliders_of
+from pipeline.exploring.verdict import Verdict, verdict_of
+from pipeline.output.alarming import alarms_of
+from pipeline.runs.settings import parameters_by_label, with_settings
+from pipeline.tuning.objective import Run, in_memory
+from pipeline.tuning.tuning import OPEN, tune
+from recorders.atomic import scratch_folder
+from recorders.errors import BadInput, choices
+from recorders.parameters import merge, nested
+from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.replaying import collect, replay
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.foreign.naming import allowed
+from replay.judging.judge import Judge
+from replay.timeline import viewer
+
+Values = Mapping[str, float]
+MOST = 2  # filters side by side
+
+
+@dataclass(frozen=True)
+class Played:
+    """One filter's replay with some settings.
+
+    Attributes:
+        label: the filter's.
+        values: of the parameters that were set.
+        cases: what is drawn, by the name of what is estimated.
+        verdicts: likewise.
+        seconds: what replaying and judging took.
+    """
+
+    label: str
+    values: Values
+    cases: Mapping[str, Case]
+    verdicts: Mapping[str, Verdict]
+    seconds: float
+
+
+@dataclass
+class Session:
+    """Explores one log with one filter or several.
+
+    Attributes:
+        source: the log, altered as it was asked for.
+        filters: settings by label.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        estimated: parameters that are part of the state, with their standard deviations at the start.
+    """
+
+    source: LogSource | MemorySource
+    filters: dict[str, dict[str, Any]]
+    gap_limit_s: float = 0.2
+    estimated: Mapping[str, float] = field(default_factory=dict)
+    _run: Run = field(init=False)
+    sliders: list[Slider] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Bind all filters, and read what they need into memory; raises BadInput as a replay does."""
+        bound = {label: self._bound(label, {}, [self.source]) for label in self.filters}
+        self._run = in_memory(self.source, [one for each in bound.values() for one in each])
+        self.sliders = sliders_of(self.source, {label: each[0] for label, each in bound.items()})
+
+    @property
+    def log(self) -> MemorySource:
+        """What is in memory of the log."""
+        return self._run.ensemble[0]
+
+    def slider(self, name: str) -> Slider:
+        """The slider of a parameter; raises BadInput where it has none."""
+        found = next((each for each in self.sliders if each.name == name), None)
+        if found is None:
+            raise BadInput(f"no slider '{name}'; {choices(name, [each.name for each in self.sliders])}")
+        return found
+
+    def has(self, name: str) -> bool:
+        """Tell whether a parameter has a slider."""
+        return any(each.name == name for each in self.sliders)
+
+    def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
+        """The same log with other filters; raises BadInput where one cannot follow it."""
+        return Session(self.source, dict(filters), self.gap_limit_s)
+
+    def with_estimated(self, names: Sequence[str]) -> "Session":
+        """The same with these parameters in the state, each from a quarter of its slider's way.
+
+        Raises BadInput where a model cannot estimate one.
+        """
+        sigmas = {name: 0.25 * (self.slider(name).high - self.slider(name).low) for name in names}
+        return Session(self.source, self.filters, self.gap_limit_s, sigmas)
+
+    def play(self, label: str, values: Values) -> Played:
+        """Replay one filter with some parameters set, and judge it.
+
+        Raises BadInput where it refuses them, or cannot begin.
+        """
+        begin = time.perf_counter()
+        bound = self._bound(label, values, self._run.ensemble)
+        outputs = collect(replay(self._run.ensemble, bound))
+        judge = Judge(self._run.ensemble, gap_limit_s=self.gap_limit_s)
+        judged = judge.add(outputs)
+        cases = cases_of(outputs, judged.errors, self.source.epoch_ns)
+        parameters = bound[0].parameters
+        stated = {label: parameters.model_dump()} if parameters is not None else {}
+        alarms, failures = alarms_of(judge, stated), judge.failures
+        verdicts = {name: verdict_of(case, alarms, failures) for name, case in cases.items()}
+        return Played(label, dict(values), cases, verdicts, time.perf_counter() - begin)
+
+    def likelihoods(
+        self, label: str, values: Values, name: str, count: int = 15
+    ) -> Iterator[tuple[float, float]]:
+        """The log-likelihood along one parameter: value and likelihood, from its least value on.
+
+        The gate is open: likelihoods of other measurements are not to be compared.
+        """
+        opened = OPEN if name not in OPEN and self._takes(label, *OPEN) else {}
+        for value in self.slider(name).values(count):
+            try:
+                cases = self.play(label, {**values, **opened, name: value}).cases
+            except BadInput:
+                continue
+            likelihood = sum(case.log_likelihood for case in cases.values())
+            if math.isfinite(likelihood):
+                yield value, likelihood
+
+    def tuned(self, label: str, values: Values, free: Sequence[str]) -> dict[str, float]:
+        """The values of most likelihood of some parameters, the others as they are set.
+
+        Raises BadInput as `tune` does.
+        """
+        found = tune(
+            self.source, {label: self.settings(label, values)}, free, gap_limit_s=self.gap_limit_s
+        )
+        best = found.parameters.set_index("parameter")["value"]
+        return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}
+
+    def diagnosed(self, label: str, values: Values) -> list[str]:
+        """What is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""
+        found = diagnose(
+            self.source, {label: self.settings(label, values)}, gap_limit_s=self.gap_limit_s
+        )
+        return found.told
+
+    def view(self, values: Values, at_s: float | None) -> None:
+        """Open the timeline of all filters in the viewer, at an instant; until it is closed.
+
+        Raises BadInput where there is no screen, or the viewer cannot run.
+        """
+        with scratch_folder("fuselog-explore") as folder:
+            rrd = folder / "timeline.rrd"
+            chosen = {label: {"kind": label, **self.settings(label, values)} for label in self.filters}
+            replayed(self.source, chosen, gap_limit_s=self.gap_limit_s).view(save=rrd)
+            viewer.view(rrd, at_s=at_s)
+
+    def settings(self, label: str, values: Values) -> dict[str, Any]:
+        """The settings of a filter, with values over its own where it has such parameters."""
+        own = self.filters[label]
+        taken = {name: value for name, value in values.items() if self._takes(label, name)}
+        for name, value in taken.items():
+            own = merge(own, nested(name, value))
+        if self.estimated:
+            own = merge(own, {"estimate": [*self.estimated], "estimate_sigma": dict(self.estimated)})
+        return dict(own)
+
+    def toml(self, values: Values) -> str:
+        """All filters' settings as a settings file has them, for `--settings`.
+
+        Raises BadInput where one is no text, such as an estimator of one's own.
+        """
+        tables = {}
+        for label in self.filters:
+            settings = self.settings(label, values)
+            if not isinstance(settings.get("kind", label), str):
+                raise BadInput(f"{label}: is an estimator of your own; a file cannot hold it")
+            tables[label] = {
+                name: each for name, each in settings.items() if (name, each) != ("kind", label)
+            }
+        return tomli_w.dumps(tables)
+
+    def command(self, values: Values) -> str:
+        """The command that replays the same."""
+        place = self.source.log.path if isinstance(self.source, LogSource) else self.source.name
+        words = ["fuselog replay", shlex.quote(str(place))]
+        words += [f"-e {label}" for label in self.filters]
+        words += [
+            f"--set {shlex.quote(f'{key}={value}')}" for key, value in setting_of(self.source).items()
+        ]
+        if self.estimated:
+            words.append(f"--set {shlex.quote(f'estimate={[*self.estimated]}')}")
+            words += [f"--set estimate_sigma.{name}={each!r}" for name, each in self.estimated.items()]
+        return " ".join([*words, *setting_text(values)])
+
+    def _bound(
+        self, label: str, values: Values, sources: Sequence[LogSource | MemorySource]
+    ) -> list[Bound]:
+        return bind(label, sources, {"kind": label, **self.settings(label, values)})
+
+    def _takes(self, label: str, name: str) -> bool:
+        [names] = parameters_by_label({label: self.filters[label]}).values()
+        return name.partition(".")[0] in names
+
+
+def open_session(
+    log: Log,
+    estimators: Named,
+    *,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+    gap_limit_s: float = 0.2,
+) -> Session:
+    """Begin to explore one log.
+
+    Args:
+        log: a path, a log that was opened, or a recording.
+        estimators: as `replay` takes them.
+        set: parameters of the filters, and how topics are altered; as `replay` has it.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Raises BadInput where there are several logs or too many filters, or one cannot follow the log.
+    """
+    alterations, given = split_settings(set or {})
+    sources = sources_of(log, alterations)
+    if len(sources) > 1:
+        raise BadInput(
+            f"{len(sources)} logs: one is explored at a time; give one, such as {sources[0].name}"
+        )
+    chosen = settings_of(estimators)
+    if len(chosen) > MOST:
+        raise BadInput(
+            f"{', '.join(chosen)}: at most {MOST} filters are explored at a time; leave some out"
+        )
+    return Session(sources[0], with_settings(chosen, allowed(given)) if given else chosen, gap_limit_s)

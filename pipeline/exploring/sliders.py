@@ -1,0 +1,181 @@
+"""Which parameters of filters have sliders, between which values, and how a person reads these."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.tuning.tuning import value_at_start
+from recorders.errors import BadInput
+from recorders.parameters import bounds_of, describe
+from replay.engine.replaying.estimator import Bound, Recursive
+from replay.engine.streams.sources import LogSource, MemorySource
+from replay.inference.model.parameters import number_fields
+
+STEPS = 400  # between the ends of a slider
+FACTOR = 10.0  # a positive parameter goes from its own value divided by this to as many times it
+# How far a parameter of either sign goes where its own value is zero, by its unit.
+REACH = {"m": 1.0, "rad": 0.2, "rad/s": 0.05, "m/s": 1.0, "s": 1.0, "m/s^2": 0.5}
+# Units as people write them: by what to multiply, and what to write, up to a value.
+SMALLER = {
+    "m": ((0.01, 1000.0, "mm"), (1.0, 100.0, "cm")),
+    "s": ((1.0, 1000.0, "ms"),),
+    "rad": ((math.inf, 180.0 / math.pi, "°"),),
+    "rad/s": ((math.inf, 180.0 / math.pi, "°/s"),),
+}
+MOTION, GATE = "motion", "gate"
+
+
+class Slider(NamedTuple):
+    """A parameter that can be dragged.
+
+    Attributes:
+        name: of the parameter.
+        group: what it is of: a topic, or `MOTION` or `GATE`.
+        meaning, unit: of the parameter.
+        own: its value as the log and the settings have it.
+        low, high: the ends of the slider.
+        is_logarithmic: whether equal ways are equal factors.
+    """
+
+    name: str
+    group: str
+    meaning: str
+    unit: str
+    own: float
+    low: float
+    high: float
+    is_logarithmic: bool
+
+    @property
+    def title(self) -> str:
+        """The name as a person reads it: without its unit.
+
+        >>> Slider("sigma_range_m", "", "", "m", 0.1, 0.01, 1.0, True).title
+        'sigma range'
+        """
+        end = "_" + self.unit.replace("^", "").replace("1/", "per_").replace("/", "p")
+        return self.name.removesuffix(end).replace("_", " ")
+
+    def place(self, value: float) -> float:
+        """Where a value lies between the ends: 0 to 1, beyond them less or more."""
+        value, low, high = (self._straight(each) for each in (value, self.low, self.high))
+        return (value - low) / (high - low)
+
+    def value(self, place: float) -> float:
+        """The value at a place from 0 to 1, to four digits; the own value where it is that."""
+        low, high = self._straight(self.low), self._straight(self.high)
+        there = low + place * (high - low)
+        value = float(f"{math.exp(there) if self.is_logarithmic else there:.4g}")
+        if abs(place - self.place(self.own)) < 0.5 / STEPS:
+            return self.own
+        return min(max(value, self.low), self.high)
+
+    def values(self, count: int) -> list[float]:
+        """So many values from end to end."""
+        return [self.value(place) for place in np.linspace(0.0, 1.0, count).tolist()]
+
+    def _straight(self, value: float) -> float:
+        if not self.is_logarithmic:
+            return value
+        return math.log(value) if value > 0.0 else -math.inf
+
+    def words(self, value: float) -> str:
+        """A value with its unit, as people write it."""
+        return in_words(value, self.unit)
+
+
+def in_words(value: float, unit: str) -> str:
+    """A number with its unit, as people write it.
+
+    >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(0.99, ""), in_words(0.004, "m")
+    ('10 cm', '1.15°', '0.99', '4 mm')
+    """
+    for most, factor, shorter in SMALLER.get(unit, ()):
+        if 0.0 < abs(value) < most:
+            space = "" if shorter.startswith("°") else " "
+            return f"{value * factor:.3g}{space}{shorter}"
+    return f"{value:.3g} {unit}".strip()
+
+
+def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
+    """The parameters of filters that can be dragged, those of one group together.
+
+    Of an estimator of a model these are the parameters that its functions read on this log; of any other
+    all its numbers that have a value above zero.
+
+    Args:
+        source: the log.
+        bound: by label.
+    """
+    found: dict[str, Slider] = {}
+    for each in bound.values():
+        if each.parameters is None:
+            continue
+        meanings = {entry.name: entry for entry in describe(type(each.parameters))}
+        for name, group in _groups(each).items():
+            if name in found or name not in meanings:
+                continue
+            entry = meanings[name]
+            slider = _slider(name, group, entry.meaning, entry.unit, source, each)
+            if slider is not None:
+                found[name] = slider
+    groups = dict.fromkeys([slider.group for slider in found.values() if slider.group != GATE])
+    return [slider for group in (*groups, GATE) for slider in found.values() if slider.group == group]
+
+
+def _groups(bound: Bound) -> dict[str, str]:
+    """The names of parameters that matter on this log, with what they are of."""
+    assert bound.parameters is not None
+    names = number_fields(type(bound.parameters))
+    if not isinstance(bound, Recursive) or bound.reading is None:
+        return dict.fromkeys(names, MOTION)
+    reading = bound.reading()
+    found = {name: topic or MOTION for name, topic in reading.noises.items()}
+    for name, (_, topics) in reading.augmentable.items():
+        found.setdefault(name, topics[0] or MOTION)
+    for (topic, _), name in (*reading.biases.items(), *reading.factors.items()):
+        found.setdefault(name, topic)
+    found |= {name: topic for topic, name in reading.delays.items()}
+    gate = {name: GATE for name in ("gate_probability",) if name in names}
+    return dict(sorted(found.items(), key=lambda each: _order(each[1], bound.streams))) | gate
+
+
+def _order(group: str, topics: Sequence[str]) -> int:
+    """Sensors in the order in which they are read, then the motion."""
+    return topics.index(group) if group in topics else len(topics)
+
+
+def _slider(
+    name: str, group: str, meaning: str, unit: str, source: LogSource | MemorySource, bound: Bound
+) -> Slider | None:
+    """The slider of a parameter; None where it is no number, or has no value on this log."""
+    try:
+        least, greatest = bounds_of(type(bound.parameters), name)  # type: ignore[arg-type]
+        own, _ = value_at_start(name, source, bound)
+    except BadInput:
+        return None
+    if isinstance(own, bool):
+        return None
+    own = float(own)
+    if math.isfinite(least) and math.isfinite(greatest):
+        low = least if least < own else own
+        ends, is_logarithmic = (max(low, 0.5) if name == "gate_probability" else low, greatest), False
+    elif own > 0.0 and least >= 0.0:
+        ends, is_logarithmic = (own / FACTOR, min(own * FACTOR, greatest)), True
+    elif own == 0.0 and least >= 0.0:
+        ends, is_logarithmic = (0.0, REACH.get(unit, 1.0)), False
+    else:
+        reach = 0.5 * abs(own) or REACH.get(unit, 1.0)
+        ends, is_logarithmic = (max(own - reach, least), min(own + reach, greatest)), False
+    return Slider(name, group, meaning, unit, own, *ends, is_logarithmic)
+
+
+def setting_text(values: Mapping[str, float]) -> Iterable[str]:
+    """Values as `--set` takes them.
+
+    >>> list(setting_text({"sigma_range_m": 0.043}))
+    ['--set sigma_range_m=0.043']
+    """
+    return [f"--set {name}={value!r}" for name, value in values.items()]

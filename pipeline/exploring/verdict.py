@@ -1,0 +1,96 @@
+"""What a person is told of a filter on a log: one sentence, and what it rests on."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from pipeline.exploring.curves import Case
+from pipeline.output.alarms import Alarm
+
+Level = Literal["good", "doubtful", "failed"]
+
+
+class Verdict(NamedTuple):
+    """A judgement in words.
+
+    Attributes:
+        level: how bad it is.
+        headline: in a few words.
+        detail: what it rests on.
+    """
+
+    level: Level
+    headline: str
+    detail: str
+
+
+def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> Verdict:
+    """Judge one filter on one log, by the alarms of its replay; those of other cases do not count.
+
+    Whether a filter is too sure of itself is what NIS and NEES say, see `pipeline.output.alarming`.
+    """
+    if failures:
+        return Verdict("failed", "It stopped.", failures[0])
+    own = [each for each in alarms if each.case in ("", case.name)]
+    if not own:
+        return Verdict("good", "Nothing speaks against it.", _evidence(case))
+    ratio, of_what = _ratio(case)
+    about = {each.kind for each in own}
+    if not about & {"innovations", "errors"} or math.isnan(ratio):
+        return Verdict("doubtful", "Doubtful.", own[0].words)
+    if ratio > 1.0:
+        return Verdict(
+            "doubtful", "Too sure of itself.", f"Its {of_what} are {ratio:.2g} times what it claims."
+        )
+    return Verdict("doubtful", "Too careful.", f"Its {of_what} are {ratio:.2g} of what it claims.")
+
+
+def _ratio(case: Case) -> tuple[float, str]:
+    """How many times larger errors or innovations are than stated, and which of them it is of.
+
+    The one that is farther from one: a filter may be right on what it measures and wrong on the rest.
+    """
+    found = []
+    if case.errors is not None and np.isfinite(case.errors.nees).any():
+        nees = float(np.nanmean(case.errors.nees))
+        found.append((math.sqrt(nees / len(case.errors.components)), "errors"))
+    if case.nis is not None and len(case.nis.mean):
+        found.append((math.sqrt(mean_nis(case)), "innovations"))
+    return max(found, key=lambda each: abs(math.log(max(each[0], 1e-12))), default=(math.nan, ""))
+
+
+def mean_nis(case: Case) -> float:
+    """The mean square of the whitened innovations; NaN without any."""
+    known = {name: each for name, each in case.whiteness.items() if np.isfinite(each.mean_square)}
+    count = sum(each.size for each in known.values())
+    if not count:
+        return math.nan
+    return sum(each.size * each.mean_square for each in known.values()) / count
+
+
+def _evidence(case: Case) -> str:
+    said = []
+    if not math.isnan(nis := mean_nis(case)):
+        said.append(f"NIS is {nis:.2f} per component")
+    if case.errors is not None and np.isfinite(case.errors.nees).any():
+        nees = float(np.nanmean(case.errors.nees))
+        said.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
+    return " and ".join(said) + " within their intervals." if said else "There is nothing to judge by."
+
+
+def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:
+    """The numbers at the head of the page, by what they are of, each with its unit."""
+    found: dict[str, tuple[float, str]] = {}
+    if case.errors is not None and len(case.errors.nees):
+        main = case.errors.main
+        squared = case.errors.error[:, main.columns] ** 2
+        unit = {"position_rmse_m": "m", "orientation_rmse_deg": "deg"}.get(main.rmse, "")
+        found["error, RMS"] = main.scale * math.sqrt(float(np.mean(squared.sum(axis=1)))), unit
+        found[f"NEES, aim {len(case.errors.components)}"] = float(np.nanmean(case.errors.nees)), ""
+    if not math.isnan(nis := mean_nis(case)):
+        found["NIS, aim 1"] = nis, ""
+    if not math.isnan(case.log_likelihood):
+        found["log-likelihood"] = case.log_likelihood, ""
+    return found

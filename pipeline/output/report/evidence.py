@@ -1,0 +1,284 @@
+"""What a result knows of each estimator: its error, whether it is consistent, failures; run by run.
+
+It is computed of the metrics and of the table of runs, which all kinds of results have in one form.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
+
+from pipeline.output.results import MetricTable, Result, metric_tables
+from pipeline.output.words import is_error
+from replay.judging.errors.differences import (
+    FEWEST_RUNS,
+    RESAMPLES,
+    Difference,
+    Target,
+    paired_difference,
+    target_of,
+)
+
+Floats = NDArray[np.float64]
+# By what estimators are compared, where they have it; else by the first error that there is.
+PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
+# A mean of squares may be off by this share: nobody would act on less, however many runs show it.
+MATERIAL = 0.1
+MANY_RUNS = 500
+MARGIN = 0.02  # as `fuselog compare` has it
+
+State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
+
+
+class Spread(NamedTuple):
+    """A value, and where it lies with 95 % over other runs; NaN where too few runs tell."""
+
+    value: float
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def is_told(self) -> bool:
+        """Whether there is an interval."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """A mean of normalised squares, NEES or NIS.
+
+    Attributes:
+        name: which of the two.
+        found: the mean.
+        aim: what it should be.
+        honest: where it lies with 95 % if the estimator is consistent.
+    """
+
+    name: str
+    found: Spread
+    aim: float
+    honest: tuple[float, float]
+
+    @property
+    def factor(self) -> float:
+        """How many times larger errors are than the estimator claims."""
+        return math.sqrt(max(self.found.value, 0.0) / self.aim)
+
+    @property
+    def state(self) -> State:
+        """What that says of the estimator."""
+        low, high = self.honest
+        if low <= self.found.value <= high or abs(self.found.value / self.aim - 1.0) <= MATERIAL:
+            return "honest"
+        return "too sure" if self.found.value > high else "too careful"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of one estimator.
+
+    Attributes:
+        estimator: its label.
+        error: of what estimators are compared by; None where it has none.
+        consistency: by NEES, or by NIS where there is no truth.
+        also: by NIS, where NEES is known too.
+        failed: how many runs failed; None where that is not known.
+        share: of the time that was estimated.
+        outside: cases in which it is inconsistent, of so many.
+    """
+
+    estimator: str
+    error: Spread | None
+    consistency: Consistency | None
+    also: Consistency | None
+    failed: int | None
+    share: float
+    outside: tuple[int, int] = (0, 1)
+
+    def state(self, runs: int) -> State:
+        """What can be said of it in a word; NIS counts where NEES finds nothing."""
+        if self.failed and self.failed >= runs:
+            return "failed"
+        states = [each.state for each in (self.consistency, self.also) if each is not None]
+        return next((state for state in states if state != "honest"), states[0] if states else "unknown")
+
+    @property
+    def decisive(self) -> Consistency | None:
+        """By what its state is: NEES, or NIS where that alone is off."""
+        if self.also is not None and self.consistency is not None and self.consistency.state == "honest":
+            return self.also if self.also.state != "honest" else self.consistency
+        return self.consistency
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a result knows of all its estimators.
+
+    Attributes:
+        tables: its metrics by case.
+        rows: a row per estimator, case and run, with quantities; may be empty.
+        runs: how many runs there were.
+        labels: the estimators in their order, bounds left out.
+    """
+
+    tables: list[MetricTable]
+    rows: pd.DataFrame
+    runs: int
+    labels: list[str]
+    bounds: list[str] = field(default_factory=list)
+
+    @cached_property
+    def main(self) -> str:
+        """The quantity by which estimators are compared; empty where there is none."""
+        there = [key for table in self.tables for key in table.quantities if is_error(key)]
+        return next((key for key in (*PREFERRED, *there) if key in there), "")
+
+    @cached_property
+    def of(self) -> Mapping[str, Evidence]:
+        """The evidence by estimator."""
+        return {label: self._evidence(label) for label in self.labels}
+
+    def by_run(self, label: str, key: str) -> "pd.Series[float]":
+        """A quantity in every run: of errors the root mean square over the cases, else the mean."""
+        if key not in self.rows:
+            return pd.Series(dtype=float)
+        own = self.rows[self.rows["estimator"] == label]
+        if "rmse" not in key:
+            return own.groupby("run")[key].mean().dropna()
+        squared = own.assign(squared=own[key] ** 2).groupby("run")["squared"].mean()
+        return np.sqrt(squared).dropna()
+
+    def difference(self, first: str, second: str, key: str, target: Target = None) -> Difference | None:
+        """What the second has more of a quantity, over the runs of both; see `fuselog compare`."""
+        both = pd.concat([self.by_run(first, key), self.by_run(second, key)], axis=1).dropna()
+        if both.empty:
+            return None
+        values = both.to_numpy(dtype=float)
+        return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
+
+    def values(self, label: str, key: str) -> list[float]:
+        """An estimator's metric in every case that has it."""
+        found = [table.quantities.get(key, {}).get(label) for table in self.tables]
+        numbers = [each.value for each in found if each is not None]
+        return [float(each) for each in numbers if isinstance(each, int | float)]
+
+    def _evidence(self, label: str) -> Evidence:
+        failed = self.values(label, "failed_runs")
+        nees, nis = self._of_nees(label), self._of_nis(label)
+        judged = [
+            measured.place
+            for table in self.tables
+            if (measured := table.quantities.get("nees", {}).get(label)) and measured.place
+        ]
+        return Evidence(
+            label,
+            self._error(label),
+            nees or nis,
+            nis if nees else None,
+            int(sum(failed)) if failed else None,
+            min(self.values(label, "estimated_share") or [1.0]),
+            (sum(place != "within" for place in judged), max(len(judged), 1)),
+        )
+
+    def _error(self, label: str) -> Spread | None:
+        """The error over all cases; an estimator that lacks one that another has is not compared."""
+        values = self.values(label, self.main)
+        cases = [table for table in self.tables if self.main in table.quantities]
+        if not values or len(values) < len(cases):
+            return None
+        squared = "rmse" in self.main
+        mean = float(np.mean(np.square(values) if squared else values))
+        value = math.sqrt(mean) if squared else mean
+        each_run = self.by_run(label, self.main).to_numpy(dtype=float)
+        low, high = (rms_interval if squared else mean_interval)(each_run)
+        return Spread(value, low, high)
+
+    def _of_nees(self, label: str) -> Consistency | None:
+        for key, name in (("nees", "NEES"), ("position_nees", "NEES of the position")):
+            found = self._consistency(label, key, name)
+            if found is not None:
+                return found
+        return None
+
+    def _of_nis(self, label: str) -> Consistency | None:
+        return self._consistency(label, "nis_per_component", "NIS")
+
+    def _consistency(self, label: str, key: str, name: str) -> Consistency | None:
+        """The mean over the cases, judged by the interval of one of them; None without any."""
+        measured = [
+            each
+            for table in self.tables
+            if (each := table.quantities.get(key, {}).get(label)) and each.bounds and each.place
+        ]
+        if not measured:
+            return None
+        values = [float(each.value) for each in measured if isinstance(each.value, int | float)]
+        honest = max(
+            (each.bounds for each in measured if each.bounds), key=lambda ends: ends[1] - ends[0]
+        )
+        aim = 1.0 if name == "NIS" else self._size(honest)
+        each_run = self.by_run(label, key).to_numpy(dtype=float)
+        return Consistency(name, Spread(float(np.mean(values)), *mean_interval(each_run)), aim, honest)
+
+    def _size(self, honest: tuple[float, float]) -> float:
+        """How many components NEES is of: as many as have this chi-square interval over the runs."""
+        from replay.judging.errors.evaluation import chi_square_interval
+
+        sizes = range(1, 100)
+        runs = max(self.runs, 1)
+        return float(min(sizes, key=lambda size: abs(chi_square_interval(size, runs)[1] - honest[1])))
+
+
+def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
+    """Where the mean of runs lies with 95 %, by Student's distribution; NaN of few runs."""
+    runs = len(values)
+    if runs < FEWEST_RUNS:
+        return math.nan, math.nan
+    half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
+    return float(values.mean()) - half, float(values.mean()) + half
+
+
+def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
+    """Where the root mean square of runs lies with 95 %: the bootstrap of `compare`, NaN of few runs.
+
+    Of many runs the mean square is normal, and resamples would take much memory to say the same.
+    """
+    runs, squares = len(values), values**2
+    if runs < FEWEST_RUNS:
+        return math.nan, math.nan
+    if runs > MANY_RUNS:
+        low, high = mean_interval(squares)
+        return math.sqrt(max(low, 0.0)), math.sqrt(high)
+    drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
+    tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
+    low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
+    return float(low), float(high)
+
+
+def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
+    """What a result knows of its estimators; `tables` are those of its folder, by name."""
+    rows = tables.get("runs", pd.DataFrame())
+    if not {"estimator", "run"} <= {*rows}:
+        rows = pd.DataFrame()
+    metrics = {key: value for key, value in result.metrics.items() if isinstance(value, int | float)}
+    cases = metric_tables(metrics, result.bounds)
+    labels = cases[0].estimators if cases else []
+    found = Findings(cases, rows, runs_of(result, tables), labels)
+    bounds = [label for label in labels if found.values(label, "over_ensemble")]
+    return Findings(cases, rows, found.runs, [each for each in labels if each not in bounds], bounds)
+
+
+def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:
+    """How many runs a result is of: as many as its tables have, else as its settings say."""
+    if "differences" in tables and len(tables["differences"]):
+        return int(tables["differences"]["runs"].max())
+    logs = result.settings.get("logs")
+    if isinstance(logs, Mapping):
+        logs = logs.get("files")
+    return len(logs) if isinstance(logs, list) else int(result.settings.get("runs", 1))

@@ -1,0 +1,376 @@
+"""What a page opens with, by the kind of result: experiment, comparison, sweep, tuning, diagnosis.
+
+Begin with `opening`. Each kind has its own first sentences; cards and differences are `story`'s.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from textwrap import shorten
+from typing import Any
+
+import pandas as pd
+
+from pipeline.output.charts import Axis, Chart, Panel, Series, curve
+from pipeline.output.claims import NO_VERDICT
+from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, runs_of
+from pipeline.output.report.story import Card, Story, gauge, story
+from pipeline.output.results import Measured, MetricTable, Result, read_table
+from pipeline.output.words import count, is_error, listed, number, quantity, scale, stated
+from replay.judging.errors.evaluation import chi_square_interval
+
+Tables = Mapping[str, pd.DataFrame]
+# More estimators than these are counted, and more claims than these are in the table below alone.
+MOST_NAMED = 6
+MOST_CLAIMS = 2
+LONGEST_CLAIM = 60
+MARGIN = 0.02
+# The tables that sentences are made of.
+TOLD_BY = ("runs", "times", "differences", "sweep", "parameters")
+
+
+@dataclass(frozen=True)
+class Opening:
+    """How a page begins.
+
+    Attributes:
+        tried: what was tried, in a sentence.
+        story: what came of it.
+        found: what is known of the estimators.
+        also: further sentences, in a list below the cards.
+        chart: a picture of this kind of result alone.
+    """
+
+    tried: str
+    story: Story
+    found: Findings
+    also: list[str] = field(default_factory=list)
+    chart: Chart | None = None
+
+
+def opening(result: Result, tables: Tables, times_s: Mapping[str, float] | None = None) -> Opening:
+    """The beginning of a result's page."""
+    if "sides" in result.settings:
+        return _of_comparison(result, tables)
+    if "sweep" in result.settings:
+        return _of_sweep(result, tables)
+    found = findings(result, tables)
+    told = story(found, result.causes, dict(times_s or {}))
+    notes = [str(each) for each in result.settings.get("notes", [])]
+    tried = what_was_tried(result, found, tables)
+    if result.experiment == "diagnose":
+        return Opening(tried, _of_diagnosis(told, notes), found, notes[1:])
+    if result.experiment == "tune":
+        return Opening(tried, _of_tuning(told, tables), found, notes)
+    if result.claims:
+        paired = told if len(found.rows) and len(found.labels) <= MOST_NAMED else Story([])
+        told = replace(paired, verdict=[*claims_sentences(result), *paired.verdict])
+    return Opening(tried, told, found, notes)
+
+
+def said(result: Result, folder: Path) -> tuple[str, str]:
+    """What was tried, and what came of it, as a terminal has them; `folder` is the result's."""
+    paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
+    begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
+    return begun.tried, " ".join(begun.story.verdict) or "No errors against a truth, and no claims."
+
+
+def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
+    """The estimators, the runs, how long each was, and where they come from."""
+    settings = result.settings
+    estimators = list(settings.get("estimators") or [*found.labels, *found.bounds])
+    named = listed(estimators)
+    if len(estimators) > MOST_NAMED:
+        named = f"{', '.join(estimators[:MOST_NAMED])} and {len(estimators) - MOST_NAMED} more"
+    scenario = settings.get("record", {}).get("scenario")
+    source = settings.get("import", {}).get("source")
+    what = count(found.runs, "simulated run" if scenario else "log" if settings.get("logs") else "run")
+    of = f" of {scenario or source}" if scenario or source else ""
+    long = _length(tables)
+    seed = f", seed {settings['seed']}" if scenario and "seed" in settings else ""
+    same = "" if len(estimators) < 2 else ", each on the same measurements"
+    return f"{named or result.experiment} over {what}{of}{long}{seed}{same}."
+
+
+def _length(tables: Tables) -> str:
+    """How long a run is, where a table has the time."""
+    for name, column in (("times", "until_s"), ("steps", "elapsed_s")):
+        if name in tables and column in tables[name] and len(tables[name]):
+            seconds = float(tables[name][column].max())
+            return f" of {number(round(seconds))} s" if seconds >= 1.5 else f" of {number(seconds, 2)} s"
+    return ""
+
+
+def claims_sentences(result: Result) -> list[str]:
+    """How many claims hold and how many do not, and the first of these."""
+    counts = Counter(claim.verdict for claim in result.claims)
+    of_all = count(len(result.claims), "claim")
+    if counts["confirmed"] == len(result.claims):
+        return [f"{'The only claim is' if len(result.claims) == 1 else f'All {of_all} are'} confirmed."]
+    sentences = [f"{counts['confirmed']} of {of_all} confirmed."]
+    refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
+    if refuted:
+        named = [f"“{shorten(each, LONGEST_CLAIM, placeholder=' …')}”" for each in refuted[:MOST_CLAIMS]]
+        more = f" and {len(refuted) - MOST_CLAIMS} more" if len(refuted) > MOST_CLAIMS else ""
+        sentences.append(f"{len(refuted)} refuted: {', '.join(named)}{more}.")
+    open_ones = [f"{counts[each]} {each}" for each in ("not shown", "not reproducible") if counts[each]]
+    if counts[NO_VERDICT]:
+        open_ones.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
+    return [*sentences, *([f"{'; '.join(open_ones)}."] if open_ones else [])]
+
+
+def _of_diagnosis(told: Story, notes: Sequence[str]) -> Story:
+    """What is wrong comes first; that an estimator is inconsistent is on its card."""
+    first = notes[0].removeprefix("1. ") if notes else ""
+    what, _, advice = first.partition("; try ")
+    is_name = "_" in what.split(" ")[0]
+    verdict = [f"{what if is_name else what[:1].upper() + what[1:]}."] if what else []
+    return replace(told, verdict=[*verdict, *([f"Try {advice}."] if advice else [])] or told.verdict)
+
+
+def _of_tuning(told: Story, tables: Tables) -> Story:
+    """The values that were found, then whether they change what the estimator is worth."""
+    sentences = []
+    for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
+        ends = row["low"], row["high"]
+        known = all(math.isfinite(each) for each in ends)
+        told_by = f" (95 % {number(ends[0])} to {number(ends[1])})" if known else ", without an interval"
+        begun = (
+            "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
+        )
+        sentences.append(f"{row['parameter']} is likeliest {number(row['value'])}{told_by}{begun}.")
+    return replace(told, verdict=[*sentences, *told.verdict])
+
+
+# A comparison.
+
+
+def _of_comparison(result: Result, tables: Tables) -> Opening:
+    rows = tables["differences"]
+    rows = rows[rows["case"] != "all"]
+    sides = [label for group in result.settings["sides"] for label in group]
+    found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
+    told = story(found)
+    differ = rows[rows["verdict"].isin(["better", "worse", "higher", "lower"])]
+    unclear = int((rows["verdict"] == "unclear").sum())
+    runs = count(found.runs, "run")
+    if found.runs and rows["low"].isna().all():
+        summary = f"{runs} give no interval: whether the differences are chance is open."
+    elif differ.empty:
+        summary = f"Of {len(rows)} metrics over {runs} none differs beyond chance and the margin"
+        summary += f"; of {unclear} more runs would tell." if unclear else "."
+    else:
+        summary = (
+            f"Of {len(rows)} metrics over {runs} {len(differ)} differ beyond chance and the margin."
+        )
+    also = [_difference_sentence(row) for row in differ.to_dict("records")]
+    tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
+    notes = [str(each) for each in result.settings.get("notes", [])]
+    chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
+    verdict = [*told.verdict[:2], summary]
+    return Opening(tried, replace(told, verdict=verdict), found, [*also, *notes], chart)
+
+
+def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:
+    """The sides of a comparison as estimators: their means over the runs, which both have."""
+    quantities: dict[str, dict[str, dict[str, Measured]]] = {}
+    for row in tables["differences"].to_dict("records"):
+        if row["case"] == "all":
+            continue
+        bounds = None
+        aim = pd.to_numeric(row["aim"], errors="coerce")
+        if row["quantity"] in ("nees", "position_nees") and math.isfinite(aim):
+            bounds = chi_square_interval(int(aim), int(row["runs"]))
+        of = quantities.setdefault(str(row["case"]), {}).setdefault(str(row["quantity"]), {})
+        for side in ("first", "second"):
+            of.setdefault(str(row[side]), Measured(float(row[f"{side}_mean"]), bounds))
+    tables_of = [MetricTable(case, labels, of) for case, of in quantities.items()]
+    rows = tables.get("runs", pd.DataFrame())
+    return Findings(tables_of, rows, runs_of(result, tables), labels)
+
+
+def _difference_sentence(row: Mapping[Any, Any]) -> str:
+    """What differs, in words."""
+    words = quantity(str(row["quantity"]))
+    first, second = (_number(row[f"{side}_mean"]) for side in ("first", "second"))
+    own = scale(words.unit, first, second)
+    low, high = _number(row["low"]), _number(row["high"])
+    of = f" of {row['case']}" if row["case"] else ""
+    near = scale(words.unit, _number(row["difference"]))
+    ends = f"95 % {near.text(low)} to {near.text(high)} {near.sign}".rstrip()
+    return (
+        f"{words.name}{of}: {row['second']} is {row['verdict']} than {row['first']}, "
+        f"{own.with_unit(second)} against {own.with_unit(first)} (difference {ends})."
+    )
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
+    """Every metric's difference in percent, with its interval, and the margin where none matters."""
+    shown = rows[(rows["margin"] > 0) & rows["low"].notna()]
+    shown = shown[[key in FOREST or is_error(key) for key in shown["quantity"]]][:12]
+    if shown.empty or not margin:
+        return None
+    panels = []
+    for (first, second), own in shown.groupby(["first", "second"], sort=False):
+        places = list(range(len(own), 0, -1))
+        factor = 100.0 * margin / own["margin"].to_numpy()
+        low, middle, high = (own[name].to_numpy() * factor for name in ("low", "difference", "high"))
+        ends: list[float | None] = []
+        lines: list[float | None] = []
+        for place, left, right in zip(places, low, high, strict=True):
+            ends += [float(left), float(right), None]
+            lines += [float(place), float(place), None]
+        several = len({*own["case"]}) > 1
+        names = [
+            quantity(key).name + (f", {case}" if several else "")
+            for key, case in zip(own["quantity"], own["case"], strict=True)
+        ]
+        ticks = {float(place): name for place, name in zip(places, names, strict=True)}
+        y = Axis(ticks=ticks, limits=(0.4, len(own) + 0.6))
+        x = Axis(label=f"{second} less {first}, in percent of {first} or of the aim; lines: 95 %")
+        edges = [
+            curve(
+                f"margin, {number(100 * margin)} %",
+                [side, side],
+                [0.4, len(own) + 0.6],
+                "dashed",
+                reference=True,
+            )
+            for side in (-100.0 * margin, 100.0 * margin)
+        ]
+        spread = Series(label=str(second), x=ends, y=lines)
+        panels.append(
+            Panel(x=x, y=y, series=[*edges, spread, curve(str(second), middle, places, "markers")])
+        )
+    title = "What differs; between the dashed lines it does not matter"
+    return Chart(title=title, panels=panels, legend=False)
+
+
+FOREST = ("nees", "position_nees", "nis_per_component", "nees_steps_within_95", "hota", "idf1")
+
+
+# A sweep.
+
+
+def _of_sweep(result: Result, tables: Tables) -> Opening:
+    table, points = tables["sweep"], result.settings["sweep"]
+    keys = list(points[0])
+    runs = runs_of(result, tables)
+    main = next((key for key in table["quantity"].unique() if is_error(key)), "")
+    cards, verdict, still = [], [], []
+    labels = list(table["estimator"].unique())
+    for label in labels:
+        own = _errors_at_points(table, label, main)
+        if own.empty:
+            continue
+        if float(own.max() - own.min()) <= 1e-9 * float(own.max()):
+            still.append(label)
+            continue
+        card, sentence = _swept(table, points, label, main, own)
+        cards.append(card)
+        verdict.append(sentence)
+    if still and cards:
+        is_are = "do not depend" if len(still) > 1 else "does not depend"
+        verdict.append(f"{listed(still)} {is_are} on it.")
+    elif still:
+        verdict.append(f"None of the errors depends on {listed(keys)}.")
+    elif not cards:
+        verdict.append(
+            "Without a truth nobody's error is known; the charts show what the innovations say."
+        )
+    over = listed([f"{key} from {_ends([point[key] for point in points])}" for key in keys])
+    source = result.settings.get("record", {}).get("scenario")
+    of = f" of {source}" if source else ""
+    swept = f"{over}: {count(len(points), 'point')}, {count(runs, 'run')}{of} at each"
+    tried = f"{swept}, for {listed([str(label) for label in labels])}."
+    found = Findings([], pd.DataFrame(), runs, [str(label) for label in labels])
+    return Opening(tried, Story(verdict, cards), found)
+
+
+def _ends(values: Sequence[object]) -> str:
+    numbers = [float(each) for each in values if isinstance(each, int | float)]
+    if len(numbers) < len(values):
+        return ", ".join(dict.fromkeys(map(str, values)))
+    return f"{stated(min(numbers))} to {stated(max(numbers))}"
+
+
+def _errors_at_points(table: pd.DataFrame, label: object, main: str) -> "pd.Series[float]":
+    """An estimator's error at each point, over all cases."""
+    own = table[(table["estimator"] == label) & (table["quantity"] == main)].dropna(subset=["value"])
+    if "rmse" in main:
+        squared = own.assign(value=own["value"] ** 2).groupby("point")["value"].mean()
+        return squared**0.5
+    return own.groupby("point")["value"].mean()
+
+
+def _swept(
+    table: pd.DataFrame,
+    points: Sequence[Mapping[str, object]],
+    label: object,
+    main: str,
+    own: "pd.Series[float]",
+) -> tuple[Card, str]:
+    """Where an estimator errs least, where that matters little, and if it is consistent there."""
+    best = int(own.index[int(own.to_numpy().argmin())])
+    unit = scale(quantity(main).unit, float(own.min()))
+    where = ", ".join(f"{key} = {_value(each)}" for key, each in points[best].items())
+    error = quantity(main).name.removesuffix(", RMS")
+    sentence = f"{label} has the least {error}, {unit.with_unit(float(own.min()))}, at {where}"
+    by = _consistency_at(table, label, best)
+    notes = [
+        f"From {unit.text(float(own.min()))} to {unit.with_unit(float(own.max()))} over all points."
+    ]
+    near = [points[place] for place in own.index[own <= (1.0 + MARGIN) * own.min()]]
+    key = next(iter(points[best]))
+    if len(points[best]) == 1 and len(near) > 1:
+        notes.append(
+            f"It makes less than 2 % of a difference from {_ends([each[key] for each in near])}."
+        )
+    look, mark, chip, claim = "fair", "○", f"Best at {where}", ""
+    if by is not None and by.state != "honest":
+        sentence += f"; there it is {by.state}, with NEES {number(by.found.value)} for {number(by.aim)}"
+        look, mark, chip = "careful", "○", f"Best at {where}, but {by.state}"
+    elif by is not None:
+        nees = f"NEES {number(by.found.value)}, {number(by.aim)} is right"
+        sentence += f", and its covariance can be believed there ({nees})"
+        look, mark, claim = "best", "✓", "Its errors are what it claims there"
+    numbers = f"NEES {number(by.found.value)}; {number(by.aim)} is right" if by else ""
+    card = Card(
+        str(label),
+        "best" if look == "best" else "careful" if look == "careful" else "fair",
+        mark,
+        chip,
+        unit.text(float(own.min())),
+        unit.sign,
+        quantity(main).name,
+        claim,
+        gauge(by) if by else None,
+        numbers,
+        notes=notes,
+    )
+    return card, f"{sentence}."
+
+
+def _value(value: object) -> str:
+    return stated(float(value)) if isinstance(value, int | float) else str(value)
+
+
+def _consistency_at(table: pd.DataFrame, label: object, point: int) -> Consistency | None:
+    """NEES at a point, where the sweep kept its interval: of the first case."""
+    if "bound_low" not in table:
+        return None
+    own = table[
+        (table["estimator"] == label) & (table["quantity"] == "nees") & (table["point"] == point)
+    ].dropna(subset=["value", "bound_low"])
+    if own.empty:
+        return None
+    row = own.iloc[0]
+    return Consistency(
+        "NEES", Spread(float(row["value"])), float(row["aim"]), (row["bound_low"], row["bound_high"])
+    )

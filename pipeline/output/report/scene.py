@@ -1,0 +1,272 @@
+"""Draws the first run from above, a lens on a second that is typical of it, and NIS over time."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, path, thinned
+from pipeline.output.report.first_run import PLANE, FirstRun, Followed, innovations_of_runs
+from recorders.log import read_streams, schemas
+from replay.distributions import chi2
+from replay.judging.errors.evaluation import chi_square_interval, split_topic
+
+Floats = NDArray[np.float64]
+# Particles are drawn at so many times, and of each cloud so many of equal weight.
+CLOUDS, CLOUD_POINTS = 6, 150
+ELLIPSES, CORNERS = 6, 48
+INSIDE = float(chi2.ppf(0.95, 2))  # of a squared error over its covariance, in the plane
+# A lens is for what the scene does not show: ellipses below this share of it.
+SMALL = 0.04
+MOST_LENSES = 3
+LENS_S, DOTS = 1.0, 6
+# A lens is at most so many times as wide as it is high, or as high as it is wide.
+WIDEST, HIGHEST = 3.6, 0.8
+MOST_COLUMNS = 3
+BINS = 60
+MOST_FIXES = 600
+
+
+def plan(run: FirstRun) -> Chart:
+    """The scene: truth under the estimates, landmarks, fixes, ellipses that can be seen, particles."""
+    longest = max(run.followed.values(), key=lambda each: len(each.time_s))
+    series: list[Series] = []
+    clouds = _clouds(run)
+    size = _extent(longest.truth)
+    for label, each in run.followed.items():
+        if _half_axis(each) > SMALL * size:
+            rows = np.linspace(0, len(each.time_s) - 1, ELLIPSES).round().astype(int)
+            series.append(_ellipses(label, each, rows))
+    series += [*_fixes(run), *clouds]
+    truth = path("truth", longest.truth[thinned(len(longest.truth))], reference=True)
+    paths = [
+        path(label, each.estimate[thinned(len(each.truth))]) for label, each in run.followed.items()
+    ]
+    series += [truth, *paths, *_landmarks(run)]
+    panel = Panel(x=Axis(label="x (m)"), y=Axis(label="y (m)"), series=series, plane=True)
+    drawn = f", with particles at {CLOUDS} times" if clouds else ""
+    shapes = "; ellipses: 95 %, as claimed" if any(each.style == "area" for each in series) else ""
+    return Chart(title=f"{run.case or 'paths'}, first run from above{drawn}{shapes}", panels=[panel])
+
+
+def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
+    """A second of the run at one scale for all estimators whose ellipses the scene is too large for.
+
+    It is the second whose share of truths outside the ellipses is nearest the whole run's, over all
+    estimators that are shown; of several the one nearest the middle. None where the scene shows all.
+    """
+    sizes = {label: _extent(each.truth) for label, each in run.followed.items()}
+    shown = {
+        label: run.followed[label]
+        for label in labels
+        if label in run.followed and _half_axis(run.followed[label]) <= SMALL * sizes[label]
+    }
+    shown = dict(list(shown.items())[:MOST_LENSES])
+    begin_s, length_s = typical_second(list(shown.values()))
+    if not shown or not length_s:
+        return None
+    rows = {label: _rows_within(each, begin_s, length_s) for label, each in shown.items()}
+    corners = np.concatenate([_shapes(shown[label], of) for label, of in rows.items()])
+    corners = np.concatenate([corners, *(shown[label].truth[of] for label, of in rows.items())])
+    low, high = np.nanmin(corners, axis=0), np.nanmax(corners, axis=0)
+    middle, half = 0.5 * (low + high), 0.58 * (high - low)
+    half = np.array([max(half[0], HIGHEST * half[1]), max(half[1], half[0] / WIDEST)])
+    ends = [(float(m - h), float(m + h)) for m, h in zip(middle, half, strict=True)]
+    x, y = Axis(label="x (m)", limits=ends[0]), Axis(label="y (m)", limits=ends[1])
+    panels = []
+    for label, each in shown.items():
+        of = rows[label]
+        is_out = each.squared > INSIDE
+        near = (each.time_s >= begin_s - 0.5 * length_s) & (each.time_s <= begin_s + 1.5 * length_s)
+        series = [
+            _ellipses(label, each, of),
+            path("truth", each.truth[near], reference=True),
+            path(label, each.estimate[near]),
+            path("truth inside", each.truth[of[~is_out[of]]], "markers", reference=True),
+            path("truth outside", each.truth[of[is_out[of]]], "outside"),
+        ]
+        title = (
+            f"{label}: truth outside {int(is_out[of].sum()) or 'none'} of {len(of)}; "
+            f"{100 * float(np.mean(is_out)):.0f} % over the whole run"
+        )
+        panels.append(Panel(x=x, y=y, series=series, title=title, plane=True))
+    title = (
+        f"Lens: {length_s:g} s of the first run, from {begin_s:.1f} s. Ellipses: where each is 95 % "
+        "sure that it is; an honest one has the truth outside in about 5 %"
+    )
+    return Chart(title=title, panels=panels, legend=False)
+
+
+def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
+    """When that second begins, and how long it is: longer where estimates are rare; (0, 0) for none."""
+    if not followed or min(len(each.time_s) for each in followed) < DOTS:
+        return 0.0, 0.0
+    step_s = max(float(np.median(np.diff(each.time_s))) for each in followed)
+    length_s = max(LENS_S, np.ceil((DOTS - 1) * step_s))
+    begin_s = max(float(each.time_s[0]) for each in followed)
+    end_s = min(float(each.time_s[-1]) for each in followed)
+    count = max(int((end_s - begin_s) / length_s), 1)
+    away = np.zeros(count)
+    for each in followed:
+        is_out = (each.squared > INSIDE).astype(float)
+        place = np.floor((each.time_s - begin_s) / length_s).astype(int)
+        known = (place >= 0) & (place < count)
+        total = np.bincount(place[known], minlength=count)
+        with np.errstate(invalid="ignore"):
+            shares = np.bincount(place[known], is_out[known], count) / total
+        away += np.abs(np.where(total > 0, shares, np.inf) - is_out.mean())
+    as_good = np.flatnonzero(away <= away.min() + 1e-9)
+    middle = as_good[np.argmin(np.abs(as_good - 0.5 * (count - 1)))]
+    return begin_s + int(middle) * float(length_s), float(length_s)
+
+
+def _rows_within(each: Followed, begin_s: float, length_s: float) -> NDArray[np.int64]:
+    """The estimates nearest to a few times of the second, evenly spread."""
+    times = np.linspace(begin_s, begin_s + length_s, DOTS)
+    return np.unique(np.abs(each.time_s[:, None] - times).argmin(axis=0))
+
+
+def _extent(points: Floats) -> float:
+    return float(np.max(np.ptp(points, axis=0), initial=0.0))
+
+
+def _half_axis(each: Followed) -> float:
+    """The longer half axis of the ellipses, as a rule."""
+    return float(np.sqrt(INSIDE * np.nanmedian(np.linalg.eigvalsh(each.covariance)[:, 1].clip(0.0))))
+
+
+def _ellipses(label: str, each: Followed, rows: NDArray[np.int64]) -> Series:
+    """95 % of the plane as an estimator claims it, at some of its estimates."""
+    points = _shapes(each, rows)
+    return Series(
+        label=label,
+        x=[None if np.isnan(x) else float(f"{x:.7g}") for x in points[:, 0]],
+        y=[None if np.isnan(y) else float(f"{y:.7g}") for y in points[:, 1]],
+        style="area",
+    )
+
+
+def _shapes(each: Followed, rows: NDArray[np.int64]) -> Floats:
+    """The borders of ellipses, one after the other, NaN between them."""
+    turn = np.linspace(0.0, 2.0 * np.pi, CORNERS)
+    circle = np.stack([np.cos(turn), np.sin(turn)])
+    values, axes = np.linalg.eigh(each.covariance[rows])
+    half = axes * np.sqrt(INSIDE * values.clip(0.0))[:, None, :]
+    borders = each.estimate[rows][:, None, :] + np.swapaxes(half @ circle, 1, 2)
+    gaps = np.full((len(rows), 1, 2), np.nan)
+    return np.concatenate([borders, gaps], axis=1).reshape(-1, 2)
+
+
+def _landmarks(run: FirstRun) -> list[Series]:
+    topics = [
+        topic
+        for topic, each in run.source.topics.items()
+        if each.schema_name == schemas.LANDMARK.full_name
+    ]
+    found = [each["position_m"][:, :2] for each in run.source.read(topics).values() if len(each)]
+    return [path("landmarks", np.concatenate(found), "triangles", reference=True)] if found else []
+
+
+def _fixes(run: FirstRun) -> list[Series]:
+    """Measured positions of what is estimated."""
+    topics = [
+        topic
+        for topic, each in run.source.topics.items()
+        if each.schema_name == schemas.POSITION_FIX.full_name
+        and (not run.case or topic.startswith(f"/{run.case}/"))
+    ]
+    found = [each["position_m"][:, :2] for each in run.source.read(topics).values() if len(each)]
+    if not found:
+        return []
+    points = np.concatenate(found)
+    return [path("fixes", points[:: max(1, -(-len(points) // MOST_FIXES))], "dots", reference=True)]
+
+
+def _clouds(run: FirstRun) -> list[Series]:
+    """Particles of densities at a few times spread over the run.
+
+    They are drawn systematically, so that a particle's chance to be shown is its weight.
+    """
+    found = []
+    for topic, each in run.output.topics.items():
+        is_density = each.schema_name == schemas.DENSITY_ESTIMATE.full_name
+        is_here = is_density and split_topic(topic)[1] == run.case
+        if is_here and set(PLANE) <= set(run.output.empty(topic).components):
+            found += _cloud_of(run, topic)
+    return found
+
+
+def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
+    estimator, case = split_topic(topic)
+    sizes = [
+        name
+        for name, found in run.output.topics.items()
+        if found.schema_name == schemas.ESTIMATE_SIZE.full_name
+        and split_topic(name) == (estimator, case)
+    ]
+    stamps = [time for each in run.output.read(sizes).values() for time in each.publish_time_ns.tolist()]
+    if not stamps:
+        return []
+    points = []
+    for row in np.linspace(0, len(stamps) - 1, CLOUDS).round().astype(int).tolist():
+        time_ns = stamps[row]
+        [cloud] = read_streams(run.output.log, [topic], start_ns=time_ns, end_ns=time_ns + 1).values()
+        if len(cloud):
+            ends = np.cumsum(cloud["weight"])
+            positions = (np.arange(CLOUD_POINTS) + 0.5) / CLOUD_POINTS * ends[-1]
+            columns = [cloud.components.index(name) for name in PLANE]
+            points.append(cloud["mean"][np.searchsorted(ends, positions)][:, columns])
+    return [path(f"{estimator}, particles", np.concatenate(points), "dots")] if points else []
+
+
+def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
+    """NIS per component over time, of runs whose estimates are kept, and where 95 % of it lies."""
+    found = innovations_of_runs(folder)
+    cases = list(dict.fromkeys(case for _, case in found))
+    drawn = []
+    for label in labels:
+        if not cases or (label, cases[0]) not in found:
+            continue
+        parts = found[label, cases[0]]
+        time_s = np.concatenate([times for times, _ in parts])
+        squared = np.concatenate([each.squared for _, each in parts])
+        degrees = np.concatenate([each.degrees for _, each in parts])
+        known = np.isfinite(squared) & (degrees > 0)
+        if known.any():
+            drawn.append((label, *_binned(time_s[known], squared[known], degrees[known])))
+    if not drawn:
+        return None
+    every = np.concatenate([np.concatenate([nis, low, high]) for _, _, nis, low, high in drawn])
+    ends = float(every[every > 0].min()) / 1.3, float(every.max()) * 1.2
+    y = Axis(label="NIS per component", log=True, limits=ends)
+    panels = []
+    for label, time_s, nis, low, high in drawn:
+        is_out = (nis < low) | (nis > high)
+        share = float(is_out.mean())
+        where = "always" if share == 1.0 else f"{100 * share:.0f} % of the time" if share else "never"
+        panel = Panel(x=Axis(label="time (s)"), y=y, title=f"{label}: outside {where}")
+        panel.bands.append(band("95 % if consistent", time_s, low, high, reference=True))
+        panel.series.append(curve(label, time_s, nis))
+        if is_out.any():
+            foot = np.full(int(is_out.sum()), 1.02 * ends[0])
+            panel.series.append(curve("outside", time_s[is_out], foot, "outside"))
+        panels.append(panel)
+    columns = max(1, min(len(panels), MOST_COLUMNS))
+    title = f"NIS over time{f' of {cases[0]}' if cases[0] else ''}; grey: 95 % if consistent"
+    return Chart(title=title, panels=panels, columns=columns, legend=False)
+
+
+def _binned(
+    time_s: Floats, squared: Floats, degrees: NDArray[np.int64]
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Mean squares per component in spans of time, and where each lies with 95 %."""
+    width = max(float(np.ptp(time_s)) / BINS, 1e-9)
+    place = np.minimum(((time_s - time_s.min()) / width).astype(int), BINS - 1)
+    counts = np.bincount(place, degrees, BINS)
+    filled = np.flatnonzero(counts)
+    sums = np.bincount(place, squared, BINS)[filled]
+    of = counts[filled]
+    ends = np.array([chi_square_interval(int(each), 1) for each in of]) / of[:, None]
+    middle = time_s.min() + (filled + 0.5) * width
+    return middle, sums / of, ends[:, 0], ends[:, 1]

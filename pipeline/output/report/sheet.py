@@ -1,0 +1,186 @@
+"""The table of metrics as a person reads it: estimators as columns, a dozen rows, the rest below."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from statistics import median
+from typing import NamedTuple
+
+from pipeline.output.report.evidence import MARGIN, MATERIAL, Findings, mean_interval, rms_interval
+from pipeline.output.results import Measured, MetricTable
+from pipeline.output.words import (
+    ACCURACY,
+    CONSISTENCY,
+    COST,
+    MISSING,
+    OTHER,
+    QUANTITIES,
+    TRACKING,
+    Scale,
+    interval,
+    number,
+    quantity,
+    scale,
+)
+from replay.judging.errors.differences import target_of
+
+MOST_ROWS = 12
+GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
+
+
+class Cell(NamedTuple):
+    """A number of a table, what stands small beside it, and if it is the best or out of bounds."""
+
+    text: str
+    small: str = ""
+    look: str = ""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A quantity of all estimators; `key` is what the result calls it."""
+
+    key: str
+    name: str
+    meaning: str
+    unit: str
+    aim: str
+    cells: list[Cell]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table: its groups of rows, and those that stand folded below."""
+
+    title: str
+    columns: list[str]
+    groups: dict[str, list[Row]]
+    more: list[Row] = field(default_factory=list)
+
+
+def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
+    """The table of a result, and of several cases one each; None without numbers."""
+    columns = [*found.labels, *found.bounds]
+    tables = [table for table in found.tables if any(table.quantities.values())]
+    if not tables or not columns:
+        return None, []
+    if len(tables) == 1:
+        return _sheet(found, tables[0], columns, ""), []
+    medians = _medians(tables)
+    title = f"Median of {len(tables)} cases, from the least to the greatest"
+    each = [_sheet(found, table, columns, table.case or "all") for table in tables]
+    return _sheet(found, medians, columns, title, spreads=_spreads(tables)), each
+
+
+def _medians(tables: list[MetricTable]) -> MetricTable:
+    """The median over the cases that have a number."""
+    quantities: dict[str, dict[str, Measured]] = {}
+    for key, of in _numbers(tables).items():
+        quantities[key] = {label: Measured(float(median(values))) for label, values in of.items()}
+    return MetricTable("", tables[0].estimators, quantities)
+
+
+def _spreads(tables: list[MetricTable]) -> dict[str, dict[str, tuple[float, float]]]:
+    return {
+        key: {label: (min(values), max(values)) for label, values in of.items()}
+        for key, of in _numbers(tables).items()
+    }
+
+
+def _numbers(tables: list[MetricTable]) -> dict[str, dict[str, list[float]]]:
+    found: dict[str, dict[str, list[float]]] = {}
+    for table in tables:
+        for key, values in table.quantities.items():
+            for label, each in values.items():
+                if isinstance(each.value, int | float) and math.isfinite(each.value):
+                    found.setdefault(key, {}).setdefault(label, []).append(float(each.value))
+    return found
+
+
+def _sheet(
+    found: Findings,
+    table: MetricTable,
+    columns: list[str],
+    title: str,
+    spreads: Mapping[str, Mapping[str, tuple[float, float]]] | None = None,
+) -> Sheet:
+    order = list(QUANTITIES)
+    keys = [key for key, values in table.quantities.items() if values and key != "over_ensemble"]
+    known = sorted((key for key in keys if key in QUANTITIES), key=order.index)
+    first = [*known, *(key for key in keys if key not in QUANTITIES and "rmse" in key)][:MOST_ROWS]
+    first = first or keys[:MOST_ROWS]
+    rows = {key: _row(found, table, key, columns, spreads) for key in keys}
+    groups = {group: [rows[key] for key in first if quantity(key).group == group] for group in GROUPS}
+    more = [rows[key] for key in keys if key not in first]
+    return Sheet(title, columns, {group: of for group, of in groups.items() if of}, more)
+
+
+def _row(
+    found: Findings,
+    table: MetricTable,
+    key: str,
+    columns: list[str],
+    spreads: Mapping[str, Mapping[str, tuple[float, float]]] | None,
+) -> Row:
+    words, values = quantity(key), table.quantities[key]
+    of = {label: values[label] for label in columns if label in values}
+    numbers = {
+        label: float(each.value) for label, each in of.items() if isinstance(each.value, int | float)
+    }
+    own = scale(words.unit, *numbers.values())
+    best = _best(key, numbers, words.aim) if len(columns) > 1 else set()
+    aim = _aim(found, key) or words.aim
+    cells = []
+    for label in columns:
+        each = of.get(label, Measured())
+        if label not in numbers:
+            cells.append(Cell(str(each.value) if isinstance(each.value, str) else MISSING))
+            continue
+        if spreads is None:
+            small = _interval(found, key, label, own)
+        else:
+            low, high = spreads[key][label]
+            small = interval(low, high, own) if low < high else ""
+        is_out = each.place in ("above", "below") and _is_material(each)
+        cells.append(
+            Cell(own.text(numbers[label]), small, "out" if is_out else "best" if label in best else "")
+        )
+    return Row(key, words.name, words.meaning, own.sign, aim, cells)
+
+
+def _is_material(each: Measured) -> bool:
+    low, high = each.bounds or (math.nan, math.nan)
+    middle = 0.5 * (low + high)
+    return isinstance(each.value, int | float) and abs(each.value / middle - 1.0) > MATERIAL
+
+
+def _interval(found: Findings, key: str, label: str, own: Scale) -> str:
+    """Where a value lies with 95 % over other runs, where one case has a table of runs."""
+    stem = key.replace("_rmse", "")
+    column = key if key in found.rows else f"rmse_{stem}"
+    if quantity(key).group not in (ACCURACY, CONSISTENCY) or column not in found.rows:
+        return ""
+    values = found.by_run(label, column).to_numpy(dtype=float)
+    low, high = (rms_interval if "rmse" in column else mean_interval)(values)
+    return interval(low, high, own) if math.isfinite(low) else ""
+
+
+def _aim(found: Findings, key: str) -> str:
+    """How large NEES should be, where all estimators have as many components."""
+    sizes = {
+        number(each.consistency.aim)
+        for each in found.of.values()
+        if each.consistency is not None and each.consistency.name == "NEES"
+    }
+    return next(iter(sizes)) if key == "nees" and len(sizes) == 1 else ""
+
+
+def _best(key: str, numbers: Mapping[str, float], aim: str) -> set[str]:
+    """Who has the best value, and who is as good but for the margin."""
+    target = target_of(key) or ("low" if quantity(key).group == ACCURACY else None)
+    finite = {label: value for label, value in numbers.items() if math.isfinite(value)}
+    if target not in ("low", "high") or len(finite) < 2 or len({*finite.values()}) == 1 or aim:
+        return set()
+    best = min(finite.values()) if target == "low" else max(finite.values())
+    allowed = MARGIN * abs(best) if key != "log_likelihood" else 2.0
+    return {label for label, value in finite.items() if abs(value - best) <= allowed}

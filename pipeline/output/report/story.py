@@ -1,0 +1,397 @@
+"""The story of a result: what was tried, what to do, a card per estimator, what differs beyond chance.
+
+It is data: sentences and numbers. `page.html` only sets it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+from pipeline.output.alarms import Cause
+from pipeline.output.report.evidence import MARGIN, Consistency, Evidence, Findings, Spread
+from pipeline.output.words import MISSING, Scale, count, interval, listed, number, quantity, scale
+from replay.judging.diagnostics import LEAST_SHARE
+from replay.judging.errors.differences import FEWEST_RUNS
+
+MOST_CARDS = 6
+# The gauge goes from a third of the aim to ten times the aim, evenly in the logarithm.
+GAUGE_ENDS = (1 / 3, 10.0)
+
+Look = Literal["broken", "careful", "best", "fair"]
+Relation = Literal["draw", "unclear", "beyond chance", "untold"]
+
+
+class Gauge(NamedTuple):
+    """Where a mean of squares lies, in percent of a scale from too careful to too sure.
+
+    Attributes:
+        honest: where a consistent estimator lies.
+        aim, value: the right value, and the one that was found.
+        spread: where the latter lies with 95 %; both ends at it where that is not known.
+        is_beyond: whether the value lies beyond the scale's end.
+        words: the same for who cannot see it.
+    """
+
+    honest: tuple[float, float]
+    aim: float
+    value: float
+    spread: tuple[float, float]
+    is_beyond: bool
+    words: str
+
+
+@dataclass(frozen=True)
+class Card:
+    """What is said of one estimator: how good it is, if it can be believed, why not, what it costs."""
+
+    estimator: str
+    look: Look
+    mark: str
+    chip: str
+    value: str = ""
+    unit: str = ""
+    about: str = ""
+    consistency: str = ""
+    gauge: Gauge | None = None
+    numbers: str = ""
+    cause: Cause | None = None
+    notes: list[str] = field(default_factory=list)
+    foot: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Story:
+    """What a page says of a result, first of all.
+
+    Attributes:
+        verdict: what to do, the most important sentence first.
+        cards: of the estimators, what is wrong first.
+        draws: sentences on pairs that cannot be told apart, differences: on those that can.
+        left_out: estimators that have no card.
+    """
+
+    verdict: list[str]
+    cards: list[Card] = field(default_factory=list)
+    draws: list[str] = field(default_factory=list)
+    differences: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+
+def story(
+    found: Findings, causes: Sequence[Cause] = (), times_s: dict[str, float] | None = None
+) -> Story:
+    """The story of estimators that were judged; causes and the time of a run where they are known."""
+    known = [each for each in found.of.values() if each.error is not None]
+    broken = _broken(found)
+    own = scale(quantity(found.main).unit, *(each.error.value for each in known if each.error))
+    take, equal = _choice(found)
+    ordered = _in_order(found, broken, take, equal)
+    by_label = {each.estimator: each for each in causes}
+    cards = [
+        _card(found, found.of[label], take, equal, own, by_label.get(label), (times_s or {}).get(label))
+        for label in ordered[:MOST_CARDS]
+    ]
+    draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
+    verdict = _verdict(found, broken, take, equal, own, by_label)
+    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:])
+
+
+def _broken(found: Findings) -> list[Evidence]:
+    """Who cannot be believed: who fails, then who is too sure, the worst first."""
+
+    def badness(each: Evidence) -> float:
+        failed = each.state(found.runs) == "failed"
+        return math.inf if failed else each.decisive.factor if each.decisive else 0.0
+
+    bad = [each for each in found.of.values() if each.state(found.runs) in ("failed", "too sure")]
+    return sorted(bad, key=badness, reverse=True)
+
+
+def _choice(found: Findings) -> tuple[str, list[str]]:
+    """Whom to take, empty where there is none, and who draws with it: of those that can be believed."""
+    sound = [
+        each
+        for each in found.of.values()
+        if each.error is not None and each.state(found.runs) not in ("failed", "too sure")
+    ]
+    if not sound:
+        return "", []
+    best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
+    others = [each.estimator for each in sound if each.estimator != best]
+    return best, [label for label in others if relation(found, best, label) in ("draw", "unclear")]
+
+
+def relation(found: Findings, first: str, second: str) -> Relation:
+    """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
+    difference = found.difference(first, second, found.main, "low")
+    if difference is not None and math.isfinite(difference.low):
+        if difference.verdict == "no difference":
+            return "draw"
+        return "unclear" if difference.verdict == "unclear" else "beyond chance"
+    errors = [found.of[label].error for label in (first, second)]
+    one, other = (each.value if each else math.nan for each in errors)
+    return "draw" if abs(other - one) <= MARGIN * abs(one) else "untold"
+
+
+def _in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
+    """What is wrong first, then whom to take, then the others by their error."""
+    rest = sorted(
+        found.labels,
+        key=lambda label: error.value if (error := found.of[label].error) else math.inf,
+    )
+    first = [each.estimator for each in broken]
+    return list(dict.fromkeys([*first, *filter(None, [take]), *equal, *rest]))
+
+
+def _verdict(
+    found: Findings,
+    broken: list[Evidence],
+    take: str,
+    equal: list[str],
+    own: Scale,
+    causes: dict[str, Cause],
+) -> list[str]:
+    """What to do, then who cannot be believed, and why."""
+    if not found.labels:
+        return []
+    if len(found.labels) == 1:
+        return _alone(found, found.of[found.labels[0]], own, causes)
+    doubts = [_doubt(each, causes) for each in broken]
+    named = [*doubts[:2], *([f"{count(len(doubts) - 2, 'other')} too."] if len(doubts) > 2 else [])]
+    if not found.main or all(each.error is None for each in found.of.values()):
+        return [_of_innovations(found), *named]
+    if not take:
+        least = min(broken, key=lambda each: each.error.value if each.error else math.inf)
+        least_is = (
+            f" The least error has {least.estimator}, {_value(least.error, own)}." if least.error else ""
+        )
+        return [
+            "Believe none of them as they are set.",
+            *named,
+            *([least_is.strip()] if least_is else []),
+        ]
+    return [_advice(found, broken, take, equal, own), *named]
+
+
+def _advice(found: Findings, broken: list[Evidence], take: str, equal: list[str], own: Scale) -> str:
+    """Whom to take; or that who errs least is not to be believed."""
+    error = found.of[take].error
+    main = quantity(found.main).name.removesuffix(", RMS")
+    better = [
+        each
+        for each in broken
+        if each.error
+        and error
+        and each.error.value < (1.0 - MARGIN) * error.value
+        and relation(found, take, each.estimator) in ("beyond chance", "untold")
+    ]
+    if better:
+        best = min(better, key=lambda each: each.error.value if each.error else math.inf)
+        return (
+            f"{best.estimator} errs least, {_value(best.error, own)}, but mend it before you believe "
+            f"its covariance; of the others {take} errs least, {_value(error, own)}."
+        )
+    runs = count(found.runs, "run")
+    if equal:
+        both = listed([take, *equal])
+        either = "either" if len(equal) == 1 else "any of them"
+        if all(relation(found, take, each) == "draw" for each in equal):
+            return f"{both} draw in {main}: take {either}."
+        return f"A draw so far: {runs} do not tell {both} apart; take {either}."
+    if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
+        alone = "on this run" if found.runs == 1 else f"over {runs}"
+        few = found.runs < FEWEST_RUNS
+        chance = f"; whether by chance, {FEWEST_RUNS} runs or more tell" if few else ""
+        return f"Take {take}: it has the least {main} {alone}, {_value(error, own)}{chance}."
+    return f"Take {take}: it has the least {main}, {_value(error, own)}."
+
+
+def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
+    """What is said of the only estimator."""
+    main = quantity(found.main).name.removesuffix(", RMS")
+    errs = f"{only.estimator} has a {main} of {_value(only.error, own)} RMS" if only.error else ""
+    state = only.state(found.runs)
+    if state in ("too sure", "failed"):
+        return [*filter(None, [errs and f"{errs}."]), _doubt(only, causes)]
+    if only.decisive is None:
+        return [f"{errs}; whether its covariance is right is not known." if errs else ""]
+    believed = _claim(only, found.runs)
+    return [f"{errs}; {believed}." if errs else f"{only.estimator}: {believed}."]
+
+
+def _of_innovations(found: Findings) -> str:
+    """What is known without a truth."""
+    honest = [each.estimator for each in found.of.values() if each.state(found.runs) == "honest"]
+    without = "Without a truth nobody's error is known"
+    if not honest:
+        return f"{without}."
+    is_are = "is" if len(honest) == 1 else "are"
+    return f"{without}; by the innovations {listed(honest)} {is_are} honest."
+
+
+def _value(error: Spread | None, own: Scale) -> str:
+    return own.with_unit(error.value) if error else MISSING
+
+
+def _doubt(each: Evidence, causes: dict[str, Cause]) -> str:
+    """Why an estimator is not to be believed, in a sentence."""
+    if each.decisive is None or each.decisive.state != "too sure":
+        return f"{each.estimator} fails in every run."
+    sure = f"{each.estimator} believes itself {_times(each.decisive.factor)} more than it should"
+    cause = causes.get(each.estimator)
+    return f"{sure}. Likeliest: {cause.short}." if cause else f"{sure}."
+
+
+def _times(factor: float) -> str:
+    return f"{number(factor, 2)} times"
+
+
+def _claim(each: Evidence, runs: int) -> str:
+    """What errors are to what is claimed of them, in a few words."""
+    by = each.decisive
+    if by is None:
+        return "its covariance was not judged"
+    what = "innovations" if by.name == "NIS" else "errors"
+    if by.state == "too sure":
+        return f"its {what} are {_times(by.factor)} what it claims"
+    if by.state == "too careful":
+        return f"its {what} are {number(by.factor, 2)} of what it claims"
+    if runs == 1 and by.name != "NIS" and each.also is None:
+        return "one run does not show it to be inconsistent"
+    return f"its {what} are what it claims"
+
+
+def _card(
+    found: Findings,
+    each: Evidence,
+    take: str,
+    equal: list[str],
+    own: Scale,
+    cause: Cause | None,
+    time_s: float | None,
+) -> Card:
+    look, mark, chip = _chip(found, each, take, equal)
+    claim = _claim(each, found.runs)
+    card = Card(each.estimator, look, mark, chip, cause=cause, notes=_notes(found, each, take, equal))
+    if each.error is not None:
+        about = quantity(found.main).name
+        if each.error.is_told:
+            about += f"; 95 % {interval(each.error.low, each.error.high, own)}"
+        card = replace(card, value=own.text(each.error.value), unit=own.sign, about=about)
+    if each.decisive is not None:
+        card = replace(
+            card,
+            consistency=claim[0].upper() + claim[1:],
+            gauge=gauge(each.decisive),
+            numbers=_numbers(each.decisive),
+        )
+    return replace(card, foot=_foot(found, each, time_s))
+
+
+def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
+    """How a card looks, its sign, and its word."""
+    state = each.state(found.runs)
+    if state == "failed":
+        return "broken", "✕", "Fails in every run"
+    if state == "too sure":
+        return "broken", "✕", "Too sure of itself"
+    if each.estimator == take and len(found.labels) > 1:
+        return "best", "✓", f"Draws with {listed(equal)}" if equal else "Take this one"
+    if each.estimator in equal:
+        return "best", "✓", f"Draws with {listed([take, *(o for o in equal if o != each.estimator)])}"
+    if state == "too careful":
+        return "careful", "○", "Too careful"
+    honest = "Honest" if state == "honest" else "Not judged"
+    if take and each.estimator != take:
+        return "fair", "○", f"{honest}, less accurate" if state == "honest" else "Less accurate"
+    return "fair", "○", honest
+
+
+def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list[str]:
+    """What else is worth a sentence."""
+    notes = []
+    best = found.of[take].error if take else None
+    if each.estimator == take and len(found.labels) > 1 and not equal:
+        notes += _in_how_many(found, take)
+    elif best and each.error and best.value and each.error.value > 1.1 * best.value:
+        notes.append(f"{number(each.error.value / best.value, 2)} times the error of {take}.")
+    outside, cases = each.outside
+    if cases > 1:
+        notes.append(f"Its NEES is outside its interval in {outside} of {cases} cases.")
+    if each.also is not None and each.decisive is each.consistency and found.runs == 1:
+        notes.append(
+            f"By its innovations, NIS is {number(each.also.found.value)} per component; 1 is right."
+        )
+    if each.share < LEAST_SHARE:
+        notes.append(f"It estimated {number(100 * each.share)} % of the time.")
+    return notes
+
+
+def _in_how_many(found: Findings, take: str) -> list[str]:
+    """In how many runs the best is the best."""
+    import pandas as pd
+
+    every = pd.concat(
+        {label: found.by_run(label, found.main) for label in found.labels}, axis=1
+    ).dropna()
+    if len(every) < 2 or len(every.columns) < 2:
+        return []
+    best = int((every.idxmin(axis=1) == take).sum())
+    which = "each of the" if best == len(every) else f"{best} of the"
+    return [f"Least error in {which} {count(len(every), 'run')}."]
+
+
+def _numbers(by: Consistency) -> str:
+    name = "NIS per component" if by.name == "NIS" else by.name
+    told = f", 95 % {interval(by.found.low, by.found.high, Scale())}" if by.found.is_told else ""
+    return f"{name} {number(by.found.value)}{told}; {number(by.aim)} is right"
+
+
+def gauge(by: Consistency) -> Gauge:
+    """Where a mean of squares lies on its scale."""
+
+    def place(value: float) -> float:
+        low, high = map(math.log, GAUGE_ENDS)
+        share = (math.log(max(value, 1e-12) / by.aim) - low) / (high - low)
+        return round(100.0 * min(max(share, 0.0), 1.0), 2)
+
+    low, high = by.honest
+    found = by.found
+    spread = (found.low, found.high) if found.is_told else (found.value, found.value)
+    words = f"{_numbers(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
+    is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
+    ends = (place(spread[0]), place(spread[1]))
+    return Gauge((place(low), place(high)), place(by.aim), place(found.value), ends, is_beyond, words)
+
+
+def _foot(found: Findings, each: Evidence, time_s: float | None) -> list[str]:
+    foot = []
+    if time_s is not None:
+        foot.append(f"{scale('s', time_s).with_unit(time_s, 2)} a run")
+    if each.failed is not None:
+        foot.append(f"{each.failed:,} of {count(found.runs, 'run')} failed")
+    return foot
+
+
+def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
+    """Whom to take against each other: those that cannot be told apart, and what is beyond chance."""
+    draws, differences = [], []
+    main = quantity(found.main).name.removesuffix(", RMS")
+    for label in labels if take else ():
+        difference = found.difference(take, label, found.main, "low") if label != take else None
+        if difference is None or not math.isfinite(difference.low):
+            continue
+        size = abs(difference.difference)
+        near = scale(quantity(found.main).unit, size or own.factor)
+        ends = f"95 % {interval(difference.low, difference.high, near)} {near.sign}".rstrip()
+        if difference.verdict == "no difference":
+            exactly = "are equal" if not size else f"differ by {near.with_unit(size)} on average, {ends}"
+            draws.append(f"In {main}, {take} and {label} cannot be told apart: they {exactly}.")
+        elif difference.verdict == "unclear":
+            runs = count(difference.runs, "run")
+            draws.append(f"In {main}, {runs} do not tell {take} and {label} apart: {ends}.")
+        else:
+            more = "more" if difference.difference > 0 else "less"
+            differences.append(f"{label} errs {near.with_unit(size)} {more} than {take} ({ends}).")
+    return draws, differences

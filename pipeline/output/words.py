@@ -1,0 +1,230 @@
+"""Quantities and numbers in words: what a person reads where a result has `position_rmse_m`."""
+
+import math
+import re
+from fnmatch import fnmatchcase
+from typing import NamedTuple
+
+DIGITS = 3
+# As people write them, not as keyboards do.
+MISSING, MINUS, TIMES = "\u2013", "\u2212", "\u00d7"
+
+
+class Quantity(NamedTuple):
+    """A quantity in words.
+
+    Attributes:
+        name: what a person calls it.
+        meaning: what it is, in a sentence.
+        group: of the table, which it is in.
+        unit: in which it is kept; empty where it has none.
+        aim: what it should be where that is a number that all estimators share.
+    """
+
+    name: str
+    meaning: str
+    group: str
+    unit: str = ""
+    aim: str = ""
+
+
+ACCURACY, CONSISTENCY, COST = "Accuracy", "Consistency", "Cost and failures"
+TRACKING, OTHER = "Targets and tracks", "Other quantities"
+_RMS = "Root mean square over all steps of all runs."
+# By pattern; the order is that of the table.
+QUANTITIES: dict[str, Quantity] = {
+    "position_rmse_m": Quantity("position error, RMS", f"Distance to the truth. {_RMS}", ACCURACY, "m"),
+    "orientation_rmse_deg": Quantity(
+        "orientation error, RMS", f"Angle to the truth. {_RMS}", ACCURACY, "deg"
+    ),
+    "gospa_m": Quantity(
+        "GOSPA",
+        "Distances to the targets that were found, and a penalty for missed and false ones.",
+        TRACKING,
+        "m",
+    ),
+    "hota": Quantity(
+        "HOTA", "How well targets are found and kept apart, together; 1 is best.", TRACKING
+    ),
+    "idf1": Quantity("IDF1", "Share of time with the right identity; 1 is best.", TRACKING),
+    "missed_targets": Quantity(
+        "missed targets at a time", "Targets without a track, mean over time.", TRACKING
+    ),
+    "false_targets": Quantity(
+        "false targets at a time", "Tracks without a target, mean over time.", TRACKING
+    ),
+    "switches": Quantity("switches of identity a run", "A track goes over to another target.", TRACKING),
+    "breaks": Quantity("breaks of tracks a run", "A target is lost, and found again.", TRACKING),
+    "total_error_m": Quantity(
+        "error of all targets, summed", "Distances to the truths, summed.", TRACKING, "m"
+    ),
+    "heading_rmse_rad": Quantity(
+        "heading error, RMS", f"Angle to the true heading. {_RMS}", ACCURACY, "rad"
+    ),
+    "nees": Quantity(
+        "NEES", "Squared errors over the variances that the estimator claims.", CONSISTENCY
+    ),
+    "position_nees": Quantity("NEES of the position", "As NEES, of the position alone.", CONSISTENCY),
+    "nees_steps_within_95": Quantity(
+        "steps with NEES in its interval",
+        "Share of steps at which the mean over the runs is where 95 % should be.",
+        CONSISTENCY,
+        "share",
+        "95 %",
+    ),
+    "nis_per_component": Quantity(
+        "NIS per component",
+        "Squared innovations over the variances that the filter expects.",
+        CONSISTENCY,
+        "",
+        "1",
+    ),
+    "log_likelihood": Quantity(
+        "log-likelihood per run",
+        "How probable the measurements were to the filter; higher is better.",
+        CONSISTENCY,
+    ),
+    "gated_share": Quantity(
+        "measurements gated out", "Share of measurements that a gate kept out.", COST, "share"
+    ),
+    "failed_runs": Quantity("failed runs", "Runs that the estimator could not follow to the end.", COST),
+    "estimated_share": Quantity(
+        "share of the time estimated", "Of the time that a run spans.", COST, "share"
+    ),
+    "estimates_without_truth": Quantity(
+        "estimates without truth", "At times at which the log has no truth.", COST
+    ),
+    "skipped_measurements": Quantity("measurements skipped", "Measurements that came to nothing.", COST),
+    "estimate_age_s": Quantity(
+        "age of an estimate", "From its stamp to when it could be given.", COST, "s"
+    ),
+}
+_UNITS = {"m": "m", "m2": "m²", "mm": "mm", "km": "km", "s": "s", "rad": "rad", "deg": "°", "mps": "m/s",
+          "radps": "rad/s", "mps2": "m/s²", "percent": "%", "bytes": "bytes", "pa": "Pa"}  # fmt: skip
+LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "localisation_m2")
+
+
+def quantity(key: str) -> Quantity:
+    """A quantity of a result in words; one that is not known by its own name, readably.
+
+    >>> quantity("turn_rmse_radps").name, quantity("turn_rmse_radps").unit
+    ('turn error, RMS', 'radps')
+    """
+    if key in QUANTITIES:
+        return QUANTITIES[key]
+    stem, _, unit = key.rpartition("_")
+    if unit not in _UNITS or not stem:
+        stem, unit = key, ""
+    if stem.endswith("_rmse") or stem.startswith("rmse_"):
+        what = stem.removesuffix("_rmse").removeprefix("rmse_").replace("_", " ")
+        return Quantity(f"{what} error, RMS", _RMS, ACCURACY, unit)
+    if stem.endswith("_share"):
+        return Quantity(stem.replace("_", " "), "", OTHER, "share")
+    return Quantity(stem.replace("_", " "), "", OTHER, unit)
+
+
+def label_of(key: str) -> str:
+    """A quantity as an axis has it, with the unit in which a result keeps it.
+
+    >>> label_of("position_rmse_m"), label_of("nees")
+    ('position error, RMS (m)', 'NEES')
+    """
+    words = quantity(key)
+    sign = _UNITS.get(words.unit, words.unit)
+    return f"{words.name} ({sign})" if sign else words.name
+
+
+def is_error(key: str) -> bool:
+    """Whether less of a quantity is better, so that estimators may be compared by it."""
+    return any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
+
+
+class Scale(NamedTuple):
+    """Gives numbers a unit that suits their size: what they are multiplied by, and the unit's sign."""
+
+    factor: float = 1.0
+    sign: str = ""
+
+    def text(self, value: float | None, digits: int = DIGITS) -> str:
+        """A number in this unit, without the unit."""
+        return number(None if value is None else value * self.factor, digits)
+
+    def with_unit(self, value: float | None, digits: int = DIGITS) -> str:
+        """A number with the unit."""
+        text = self.text(value, digits)
+        return (
+            text
+            if text == MISSING or not self.sign
+            else f"{text}{'' if self.sign == '°' else ' '}{self.sign}"
+        )
+
+
+def scale(unit: str, *values: float | None) -> Scale:
+    """A unit for values that stand together: that in which the least has a digit before the point.
+
+    >>> scale("m", 0.0162, 0.414).with_unit(0.414), scale("rad", 0.00544).with_unit(0.00544)
+    ('41.4 cm', '0.312°')
+    """
+    known = [abs(value) for value in values if value is not None and math.isfinite(value) and value]
+    least = min(known, default=1.0)
+    if unit == "m":
+        for floor, factor, sign in (
+            (2000.0, 1e-3, "km"),
+            (0.5, 1.0, "m"),
+            (0.002, 100.0, "cm"),
+            (0.0, 1e3, "mm"),
+        ):
+            if least >= floor:
+                return Scale(factor, sign)
+    if unit == "s" and least < 0.5:
+        return Scale(1000.0, "ms")
+    if unit in ("rad", "radps"):
+        return Scale(math.degrees(1.0), "°" if unit == "rad" else "°/s")
+    return Scale(100.0, "%") if unit == "share" else Scale(1.0, _UNITS.get(unit, unit))
+
+
+def number(value: float | None, digits: int = DIGITS) -> str:
+    """A number as people write it: so many digits, no e, a true minus, commas in thousands.
+
+    >>> [number(each) for each in (0.0266714, -7514.7, 3.0, 1e-7, 0.99999, None)]
+    ['0.0267', '−7,515', '3', '1 × 10⁻⁷', '1', '–']
+    """
+    if value is None or not math.isfinite(value):
+        return MISSING
+    if value == 0.0:
+        return "0"
+    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    if not -4 <= exponent < 9:
+        mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
+        raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+        return f"{_bare(mantissa)} {TIMES} 10{raised}".replace("-", MINUS)
+    return _bare(f"{value:,.{max(digits - 1 - exponent, 0)}f}").replace("-", MINUS)
+
+
+def stated(value: float) -> str:
+    """A number that a person set, as it was set: 0.05, not 0.0500."""
+    return f"{value:.4g}".replace("-", MINUS) if 1e-4 <= abs(value) < 1e6 else number(value)
+
+
+def _bare(text: str) -> str:
+    """Without zeros at the end that say nothing of a whole number."""
+    return re.sub(r"\.0+$", "", text)
+
+
+def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
+    """Two ends in one unit, without the unit."""
+    return f"{own.text(low, digits)} to {own.text(high, digits)}"
+
+
+def count(number_of: int, one: str, many: str = "") -> str:
+    """A number of things.
+
+    >>> count(1, "run"), count(1200, "run")
+    ('1 run', '1,200 runs')
+    """
+    return f"{number_of:,} {one if number_of == 1 else many or one + 's'}"
+
+
+def listed(words: list[str]) -> str:
+    """Words one after the other, `and` before the last."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), *words[-1:]]))

@@ -1,0 +1,265 @@
+"""Every option of a command changes what is printed or written, or other tests have it, or none does."""
+
+import re
+from contextlib import chdir
+from hashlib import sha256
+from pathlib import Path
+from shutil import copytree, rmtree
+from typing import NamedTuple
+
+import click
+import pytest
+
+from pipeline.command_line import fuselog
+from tests.pipeline.conftest import run_here
+
+ROOT = Path(__file__).parents[2]
+GROUP = click.Context(fuselog)
+COMMANDS = {name: fuselog.get_command(GROUP, name) for name in fuselog.list_commands(GROUP)}
+
+
+class Moves(NamedTuple):
+    """A command line, and what is added to it to move each of its options."""
+
+    usual: str
+    options: dict[str, str]
+
+
+OUT = "-o out.mcap"
+RECORD = "record landmarks --set duration_s=3 --set fix.rate_hz=2"
+TIMES = re.compile(r" *time \(s\)(?s:.*)")  # of which no two are alike, nor as wide
+MOVES = [
+    Moves(
+        f"{RECORD} {OUT}",
+        {
+            "--out": "-o new.mcap",
+            "--seed": "--seed 1",
+            "--run": "--run 1",
+            "--compression": "--compression lz4",
+            "--foxglove": "--foxglove",
+            "--set": "--set speed_mps=1",
+        },
+    ),
+    Moves("record --again run.mcap -o out.mcap", {"--again": "--again other.mcap", "--run": "--run 1"}),
+    Moves(
+        f"replay run.mcap -e ekf {OUT}",
+        {
+            "--estimator": "-e ukf",
+            "--every": "--every 0.03",
+            "--arrival-order": "--arrival-order",
+            "--end": "--end 1",
+            "--save": "--save out.rrd",
+            "--foxglove": "--foxglove",
+            "--json": "--json",
+            "--parameters": "--parameters",
+            "--set": "--set ekf.gate_probability=0.5",
+            "--settings": "--settings settings.toml",
+        },
+    ),
+    Moves(f"replay run.mcap -e ekf --arrival-order {OUT}", {"--late": "--late drop"}),
+    Moves(
+        f"replay run.mcap -e ekf --start 1 --start-from truth {OUT}",
+        {"--start": "--start 2", "--start-sigma": "--start-sigma x_m=3"},
+    ),
+    Moves(
+        "evaluate est.mcap",
+        {
+            "--align": "--align se2",
+            "--metric": "--metric accuracy",
+            "--out": "--out out",
+            "--gap-limit": "--gap-limit 0.001",
+            "--json": "--json",
+        },
+    ),
+    Moves("evaluate est.mcap --out out", {"--errors": "--errors"}),
+    Moves(
+        "evaluate est.mcap --align se2 --delta 2",
+        {
+            "--delta": "--delta 1",
+            "--delta-unit": "--delta-unit s",
+            "--association": "--association nearest",
+        },
+    ),
+    Moves(
+        "evaluate est.txt --truth truth.txt",
+        {
+            "--truth": "--truth est.txt",
+            "--time-offset": "--time-offset 0.05",
+        },
+    ),
+    Moves(
+        "compare run.mcap -e ekf -e ukf",
+        {
+            "--estimator": "-e dead-reckoning",
+            "--margin": "--margin 0.5",
+            "--out": "--out out",
+            "--save": "--save out.rrd",
+            "--json": "--json",
+            "--set": "--set ekf.gate_probability=0.5",
+            "--settings": "--settings settings.toml",
+        },
+    ),
+    Moves("compare est.mcap est-ukf.mcap", {"--gap-limit": "--gap-limit 0.001"}),
+    Moves(
+        f"cut run.mcap {OUT}",
+        {
+            "--out": "-o new.mcap",
+            "--start": "--start 1",
+            "--end": "--end 1",
+            "--topics": "--topics /robot1/*",
+            "--decimate": "--decimate /robot1/odometry=2",
+        },
+    ),
+    Moves(
+        f"merge left.mcap run.mcap {OUT}", {"--out": "-o new.mcap", "--offset": "--offset run.mcap=1"}
+    ),
+    Moves(
+        f"relabel run.mcap --topic /robot1/=/left/ {OUT}",
+        {
+            "--out": "-o new.mcap",
+            "--topic": "--topic /landmarks=/map",
+            "--component": "--component x_m=east_m",
+        },
+    ),
+    Moves(
+        "export est.mcap --to csv --out out",
+        {
+            "--to": "--to tum",
+            "--out": "--out other",
+            "--topic": "--topic /estimates/ekf/robot1/pose -o new.csv",
+        },
+    ),
+    Moves("info run.mcap", {"--all": "--all", "--json": "--json"}),
+    Moves(
+        "observability run.mcap",
+        {
+            "--window": "--window 1",
+            "--scale": "--scale x_m=3",
+            "--end": "--end 1",
+            "--json": "--json",
+            "--set": "--set sigma_range_m=3",
+        },
+    ),
+    Moves(f"constrain drive.mcap {OUT}", {"--out": "-o new.mcap", "--set": "--set rolling_hz=10"}),
+    Moves("models robot", {"--formulas": "--formulas", "--json": "--json"}),
+    *(
+        Moves(each, {"--json": "--json"})
+        for each in ("estimators ekf", "experiments", "metrics", "scenarios")
+    ),
+    Moves(
+        "sweep landmarks --set duration_s=2 --runs 1 --over speed_mps=0.5:1:2 --samples 1 --out out",
+        {"--samples": "--samples 2", "--sampling": "--sampling random"},
+    ),
+]
+
+# what is moved in another file: of all commands, and the commands whose other options are
+OPTIONS_ELSEWHERE = {
+    "--allow-programs": "tests/replay/foreign/test_everywhere.py",
+    "--connect": "tests/replay/timeline/test_timeline.py",
+    "--model": "tests/pipeline/test_command_line.py",
+    "--origin": "tests/pipeline/test_planes.py",
+    "--recover": "tests/pipeline/test_command_line.py",
+    "--scheduler": "tests/pipeline/test_campaigns.py",
+    "--settings": "tests/pipeline/test_tuning.py",
+    "--workers": "tests/pipeline/test_campaigns.py",
+}
+COMMANDS_ELSEWHERE = {
+    "cache": ("test_cache",),
+    "check": ("test_checking", "test_stored_goldens", "test_late"),
+    "compare": ("test_comparing", "test_trajectories"),
+    "diagnose": ("test_battery", "test_diagnosing", "test_outputs"),
+    "evaluate": ("test_trajectories", "test_command_line"),
+    "import": ("test_table_import", "test_ros_import"),
+    "replay": ("test_spans", "test_command_line"),
+    "report": ("test_report", "test_outputs"),
+    "run": ("test_experiments", "test_late"),
+    "sweep": ("test_sweeps", "test_campaigns", "test_outputs"),
+    "tune": ("test_tuning",),
+    "view": ("test_outputs", "test_spans", "../replay/timeline/test_timeline"),
+}
+
+
+UNMOVED = {
+    "compare --case": "no test moves it yet",
+    "constrain --unit": "no test moves it yet",
+    "diagnose --gap-limit": "no test moves it yet",
+    "evaluate --format": "it is found from the content, and another than that is refused",
+    "evaluate --max-difference": "no test moves it yet",
+    "evaluate --truth-format": "it is found from the content, and another than that is refused",
+    "replay --gap-limit": "truth is known at every stamp of the short log",
+    "report --viewer": "no test moves it yet",
+    "run --parameters": "no test moves it yet",
+    "sweep --seed": "no test moves it yet",
+    "tune --gap-limit": "no test moves it yet",
+    "view --gap-limit": "no test moves it yet",
+}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    with chdir(folder):
+        (folder / "settings.toml").write_text("[ekf]\ngate_probability = 0.7\n")
+        for line in (
+            f"{RECORD} -o run.mcap --set range_bearing.latency_s=0.3",
+            f"{RECORD} -o other.mcap --seed 3",
+            "record navigation --set duration_s=12 -o drive.mcap",
+            "replay run.mcap -e ekf --every 0.03 -o est.mcap",
+            "replay run.mcap -e ukf --every 0.03 -o est-ukf.mcap",
+            "export est.mcap --to tum --topic /estimates/ekf/robot1/pose -o est.txt",
+            "export run.mcap --to tum --topic /robot1/truth -o truth.txt",
+            "relabel run.mcap --topic /robot1/=/left/ --topic /landmarks=/left/landmarks -o left.mcap",
+        ):
+            said = run_here(*line.split())
+            assert said.code == 0, said.err
+    return folder
+
+
+def outcome(line: str, logs: Path, folder: Path) -> tuple[str, ...]:
+    """What a command prints and writes."""
+    copytree(logs, folder, dirs_exist_ok=True)
+    with chdir(folder):
+        said = run_here(*line.split())
+    assert said.code == 0, (line, said.err)
+    new = sorted(each for each in folder.rglob("*") if each.is_file())
+    found = (
+        TIMES.sub("", said.out),
+        *(f"{each.relative_to(folder)} {sha256(each.read_bytes()).hexdigest()}" for each in new),
+    )
+    rmtree(folder)
+    return found
+
+
+@pytest.mark.parametrize("moves", MOVES, ids=lambda moves: moves.usual)
+def test_every_option_changes_what_comes_out(moves: Moves, logs: Path, tmp_path: Path):
+    place = tmp_path / "here"
+    usual = outcome(moves.usual, logs, place)
+    assert outcome(moves.usual, logs, place) == usual or "--out" in moves.usual
+    same = {
+        option
+        for option, added in moves.options.items()
+        if outcome(f"{moves.usual} {added}", logs, place) == usual
+    }
+    assert not same
+
+
+def test_no_option_is_left_out():
+    """Of one that is not moved above, the file that is to move it says its name."""
+    moved = {(moves.usual.split()[0], option) for moves in MOVES for option in moves.options}
+    left = {
+        f"{name} {option}"
+        for name, command in COMMANDS.items()
+        for each in command.params
+        if isinstance(each, click.Option)
+        for option in [max(each.opts, key=len)]
+        if (name, option) not in moved and not _is_named(name, option, each.opts)
+    }
+    assert left == set(UNMOVED)
+
+
+def _is_named(command: str, option: str, spellings: list[str]) -> bool:
+    paths = [ROOT / "tests" / "pipeline" / f"{each}.py" for each in COMMANDS_ELSEWHERE.get(command, ())]
+    if option in OPTIONS_ELSEWHERE:
+        paths = [ROOT / OPTIONS_ELSEWHERE[option]]
+    spelt = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, spellings))})(?![\w-])")
+    return any(spelt.search(path.read_text(encoding="utf-8")) for path in paths)

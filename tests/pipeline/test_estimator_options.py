@@ -1,0 +1,130 @@
+"""Every parameter of every estimator, model and method changes the estimates, or a reason says why not.
+
+Parameters are values at run time, so that all of a model's share one kernel.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from pipeline.runs.recorded import replay_in_memory
+from recorders.errors import BadInput
+from recorders.parameters import Described, Parameters, merge, nested
+from recorders.recording import record_run
+from recorders.registry import available
+from replay.engine.replaying.estimator import configure, find_estimator
+from replay.engine.streams.sources import MemorySource, memory_source
+from replay.inference.all_methods import METHODS
+from replay.inference.estimators import registered_models
+from replay.inference.kalman.methods import MethodParameters
+from replay.inference.model.parameters import ModelParameters
+from tests.pipeline import estimator_cases as cases
+from tests.pipeline.estimator_cases import Case, Situation
+from tests.pipeline.moves import moved, settable
+
+COMMON = {*ModelParameters.model_fields, *MethodParameters.model_fields}
+ELSEWHERE = {
+    "analytic": "it has the common options alone",
+    "dead-reckoning": "it is the filter of a robot without its sensors",
+    "exec": "what a program does with its parameters is its own",
+    "lib": "what a library does with its parameters is its own",
+    "vehicle-kalman": "it is the filter of a vehicle that drives",
+    **dict.fromkeys(("ekf", "iekf"), "they have the common options alone"),
+    **dict.fromkeys(
+        ("bingham-inertial", "gyro", "madgwick", "mahony", "triad", "vqf"),
+        "no scenario has a magnetometer; their tests are of recordings",
+    ),
+    "report-tracker": "no scenario has reports of ships; its tests are of recordings",
+}
+MODELS_ELSEWHERE = {"orientation": "no scenario has a magnetometer; its tests are of recordings"}
+
+
+class Tried(NamedTuple):
+    """Parameters of an estimator that are tried together; all of them where none are named."""
+
+    label: str
+    case: Case
+    names: frozenset[str] | None = None
+    model: str = ""
+
+
+def all_tried() -> Iterator[Tried]:
+    """A model's own parameters, those that all have in common, a method's own, or an estimator's."""
+    for name in registered_models().keys() - MODELS_ELSEWHERE.keys():
+        own = registered_models()[name].parameters.model_fields.keys() - COMMON
+        yield Tried(f"model {name}", cases.MODELS[name], frozenset(own), name)
+    yield Tried("common", cases.METHODS["common"], frozenset(COMMON))
+    for name, method in METHODS.items():
+        if own := method.parameters.model_fields.keys() - COMMON:
+            yield Tried(f"method {name}", cases.METHODS[name], frozenset(own))
+    for name, case in cases.OWN.items():
+        yield Tried(name, case)
+
+
+TRIED = sorted(all_tried(), key=lambda each: each.label)
+
+
+@cache
+def recorded(scenario: str, settings: str) -> MemorySource:
+    return memory_source(*record_run(scenario, json.loads(settings), seed=3))
+
+
+def fingerprint(situation: Situation, settings: Mapping[str, Any]) -> str:
+    """Of all that is estimated."""
+    source = recorded(situation.scenario, json.dumps(situation.recorded))
+    outputs = replay_in_memory([source], {"tried": settings})
+    digest = hashlib.sha256()
+    for topic, ragged in outputs.items():
+        digest.update(repr((topic, sorted(ragged.stream.metadata.items()))).encode())
+        for column in (ragged.stream.publish_time_ns, *ragged.stream.columns.values()):
+            digest.update(np.ascontiguousarray(column).data)
+    return digest.hexdigest()
+
+
+def counts(tried: Tried, kind: type[Parameters], parameter: Described) -> bool:
+    """Whether another value of a parameter gives other estimates; it does not where it is refused."""
+    case, name = tried.case, parameter.name
+    situation = case.under.get(name, case.usual)
+    base = dict(situation.settings)
+    if name in case.values:
+        other = merge(base, nested(name, case.values[name]))
+    else:
+        other = moved(kind, base, parameter)
+    chosen = {"kind": case.kind, **({"model": tried.model} if tried.model else {})}
+    usual = fingerprint(situation, {**chosen, **base})
+    try:
+        return fingerprint(situation, {**chosen, **other}) != usual
+    except BadInput:
+        return False
+
+
+@pytest.mark.parametrize("tried", TRIED, ids=lambda tried: tried.label)
+def test_every_parameter_changes_the_estimates(tried: Tried):
+    estimator, variant = find_estimator(tried.case.kind)
+    by_model = estimator.parameters_by_model(tried.case.kind, variant)
+    kind = by_model.get(tried.model) or estimator.parameters_with(tried.case.kind, variant)
+    nothing = {
+        each.name
+        for each in settable(kind)
+        if tried.names is None or each.name.partition(".")[0] in tried.names
+        if not counts(tried, kind, each)
+    }
+    assert nothing == set(tried.case.nothing)
+
+
+def test_no_estimator_is_left_out():
+    assert {*cases.OWN, *cases.METHODS, *ELSEWHERE} - {"common"} == set(available("estimators"))
+    assert {*cases.MODELS, *MODELS_ELSEWHERE} == set(available("models"))
+
+
+def test_a_name_and_a_setting_that_differ_are_refused():
+    """What the name says stood, and the setting did nothing."""
+    with pytest.raises(BadInput, match="tracker:jipda says association = jipda, and a setting nearest;"):
+        configure("tracker:jipda", {"association": "nearest"})
+    configure("tracker:jipda", {"association": "jipda"})
+    configure("particles:50", {"particles": 50})

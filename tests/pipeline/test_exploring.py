@@ -1,0 +1,259 @@
+"""A filter is played by its parameters: the session, and the page in a browser."""
+
+import json
+import shutil
+import socket
+import tomllib
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.exploring.curves import BIN_S, ellipse, extremes, typical_time_s
+from pipeline.exploring.newest import NewestFirst
+from pipeline.exploring.session import Session, open_session
+from pipeline.exploring.verdict import numbers_of
+from recorders.errors import BadInput
+
+SURE = {"sigma_range_m": 0.03}  # of .1
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("explore") / "run.mcap"
+    fl.write(path, fl.record("landmarks", seed=3, duration_s=20.0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def session(log: Path) -> Session:
+    return open_session(log, "ekf")
+
+
+def test_what_is_shown_is_what_a_replay_gives(session: Session, log: Path) -> None:
+    played = session.play("ekf", SURE).cases["robot1"]
+    replayed = fl.replay(log, {"ekf": {"kind": "ekf", **SURE}})
+    errors, innovations = replayed.errors, replayed.innovations
+    assert played.errors is not None
+    assert played.nis is not None
+    np.testing.assert_array_equal(played.errors.error[:, 1], errors["error_y_m"])
+    np.testing.assert_array_equal(played.errors.nees, errors["nees"])
+    first = innovations[(innovations["time_ns"] - replayed.logs[0].epoch_ns) * 1e-9 < BIN_S]
+    assert played.nis.mean[0] == pytest.approx(first["nis"].sum() / first["degrees"].sum())
+    assert played.log_likelihood == pytest.approx(innovations["log_likelihood"].sum())
+    metrics = replayed.metrics.set_index("quantity")["value"]
+    assert numbers_of(played)["error, RMS"] == (pytest.approx(metrics["position_rmse_m"]), "m")
+    assert numbers_of(played)["NEES, aim 3"][0] == pytest.approx(metrics["nees"])
+    assert numbers_of(played)["NIS, aim 1"][0] == pytest.approx(metrics["nis_per_component"])
+
+
+def test_verdicts_are_on_the_right_side(session: Session) -> None:
+    sure = session.play("ekf", SURE).verdicts["robot1"]
+    careful = session.play("ekf", {"sigma_range_m": 0.4, "sigma_bearing_rad": 0.08}).verdicts["robot1"]
+    assert session.play("ekf", {}).verdicts["robot1"].level == "good"
+    assert (sure.level, sure.headline) == ("doubtful", "Too sure of itself.")
+    assert careful.headline == "Too careful."
+
+
+def test_saved_settings_replay_to_the_same_numbers(
+    session: Session, log: Path, tmp_path: Path, fuselog: Callable[..., Any]
+) -> None:
+    file = tmp_path / "settings.toml"
+    file.write_text(session.toml(SURE), encoding="utf-8")
+    assert tomllib.loads(file.read_text(encoding="utf-8")) == {"ekf": SURE}
+    command = session.command(SURE)
+    assert command == f"fuselog replay {log} -e ekf --set sigma_range_m=0.03"
+    played = session.play("ekf", SURE).cases["robot1"]
+    error_m, _ = numbers_of(played)["error, RMS"]
+    for words in (command.split()[1:], ["replay", log, "-e", "ekf", "--settings", file]):
+        said = fuselog(*words, "-o", tmp_path / f"{len(words)}.mcap", "--json")
+        assert json.loads(said.out)["metrics"]["ekf.position_rmse_m.robot1"] == pytest.approx(error_m)
+
+
+def test_sliders_are_of_what_the_log_is_read_by(session: Session) -> None:
+    found = {each.name: each for each in session.sliders}
+    assert {
+        "sigma_range_m",
+        "bias_bearing_rad",
+        "turn_noise_density",
+        "gate_probability",
+    } <= found.keys()
+    assert not {"sigma_fix_m", "lever_x_m", "sigma_heading_rad"} & found.keys()
+    for slider in found.values():
+        assert slider.low <= slider.own <= slider.high
+        assert slider.value(slider.place(slider.own)) == slider.own
+        ends = slider.value(0.0), slider.value(1.0)
+        assert ends == pytest.approx((slider.low, slider.high), rel=1e-3)
+    assert found["sigma_range_m"].value(0.0) == pytest.approx(0.01)
+    with pytest.raises(BadInput, match="no slider 'sigma_rang_m'; did you mean 'sigma_range_m'"):
+        session.slider("sigma_rang_m")
+
+
+def test_likelihood_is_greatest_where_tuning_ends(session: Session) -> None:
+    points = list(session.likelihoods("ekf", SURE, "sigma_range_m"))
+    best = max(points, key=lambda each: each[1])[0]
+    tuned = session.tuned("ekf", SURE, ["sigma_range_m"])["sigma_range_m"]
+    values = [value for value, _ in points]
+    assert abs(values.index(best) - np.argmin(np.abs(np.log(np.array(values) / tuned)))) <= 1
+    assert session.diagnosed("ekf", SURE)[0].startswith("1. sigma_range_m")
+
+
+def test_a_parameter_is_taken_into_the_state(session: Session) -> None:
+    wider = session.with_estimated(["bias_range_m"])
+    assert wider.play("ekf", {}).cases["robot1"].components[-1] == "bias_range_m"
+
+
+def test_a_log_without_truth_is_explored(log: Path) -> None:
+    source = fl.open(log)
+    streams = {name: source[name] for name in source if "truth" not in name}
+    found = open_session(fl.MemorySource(streams, source.run, "blind", source.start_ns), "ekf")
+    case = found.play("ekf", SURE).cases["robot1"]
+    assert case.errors is None
+    assert typical_time_s(case) is None
+    assert found.play("ekf", SURE).verdicts["robot1"].headline == "Too sure of itself."
+
+
+def test_nothing_drawn_is_lost(session: Session) -> None:
+    values = np.zeros(100_000)
+    values[[77_777, 33]] = 5.0, -4.0
+    rows = extremes(values)
+    assert len(rows) <= 400
+    assert (values[rows].min(), values[rows].max()) == (-4.0, 5.0)
+    outline = ellipse(np.array([1.0, 2.0]), np.diag([4.0, 1.0])) - [1.0, 2.0]
+    assert np.ptp(outline, axis=0) == pytest.approx(
+        [4.0 * np.sqrt(5.9915), 2.0 * np.sqrt(5.9915)], rel=1e-3
+    )
+
+
+def test_the_newest_work_wins() -> None:
+    begun, go_on, done, ended = Event(), Event(), [], Event()
+    worker = NewestFirst(done.append)
+
+    def first(is_newer: Any) -> None:
+        begun.set()
+        go_on.wait(5.0)
+        done.append(("first", is_newer()))
+
+    worker.ask(first)
+    begun.wait(5.0)
+    for number in range(5):
+        worker.ask(lambda _, number=number: (done.append(number), ended.set()))
+    go_on.set()
+    assert ended.wait(5.0)
+    worker.end()
+    assert done == [("first", True), 4]
+
+
+@pytest.mark.parametrize(
+    ("estimators", "sentence"),
+    [
+        (["ekf", "ukf", "iekf"], "ekf, ukf, iekf: at most 2 filters are explored at a time"),
+        (["network"], "network"),
+    ],
+)
+def test_what_cannot_be_explored_is_said(log: Path, estimators: list[str], sentence: str) -> None:
+    with pytest.raises(BadInput, match=sentence):
+        open_session(log, estimators)
+
+
+# The page.
+
+
+@pytest.fixture(scope="module")
+def explorer(log: Path) -> Iterator[Any]:
+    pytest.importorskip("bokeh")
+    explorer = fl.explore(log, "ekf", show=False)
+    yield explorer
+    explorer.close()
+
+
+def test_who_does_not_know_the_address_gets_nothing(explorer: Any) -> None:
+    base = explorer.url.rsplit("/", 2)[0]
+    host, port = base.removeprefix("http://").split(":")
+    assert host == "127.0.0.1"
+    for path in ("/", "/ws", "/autoload.js", "/static/js/bokeh.min.js", "/" + "a" * 32 + "/"):
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(base + path)
+        assert refused.value.code == 404
+        refused.value.close()
+    for family, address in ((socket.AF_INET, _outer_address()), (socket.AF_INET6, "::1")):
+        with socket.socket(family) as tried:
+            tried.settimeout(1.0)
+            assert tried.connect_ex((address, int(port))) != 0
+
+
+def _outer_address() -> str:
+    """An address of this machine in its network, else another one of its loopback."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        try:
+            asked.connect(("192.0.2.1", 9))
+            return str(asked.getsockname()[0])
+        except OSError:
+            return "127.0.0.2"
+
+
+def test_a_page_of_another_origin_gets_nothing(explorer: Any) -> None:
+    with urllib.request.urlopen(explorer.url) as answer:
+        assert "Access-Control-Allow-Origin" not in answer.headers
+        assert 'name="referrer" content="no-referrer"' in answer.read().decode()
+    host, path = explorer.url.removeprefix("http://").split("/", 1)
+    name, port = host.split(":")
+    for origin in ("http://evil.example", "http://localhost:1"):
+        with socket.create_connection((name, int(port))) as asked:
+            lines = (
+                *(f"GET /{path}ws HTTP/1.1", f"Host: {host}", f"Origin: {origin}"),
+                *("Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"),
+                *("Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "", ""),
+            )
+            asked.sendall("\r\n".join(lines).encode())
+            assert asked.recv(64).startswith(b"HTTP/1.1 403 ")
+
+
+NOW = """() => {
+  const source = Bokeh.documents[0].get_model_by_name("nis-line-0");
+  return Array.from(source.data.y).reduce((sum, each) => sum + each, 0) / source.data.y.length;
+}"""
+DRAG = 'place => { Bokeh.documents[0].get_model_by_name("sigma_range_m").value = place; }'
+
+
+def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no Chromium: install one, or run `playwright install chromium`")
+    explorer = fl.explore(log, "ekf", show=False)
+    slider = explorer.session.slider("sigma_range_m")
+    said: list[str] = []
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": 1280, "height": 900})
+        page.on(
+            "console", lambda message: said.append(message.text) if message.type == "error" else None
+        )
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.goto(explorer.url)
+        page.wait_for_selector("text=Nothing speaks against it.")
+        before = page.evaluate(NOW)
+        for place in (0.9, 0.1, 0.7, 0.25):  # the last one wins
+            page.evaluate(DRAG, place)
+        wanted = explorer.session.play("ekf", {"sigma_range_m": slider.value(0.25)}).cases["robot1"]
+        mean = float(wanted.nis.mean.mean())
+        page.wait_for_function(f"Math.abs(({NOW})() - {mean}) < 1e-9 * {mean}")
+        page.wait_for_selector("text=Too sure of itself.")
+        assert mean > 2.0 * before
+        page.get_by_text("Command", exact=True).click()
+        page.wait_for_selector(f"text=--set sigma_range_m={slider.value(0.25)!r}")
+        page.get_by_text("Pin", exact=True).click()
+        page.get_by_text("Reset", exact=True).click()
+        page.wait_for_selector("text=Nothing speaks against it.")
+        page.wait_for_selector("text=pinned")
+        browser.close()
+    explorer._is_ended.wait(20.0)
+    assert explorer._is_ended.is_set()  # the page is closed
+    assert said == []
