@@ -332,7 +332,9 @@ def _message(data: NDArray[np.uint8], position: int) -> tuple[str, bytes]:
 def _gathered(data: NDArray[np.uint8], begins: NDArray[np.int64], dtype: np.dtype) -> NDArray:
     """The rows (n,) of a layout that begin at these bytes."""
     count = len(data) - dtype.itemsize + 1
-    return np.ndarray((count,), dtype, data.data, strides=(1,))[begins]
+    # As bytes, which NumPy copies several times faster than fields.
+    every = np.ndarray((count,), f"V{dtype.itemsize}", data.data, strides=(1,))
+    return every[begins].view(dtype)
 
 
 def _text(body: bytes) -> str:
