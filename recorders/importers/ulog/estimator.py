@@ -209,8 +209,7 @@ class Autopilot:
 
 def _table(fields: Fields, names: list[str] | tuple[str, ...]) -> _Table:
     """Fields by name as numbers; NaN where there is none of the name."""
-    missing = np.full(len(fields.rows.data), np.nan)
-    values = np.stack([fields.of(name) if fields.has(name) else missing for name in names], axis=1)
+    values = fields.vector(*names)
     key = "timestamp_sample" if fields.has("timestamp_sample") else "timestamp"
     key_us = fields.rows.data[key].astype(np.int64)
     return _Table(key_us, fields.measured_us, fields.rows.time_us, values)

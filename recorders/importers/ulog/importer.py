@@ -43,7 +43,7 @@ def _surroundings(path: Path) -> _Surroundings:
                 above = fields.of("altitude_ellipsoid_m") - fields.of("altitude_msl_m")
                 separation_m = float(above[-1])
             elif fields.has("ref_lat"):
-                known = np.flatnonzero(fields.of("xy_global") * (fields.of("ref_timestamp") > 0))
+                known = np.flatnonzero((fields.of("xy_global") > 0) & (fields.of("ref_timestamp") > 0))
                 if len(known):
                     place = fields.vector("ref_lat", "ref_lon", "ref_alt")[known[0]].tolist()
                     place[2] += separation_m

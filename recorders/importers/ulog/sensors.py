@@ -53,7 +53,9 @@ class Fields(NamedTuple):
         return name in (self.rows.data.dtype.names or ())
 
     def of(self, name: str) -> Floats:
-        """A field (n,)."""
+        """A field (n,); NaN where there is none of the name."""
+        if not self.has(name):
+            return np.full(len(self.rows.data), np.nan)
         return self.rows.data[name].astype(float)
 
     def vector(self, *names: str, width: int = 0) -> Floats:
