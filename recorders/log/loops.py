@@ -56,31 +56,31 @@ def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Patter
     """The pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
     size = len(record)
     places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
-    mask = _words(is_fixed)[places]
+    mask = words_of(is_fixed)[places]
     places, mask = places[mask != 0], mask[mask != 0]
-    return Pattern(size, places, _words(record)[places] & mask, mask)
+    return Pattern(size, places, words_of(record)[places] & mask, mask)
 
 
 def scan(data: NDArray[np.uint8]) -> Scan:
     """Walk the records of a chunk."""
-    return Scan(*_loop(_scan, len(data))(_words(data), len(data)))
+    return Scan(*loop_for(_scan, len(data))(words_of(data), len(data)))
 
 
 def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern) -> bool:
     """Tell whether the records at ascending `offsets` lie inside `data` and have the pattern's bytes."""
     if offsets[-1] + pattern.size > len(data):
         return False
-    agreed = _loop(_agree, len(offsets) * pattern.size)
-    return bool(agreed(_words(data), offsets, pattern.places, pattern.expected, pattern.mask))
+    agreed = loop_for(_agree, len(offsets) * pattern.size)
+    return bool(agreed(words_of(data), offsets, pattern.places, pattern.expected, pattern.mask))
 
 
-def _words(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
+def words_of(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """The words that start at every byte of `data` but the last seven, without a copy."""
     count = max(len(data) - 7, 0)
     return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
 
 
-def _loop(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
+def loop_for(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
     """The loop to go through so many bytes with."""
     _left["plain"] -= size
     if _left["plain"] >= 0 and "numba" not in sys.modules:

@@ -20,6 +20,7 @@ from numpy.testing import assert_array_equal
 import replay.engine.compiling.compile
 from recorders.errors import BadInput
 from recorders.importers.ros.files import ros1_file
+from recorders.importers.ulog import loops as ulog_loops
 from recorders.log import loops
 from replay.engine.compiling.cache import cache_folder, in_turn
 from replay.engine.compiling.compile import compile_over_runs, compiled
@@ -375,12 +376,13 @@ def test_every_kernel_of_replay_is_compiled_here():
 
 @pytest.mark.parametrize(
     ("module", "names"),
-    [(loops, {"_scan", "_agree"}), (ros1_file, {"_scan", "_number"})],
-    ids=["loops", "ros1_file"],
+    [(loops, {"_scan", "_agree"}), (ros1_file, {"_scan", "_number"}), (ulog_loops, {"_walk"})],
+    ids=["loops", "ros1_file", "ulog_loops"],
 )
 def test_the_loops_of_recorders_call_nothing_outside_their_file(module: ModuleType, names: set[str]):
     """Numba caches them, since recorders know no replay, and notices a change in their own file only."""
-    compiled = re.findall(r"(?:^@njit.*\ndef |_loop\()(_\w+)", inspect.getsource(module), re.MULTILINE)
+    source = inspect.getsource(module)
+    compiled = re.findall(r"(?:^@njit.*\ndef |loop_for\()(_\w+)", source, re.MULTILINE)
     assert {*compiled} == names
     kernels = [vars(module)[name] for name in names]
     for kernel in kernels:

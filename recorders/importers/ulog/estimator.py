@@ -1,0 +1,294 @@
+"""What becomes of the autopilot's own filter, EKF2: its states and innovations, and a simulator's truth.
+
+PX4's innovations are what was predicted minus what was measured; ours have the other sign. It fuses one
+component after the other, and logs the variance of each alone: the covariances here are diagonal.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.importers.ulog.file import Rows
+from recorders.importers.ulog.frames import orientations, to_enu
+from recorders.importers.ulog.sensors import BODY, Fields, Part
+from recorders.log import schemas
+from recorders.models.orientation import conjugate, left_matrix, rotate
+from recorders.models.states import NAVIGATION, state_metadata
+
+Floats = NDArray[np.float64]
+TRUTH = f"{BODY}/truth"
+_POSE = NAVIGATION[:10]
+# How many states of which the variances are logged have an orientation of three.
+_TANGENT_STATES = 23
+_UNIT_TOLERANCE = 1e-2
+_INNOVATIONS = (
+    "estimator_innovations",
+    "estimator_innovation_variances",
+    "estimator_innovation_test_ratios",
+)
+_LOCAL, _ATTITUDE = "vehicle_local_position_groundtruth", "vehicle_attitude_groundtruth"
+TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_status", "ekf2_innovations")
+
+
+class _Sensor(NamedTuple):
+    """The innovations of a sensor: their fields, and what we call them; with the sign that is ours."""
+
+    fields: tuple[str, ...]
+    components: tuple[str, ...]
+    signs: tuple[float, ...]
+
+
+def _enu(what: str, unit: str, horizontal: str, vertical: str) -> _Sensor:
+    fields = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
+    names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
+    return _Sensor(fields, names, (-1.0, -1.0, 1.0))
+
+
+def _flu(name: str, unit: str) -> _Sensor:
+    fields = tuple(f"{name}[{index}]" for index in range(3))
+    return _Sensor(fields, tuple(f"{name}_{axis}_{unit}" for axis in "xyz"), (-1.0, 1.0, 1.0))
+
+
+_SENSORS = {
+    "gnss_velocity": _enu("v", "mps", "gps_hvel", "gps_vvel"),
+    "gnss_position": _enu("", "m", "gps_hpos", "gps_vpos"),
+    "vision_velocity": _enu("v", "mps", "ev_hvel", "ev_vvel"),
+    "vision_position": _enu("", "m", "ev_hpos", "ev_vpos"),
+    "barometer": _Sensor(("baro_vpos",), ("z_m",), (1.0,)),
+    "range": _Sensor(("rng_vpos",), ("z_m",), (1.0,)),
+    "heading": _Sensor(("heading",), ("heading_rad",), (1.0,)),
+    "magnetometer": _flu("mag_field", "gauss"),
+    "gravity": _flu("gravity", "g"),
+    "flow": _Sensor(("flow[0]", "flow[1]"), ("flow_x_radps", "flow_y_radps"), (-1.0, -1.0)),
+    "drag": _Sensor(("drag[0]", "drag[1]"), ("drag_x_mps2", "drag_y_mps2"), (-1.0, -1.0)),
+    "airspeed": _Sensor(("airspeed",), ("airspeed_mps",), (-1.0,)),
+    "sideslip": _Sensor(("beta",), ("sideslip_rad",), (-1.0,)),
+}
+# The names that old firmware has for the same, in one topic with their variances.
+_OLD = {
+    "gps_hvel[0]": "vel_pos_innov{}[0]", "gps_hvel[1]": "vel_pos_innov{}[1]",
+    "gps_vvel": "vel_pos_innov{}[2]", "gps_hpos[0]": "vel_pos_innov{}[3]",
+    "gps_hpos[1]": "vel_pos_innov{}[4]", "gps_vpos": "vel_pos_innov{}[5]",
+    "heading": "heading_innov{}", "airspeed": "airspeed_innov{}", "beta": "beta_innov{}",
+    **{f"mag_field[{index}]": f"mag_innov{{}}[{index}]" for index in range(3)},
+    **{f"flow[{index}]": f"flow_innov{{}}[{index}]" for index in range(2)},
+}  # fmt: skip
+_FIELDS = tuple(dict.fromkeys(name for sensor in _SENSORS.values() for name in sensor.fields))
+
+
+class _Table(NamedTuple):
+    """Rows (n,) of numbers (n, k) by their key in us, with their stamps."""
+
+    key_us: NDArray[np.int64]
+    time_us: NDArray[np.int64]
+    logged_us: NDArray[np.int64]
+    values: Floats
+
+    def take(self, which: NDArray | slice) -> "_Table":
+        return _Table(self.key_us[which], self.time_us[which], self.logged_us[which], self.values[which])
+
+    def then(self, other: "_Table") -> "_Table":
+        return _Table(
+            np.concatenate([self.key_us, other.key_us]),
+            np.concatenate([self.time_us, other.time_us]),
+            np.concatenate([self.logged_us, other.logged_us]),
+            np.concatenate([self.values, other.values]),
+        )
+
+
+def label_of(instance: int) -> str:
+    """What an instance of the filter is called as an estimator."""
+    return f"ekf2_{instance}" if instance else "ekf2"
+
+
+class Autopilot:
+    """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[tuple[str, int], _Table] = {}
+        self._last: dict[tuple[int, str], Floats] = {}
+
+    def parts(self, rows: list[Rows]) -> Iterator[Part]:
+        """The parts of a block's rows; what lacks its counterpart waits for the next block."""
+        for each in rows:
+            fields = Fields(each)
+            if each.topic in ("estimator_states", "estimator_status") and fields.has("states[9]"):
+                yield _state(fields)
+            elif each.topic == "ekf2_innovations":
+                value, variance = (
+                    _table(fields, [_OLD.get(name, "").format(of) for name in _FIELDS])
+                    for of in ("", "_var")
+                )
+                yield from self._innovations(each.instance, value, variance, None)
+            elif each.topic in _INNOVATIONS:
+                self._add(each, _table(fields, _FIELDS))
+            elif each.topic == _ATTITUDE:
+                self._add(each, _table(fields, [f"q[{index}]" for index in range(4)]))
+            elif each.topic == _LOCAL:
+                self._add(each, _table(fields, ("x", "y", "z", "vx", "vy", "vz")))
+        for instance in sorted({key[1] for key in self._waiting if key[0] in _INNOVATIONS}):
+            yield from self._joined(instance)
+        yield from self._truth()
+
+    def _add(self, rows: Rows, table: _Table) -> None:
+        key = rows.topic, rows.instance
+        self._waiting[key] = self._waiting[key].then(table) if key in self._waiting else table
+
+    def _joined(self, instance: int) -> Iterator[Part]:
+        """The innovations whose variances have come as well."""
+        tables = [self._waiting.get((topic, instance)) for topic in _INNOVATIONS]
+        innovations, variances, ratios = tables
+        if innovations is None or variances is None:
+            return
+        common, first, second = np.intersect1d(innovations.key_us, variances.key_us, return_indices=True)
+        if not len(common):
+            return
+        tested = None
+        if ratios is not None:
+            places = np.searchsorted(ratios.key_us, common)
+            places = np.minimum(places, len(ratios.key_us) - 1)
+            is_there = ratios.key_us[places] == common
+            tested = np.where(is_there[:, None], ratios.values[places], np.nan)
+        yield from self._innovations(instance, innovations.take(first), variances.take(second), tested)
+        for topic in _INNOVATIONS:
+            table = self._waiting.get((topic, instance))
+            if table is not None:
+                self._waiting[topic, instance] = table.take(table.key_us > common[-1])
+
+    def _innovations(
+        self, instance: int, innovations: _Table, variances: _Table, ratios: Floats | None
+    ) -> Iterator[Part]:
+        """The innovations of every sensor that was fused: those that are new."""
+        for name, sensor in _SENSORS.items():
+            columns = [_FIELDS.index(each) for each in sensor.fields]
+            value, variance = innovations.values[:, columns], variances.values[:, columns]
+            before = self._last.get((instance, name), np.full((1, len(columns)), np.nan))
+            self._last[instance, name] = value[-1:]
+            is_new = (np.diff(value, axis=0, prepend=before) != 0.0).any(axis=1)
+            is_fused = np.isfinite(value) & np.isfinite(variance) & (variance > 0.0)
+            which = np.flatnonzero(is_new & is_fused.any(axis=1))
+            if not len(which):
+                continue
+            # What is not fused has a ratio of zero.
+            is_rejected = np.zeros(len(which), bool)
+            if ratios is not None:
+                is_rejected |= (ratios[which][:, columns] > 1.0).any(axis=1)
+            kept = np.where(is_fused, value, np.nan)[which] * sensor.signs
+            spread = np.where(is_fused, variance, np.nan)[which]
+            yield _innovation(
+                f"/estimates/{label_of(instance)}{BODY}/{name}/innovation",
+                sensor.components,
+                innovations.take(which),
+                (kept, spread, ~is_rejected),
+            )
+
+    def _truth(self) -> Iterator[Part]:
+        """The simulator's truth: positions and velocities at the stamps of its attitudes."""
+        attitude, local = self._waiting.get((_ATTITUDE, 0)), self._waiting.get((_LOCAL, 0))
+        if attitude is None or local is None or not len(local.time_us) or not len(attitude.time_us):
+            return
+        inside = (local.time_us[0] <= attitude.time_us) & (attitude.time_us <= local.time_us[-1])
+        self._waiting[_ATTITUDE, 0] = attitude.take(attitude.time_us > local.time_us[-1])
+        now = attitude.take(inside)
+        if not len(now.time_us):
+            return
+        begin = local.time_us[0]
+        moved = np.stack(
+            [np.interp(now.time_us - begin, local.time_us - begin, each) for each in local.values.T],
+            axis=1,
+        )
+        self._waiting[_LOCAL, 0] = local.take(slice(len(local.time_us) - 1, None))
+        state = np.hstack([to_enu(moved[:, :3]), to_enu(moved[:, 3:]), orientations(_unit(now.values))])
+        columns = {"state": state}
+        yield Part(
+            TRUTH, schemas.TRUTH_STATE, now.time_us, now.logged_us, columns, state_metadata(_POSE)
+        )
+
+
+def _table(fields: Fields, names: list[str] | tuple[str, ...]) -> _Table:
+    """Fields by name as numbers; NaN where there is none of the name."""
+    values = fields.vector(*names)
+    key = "timestamp_sample" if fields.has("timestamp_sample") else "timestamp"
+    key_us = fields.rows.data[key].astype(np.int64)
+    return _Table(key_us, fields.measured_us, fields.rows.time_us, values)
+
+
+def _innovation(
+    topic: str,
+    components: tuple[str, ...],
+    at: _Table,
+    found: tuple[Floats, Floats, NDArray[np.bool_]],
+) -> Part:
+    """Innovations (n, m) with their variances (n, m), and whether they were accepted (n,)."""
+    innovation, variance, accepted = found
+    size, width = innovation.shape
+    is_known = np.isfinite(innovation)
+    squared = np.where(is_known, innovation**2 / variance, 0.0)
+    logs = np.where(is_known, np.log(2.0 * np.pi * variance), 0.0)
+    covariance = np.zeros((size, width, width))
+    covariance[:, range(width), range(width)] = variance
+    covariance[~(is_known[:, :, None] & is_known[:, None, :])] = np.nan
+    columns = {
+        "target_id": np.zeros(size, np.uint32),
+        "accepted": accepted.astype(np.uint32),
+        "innovation": innovation,
+        "covariance": covariance.reshape(size, width * width),
+        "normalised_innovation_squared": squared.sum(axis=1),
+        "log_likelihood": -0.5 * (squared + logs).sum(axis=1),
+    }
+    metadata = {**state_metadata(components), "truth": TRUTH}
+    return Part(topic, schemas.INNOVATION, at.time_us, at.logged_us, columns, metadata)
+
+
+def _unit(quaternions: Floats) -> Floats:
+    """Quaternions (n, 4) at unit length; NaN where they are far from it."""
+    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.where(np.abs(length - 1.0) < _UNIT_TOLERANCE, quaternions, np.nan) / length
+
+
+def _state(fields: Fields) -> Part:
+    """Position, velocity and orientation of the filter, by its states and their variances.
+
+    The biases are left out: of old firmware they are increments over a step of the filter.
+    """
+    states = fields.vector("states", width=10)
+    count = sum(name.startswith("covariances[") for name in fields.rows.data.dtype.names or ())
+    # A quaternion's four variances, or of newer firmware those of a rotation about north, east, down.
+    turns = 3 if count == _TANGENT_STATES else 4
+    variances = fields.vector("covariances", width=turns + 6)
+    quaternion = orientations(_unit(states[:, :4]))
+    covariance = np.zeros((len(states), 9, 9))
+    for row, variance in ((3, variances[:, turns : turns + 3]), (0, variances[:, turns + 3 :])):
+        covariance[:, range(row, row + 3), range(row, row + 3)] = np.abs(to_enu(variance))
+    covariance[:, 6:, 6:] = _tilts(quaternion, _unit(states[:, :4]), variances[:, :turns])
+    is_old = np.isnan(quaternion).any(axis=1)
+    mean = np.hstack([to_enu(states[:, 7:10]), to_enu(states[:, 4:7]), quaternion])
+    part = Part(
+        f"/estimates/{label_of(fields.rows.instance)}{BODY}/state",
+        schemas.GAUSSIAN_ESTIMATE,
+        fields.measured_us,
+        fields.rows.time_us,
+        {"mean": mean, "covariance": covariance.reshape(len(states), 81)},
+        {**state_metadata(_POSE), "truth": TRUTH},
+        {"states without a unit quaternion, as of firmware of 2016": int(is_old.sum())},
+    )
+    return part.take(np.flatnonzero(~is_old))
+
+
+def _tilts(quaternion: Floats, logged: Floats, variances: Floats) -> Floats:
+    """The covariances (n, 3, 3) of rotations about the body's forward, left and up axes.
+
+    Args:
+        quaternion: (n, 4) from that body to east, north, up.
+        logged: (n, 4) as it was logged, from forward, right, down to north, east, down.
+        variances: (n, 4) of what was logged, or (n, 3) of rotations about north, east, down.
+    """
+    if variances.shape[1] == 4:
+        # A small rotation is twice the vector part of conj(q) dq, here about forward, right, down.
+        by = 2.0 * left_matrix(conjugate(logged))[:, 1:] * np.array([1.0, -1.0, -1.0])[:, None]
+    else:
+        variances = np.abs(to_enu(variances))
+        by = rotate(quaternion[:, None], np.eye(3))  # rows: the body's axes in the plane
+    return np.einsum("nij,nj,nkj->nik", by, variances, by)

@@ -1,0 +1,366 @@
+"""Reads a ULog in blocks: what it defines at its beginning, then the rows of its topics.
+
+What cannot be read is counted in `losses`, and reading goes on after it: at the next synchronisation
+message where a message is none, at its offset where a section was appended.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.errors import BadInput
+from recorders.importers.ulog.formats import TYPES, Damaged, FormatField, Layout, layout_of, parsed
+from recorders.importers.ulog.loops import BEYOND_BYTES, HEAD_BYTES, walk
+from recorders.log.loops import words_of
+
+MAGIC = bytes.fromhex("554c6f67011235")
+_SYNC = bytes.fromhex("080053") + bytes.fromhex("2f731320250cbb12")
+_PIECE_BYTES = 1 << 23
+_NUMBER_BYTES = 2
+_NEVER = 1 << 62
+_PASSED_OVER = "bytes that are no messages, and were passed over"
+_RECENT_US = 1_000_000
+_MONTH_US = 30 * 86_400_000_000
+_LEVELS = ("emergency", "alert", "critical", "error", "warning", "notice", "info", "debug")
+
+
+class Rows(NamedTuple):
+    """Some rows (n,) of a topic's instance, in the order of the file.
+
+    `time_us` are their stamps, for rows without one those between which they lie in the file, of which
+    `untimed` counts how many.
+    """
+
+    topic: str
+    instance: int
+    data: NDArray
+    time_us: NDArray[np.int64]
+    untimed: int
+
+
+class Text(NamedTuple):
+    """What the autopilot said: when, how grave it is, and what."""
+
+    time_us: int
+    level: str
+    text: str
+
+
+class _Subscription(NamedTuple):
+    """What the rows of a number are, from the byte `since` on, before the byte `until`."""
+
+    topic: str
+    instance: int
+    layout: Layout
+    since: int
+    until: int = _NEVER
+
+
+class UlogFile:
+    """A ULog, read once from its beginning to its end.
+
+    Attributes:
+        path: the file.
+        start_us: the stamp at which logging began.
+        info: what it says of itself, by key.
+        parameters: the autopilot's parameters at the beginning, and `defaults` where they are stated.
+        changes: those that changed: when, name, value.
+        texts: what the autopilot said.
+        dropouts: stamp and length in us of what the logger knew to be lost.
+        rows: how many each topic and instance had so far.
+        losses: what could not be read, and how often.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.info: dict[str, str] = {}
+        self.parameters: dict[str, float] = {}
+        self.defaults: dict[str, float] = {}
+        self.changes: list[tuple[int, str, float]] = []
+        self.texts: list[Text] = []
+        self.dropouts: list[tuple[int, int]] = []
+        self.rows: Counter[tuple[str, int]] = Counter()
+        self.losses: Counter[str] = Counter()
+        self._formats: dict[str, list[FormatField]] = {}
+        self._subscriptions: dict[int, _Subscription] = {}
+        self._appended: list[int] = []
+        try:
+            self._size = path.stat().st_size
+            with path.open("rb") as file:
+                self._begins = self._read_definitions(file)
+        except OSError as error:
+            raise BadInput(f"{path}: cannot be read ({error.strerror}); give a .ulg file") from error
+
+    def blocks(self, is_wanted: Callable[[str], bool]) -> Iterator[list[Rows]]:
+        """The rows of the topics that are wanted, a block for some megabytes of the file."""
+        ends = sorted({each for each in self._appended if self._begins <= each < self._size})
+        if len(ends) < len(self._appended):
+            self.losses["appended section that lies outside of the file"] += 1
+        try:
+            with self.path.open("rb") as file:
+                for begin, end in zip([self._begins, *ends], [*ends, self._size], strict=True):
+                    yield from self._section(file, begin, end, is_wanted)
+        except OSError as error:
+            raise BadInput(f"{self.path}: cannot be read ({error.strerror}); copy it anew") from error
+
+    # The beginning.
+
+    def _read_definitions(self, file: BinaryIO) -> int:
+        """Read all that is before the first subscription; where that is."""
+        head = file.read(16)
+        if head[:7] != MAGIC or len(head) < 16:
+            what = "is empty" if not head else "is no ULog"
+            raise BadInput(f"{self.path}: {what}; give a .ulg file of PX4")
+        self.start_us = int.from_bytes(head[8:], "little")
+        if self.start_us >= 1 << 62:
+            raise BadInput(f"{self.path}: its first stamp is no time; its head is damaged: copy it anew")
+        self._last_us = self.start_us
+        position = len(head)
+        while len(head := file.read(HEAD_BYTES)) == HEAD_BYTES:
+            size, kind = struct.unpack("<HB", head)
+            if chr(kind) in "ADLCSOR":
+                break
+            body = file.read(size)
+            if len(body) < size:
+                break
+            if not size or not 65 <= kind <= 90:
+                raise BadInput(
+                    f"{self.path}: byte {position} is no message's: the definitions are damaged, and "
+                    "nothing after them can be read; copy it anew"
+                )
+            try:
+                self._define(chr(kind), body)
+            except Damaged as why:
+                self.losses[str(why)] += 1
+            position += HEAD_BYTES + size
+        if not self._formats:
+            raise BadInput(f"{self.path}: ends in its definitions, at byte {position}; copy it anew")
+        return position
+
+    def _define(self, kind: str, body: bytes) -> None:
+        if kind == "F":
+            name, fields = parsed(_text(body))
+            self._formats[name] = fields
+        elif kind == "B" and len(body) >= 40 and body[8] & 1:
+            self._appended = [each for each in struct.unpack("<3Q", body[16:40]) if each]
+        elif kind == "P":
+            name, value = _parameter(body)
+            self.parameters[name] = value
+        elif kind == "Q":
+            name, value = _parameter(body[1:])
+            self.defaults[name] = value
+        elif kind == "I":
+            stated, value_bytes = _keyed(body)
+            of, _, key = stated.partition(" ")
+            self.info[key] = (
+                _text(value_bytes) if of.startswith("char") else str(_number(of, value_bytes))
+            )
+
+    # The data.
+
+    def _section(
+        self, file: BinaryIO, begin: int, end: int, is_wanted: Callable[[str], bool]
+    ) -> Iterator[list[Rows]]:
+        """The rows between two bytes of the file; the message that the end cuts is none."""
+        piece, place, is_lost = b"", begin, False
+        file.seek(begin)
+        while True:
+            if len(piece) < _PIECE_BYTES:
+                piece += file.read(max(min(_PIECE_BYTES, end - place - len(piece)), 0))
+            is_last = place + len(piece) >= end or len(piece) < _PIECE_BYTES
+            if is_lost:
+                found = piece.find(_SYNC)
+                is_lost = found < 0
+                skipped = max(len(piece) - len(_SYNC), 0) if is_lost else found
+                self.losses[_PASSED_OVER] += skipped
+                piece, place = piece[skipped:], place + skipped
+                if is_lost and is_last:
+                    self.losses[_PASSED_OVER] += len(piece)
+                    return
+                if is_lost:
+                    continue
+            data = np.frombuffer(piece + bytes(BEYOND_BYTES), np.uint8)
+            done, is_broken, rows = self._walked(data, len(piece), place, is_wanted)
+            if rows:
+                yield rows
+            piece, place = piece[done:], place + done
+            if is_broken or (is_last and _SYNC in piece[1:]):
+                self.losses[_PASSED_OVER] += 1
+                piece, place, is_lost = piece[1:], place + 1, True
+            elif is_last:
+                if piece and end == self._size:
+                    self.losses["bytes at the end that are no whole message"] += len(piece)
+                return
+
+    def _walked(
+        self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
+    ) -> tuple[int, bool, list[Rows]]:
+        """Where the last message of a piece at `place` ends, whether one broke there, and the rows."""
+        found = walk(data, size)
+        words = words_of(data)
+        others = [(each, *_message(data, each)) for each in found.others.tolist()]
+        for position, kind, body in others:
+            if kind == "A":
+                self._subscribe(body, place + position)
+        at, cut = self._up_to_damage(found.data, words)
+        others = [each for each in others if each[0] < cut]
+        numbers = (words[at] >> np.uint64(24) & np.uint64(0xFFFF)).astype(np.uint16)
+        order = np.argsort(numbers, kind="stable")
+        parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1) if len(order) else []
+        groups = []
+        stamps = np.zeros(len(at), np.int64)
+        for part in parts:
+            subscription = self._subscriptions.get(int(numbers[part[0]]))
+            if subscription is None:
+                self.losses["rows of no topic"] += len(part)
+                continue
+            which = part[self._are_its(subscription, place + at[part])]
+            begin = HEAD_BYTES + _NUMBER_BYTES + subscription.layout.stamp
+            stamps[which] = words[at[which] + begin].astype(np.int64)
+            groups.append((subscription, which))
+        timed = (stamps != 0) & (np.abs(stamps - self.start_us) < _MONTH_US)
+        time_us = self._times(at, stamps, timed)
+        # The latest stamp so far, before every row and at the end.
+        reached_us = np.maximum.accumulate(np.append(self._last_us, np.where(timed, stamps, 0)))
+        rows = []
+        for subscription, which in groups:
+            has_stamp = stamps[which] != 0
+            kept = which[timed[which] | ~has_stamp]
+            self.losses["rows whose stamp is a month from the log's begin"] += len(which) - len(kept)
+            key = (subscription.topic, subscription.instance)
+            self.rows[key] += len(kept)
+            if is_wanted(subscription.topic) and len(kept):
+                values = _gathered(
+                    data, at[kept] + HEAD_BYTES + _NUMBER_BYTES, subscription.layout.dtype
+                )
+                rows.append(Rows(*key, values, time_us[kept], int((~has_stamp).sum())))
+        for position, kind, body in others:
+            self._take(kind, body, int(reached_us[np.searchsorted(at, position)]))
+        self._last_us = int(reached_us[-1])
+        return min(found.end, cut), found.is_broken or cut < _NEVER, rows
+
+    def _up_to_damage(
+        self, at: NDArray[np.int64], words: NDArray[np.uint64]
+    ) -> tuple[NDArray[np.int64], int]:
+        """The rows before the first of a length that is not its format's, and where that begins."""
+        lengths = (words[at] & np.uint64(0xFFFF)).astype(np.int64) - _NUMBER_BYTES
+        numbers = (words[at] >> np.uint64(24) & np.uint64(0xFFFF)).astype(np.int64)
+        least, most = np.zeros(1 << 16, np.int64), np.full(1 << 16, 1 << 16)
+        for number, subscription in self._subscriptions.items():
+            least[number] = subscription.layout.dtype.itemsize
+            most[number] = subscription.layout.most_bytes
+        wrong = np.flatnonzero((lengths < least[numbers]) | (lengths > most[numbers]))
+        if not len(wrong):
+            return at, _NEVER
+        self.losses["rows of a length that is not their format's"] += 1
+        return at[: wrong[0]], int(at[wrong[0]])
+
+    def _are_its(self, subscription: "_Subscription", position: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which rows (n,) of a number are its topic's; the others are counted."""
+        is_its = (subscription.since <= position) & (position < subscription.until)
+        self.losses["rows of a number that two topics have"] += int((~is_its).sum())
+        return is_its
+
+    def _times(
+        self, at: NDArray[np.int64], stamps: NDArray[np.int64], timed: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """The stamps (n,) of rows, of those without one between their neighbours' in the file."""
+        if timed.all():
+            return stamps
+        last_us = self._last_us
+        # Of a topic that stands still the stamp may be of long before.
+        recent = np.flatnonzero(timed & (stamps >= last_us - _RECENT_US))
+        known = np.concatenate([[0], stamps[recent] - last_us])
+        between = np.interp(at, np.concatenate([[-1], at[recent]]), known)
+        return np.where(timed, stamps, last_us + np.rint(between).astype(np.int64))
+
+    def _subscribe(self, body: bytes, position: int) -> None:
+        """Take up which topic a number is of."""
+        if len(body) < 4:
+            self.losses["subscriptions that are too short"] += 1
+            return
+        instance, number = struct.unpack("<BH", body[:3])
+        topic = _text(body[3:])
+        known = self._subscriptions.get(number)
+        if known is not None:
+            if (known.topic, known.instance) != (topic, instance):
+                self._subscriptions[number] = known._replace(until=min(known.until, position))
+                self.losses[f"number of {known.topic} that {topic} has too"] += 1
+            return
+        try:
+            layout = layout_of(topic, self._formats)
+        except Damaged as why:
+            self.losses[str(why)] += 1
+            return
+        self._subscriptions[number] = _Subscription(topic, instance, layout, position)
+
+    def _take(self, kind: str, body: bytes, time_us: int) -> None:
+        """Take up a message of the data that is no row."""
+        try:
+            if kind == "P":
+                self.changes.append((time_us, *_parameter(body)))
+            elif kind == "O" and len(body) == 2:
+                self.dropouts.append((time_us, 1000 * int.from_bytes(body, "little")))
+            elif kind in "LC":
+                begin = 1 if kind == "L" else 3
+                level = body[0] - ord("0")
+                stamp = int.from_bytes(body[begin : begin + 8], "little")
+                if not 0 <= level < len(_LEVELS) or abs(stamp - self.start_us) > _MONTH_US:
+                    raise Damaged("text that cannot be read")
+                self.texts.append(Text(stamp, _LEVELS[level], _text(body[begin + 8 :])))
+            elif kind == "Q":
+                name, value = _parameter(body[1:])
+                self.defaults[name] = value
+            elif kind not in "AIMSR":
+                raise Damaged("messages of a type that is not known")
+        except Damaged as why:
+            self.losses[str(why)] += 1
+
+
+def _message(data: NDArray[np.uint8], position: int) -> tuple[str, bytes]:
+    """Type and content of a message."""
+    size = int(data[position]) + (int(data[position + 1]) << 8)
+    begin = position + HEAD_BYTES
+    return chr(data[position + 2]), data[begin : begin + size].tobytes()
+
+
+def _gathered(data: NDArray[np.uint8], begins: NDArray[np.int64], dtype: np.dtype) -> NDArray:
+    """The rows (n,) of a layout that begin at these bytes."""
+    count = len(data) - dtype.itemsize + 1
+    # As bytes, which NumPy copies several times faster than fields.
+    every = np.ndarray((count,), f"V{dtype.itemsize}", data.data, strides=(1,))
+    return every[begins].view(dtype)
+
+
+def _text(body: bytes) -> str:
+    return body.decode("utf-8", "replace")
+
+
+def _keyed(body: bytes) -> tuple[str, bytes]:
+    """Type and name of a value, with a blank between them, and its bytes; raises Damaged."""
+    if not body or len(body) < 1 + body[0]:
+        raise Damaged("value without a name")
+    return _text(body[1 : 1 + body[0]]), body[1 + body[0] :]
+
+
+def _parameter(body: bytes) -> tuple[str, float]:
+    """Name and value of a parameter; raises Damaged."""
+    stated, value = _keyed(body)
+    kind, _, name = stated.partition(" ")
+    number = _number(kind, value) if kind in ("int32_t", "float") and name.isprintable() else None
+    if not name or number is None:
+        raise Damaged("parameter that cannot be read")
+    return name, number
+
+
+def _number(kind: str, value: bytes) -> float | None:
+    """A number of one of ULog's types; None where there is none."""
+    dtype = np.dtype(TYPES[kind]) if kind in TYPES else None
+    if dtype is None or len(value) != dtype.itemsize:
+        return None
+    return np.frombuffer(value, dtype)[0].item()

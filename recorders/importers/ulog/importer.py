@@ -1,0 +1,206 @@
+"""The importer of ULog: topics become streams, and what is not taken is told."""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput, some_of
+from recorders.importers.mapping import not_finite
+from recorders.importers.ulog.estimator import TOPICS, Autopilot
+from recorders.importers.ulog.file import UlogFile
+from recorders.importers.ulog.sensors import BODY, SENSORS, Fields, Part
+from recorders.importers.ulog.settings import carried, stated_noise
+from recorders.log import Stream, make_stream, schemas
+from recorders.log.planes import Origin, in_plane
+from recorders.parameters import Parameters
+from recorders.recording import Blocks, Importer
+
+_PLACED = ("vehicle_local_position", "vehicle_gps_position", "sensor_gps")
+
+
+class UlogParameters(Parameters):
+    """Nothing is chosen: all that can be imported is."""
+
+
+class _Surroundings(NamedTuple):
+    """The origin of the filter's plane on the earth; None where the log states none."""
+
+    origin: Origin | None
+
+
+def _surroundings(path: Path) -> _Surroundings:
+    """Read a log up to where its filter says where it is."""
+    separation_m = 0.0
+    for block in UlogFile(path).blocks(lambda topic: topic in _PLACED):
+        for rows in sorted(block, key=lambda each: each.topic != "vehicle_gps_position"):
+            fields = Fields(rows)
+            if fields.has("alt_ellipsoid"):
+                separation_m = 1e-3 * float((fields.of("alt_ellipsoid") - fields.of("alt"))[-1])
+            elif fields.has("altitude_ellipsoid_m"):
+                above = fields.of("altitude_ellipsoid_m") - fields.of("altitude_msl_m")
+                separation_m = float(above[-1])
+            elif fields.has("ref_lat"):
+                known = np.flatnonzero((fields.of("xy_global") > 0) & (fields.of("ref_timestamp") > 0))
+                if len(known):
+                    place = fields.vector("ref_lat", "ref_lon", "ref_alt")[known[0]].tolist()
+                    place[2] += separation_m
+                    if np.isfinite(place).all() and abs(place[0]) <= 90 and abs(place[1]) <= 180:
+                        return _Surroundings(Origin(*place))
+    return _Surroundings(None)
+
+
+class _Import:
+    """The import of one file: its streams, block after block, and what is to be told."""
+
+    def __init__(self, file: UlogFile, origin: Origin | None) -> None:
+        self._file, self._origin = file, origin
+        self._autopilot = Autopilot()
+        self._noise = stated_noise(file.parameters)
+        self._told: Counter[str] = Counter()
+        self._first_ns: int | None = None
+
+    def block(self, rows: list) -> list[Stream]:
+        """The streams of a block's rows."""
+        parts: list[Part] = []
+        for each in rows:
+            if each.untimed:
+                said = f"{each.topic}: rows without a stamp, timed by their neighbours in the file"
+                self._told[said] += each.untimed
+            if each.topic not in SENSORS:
+                continue
+            try:
+                parts += SENSORS[each.topic](Fields(each))
+            except (KeyError, ValueError) as error:
+                self._told[f"{each.topic}: rows whose fields are others ({error})"] += len(each.data)
+        parts += self._autopilot.parts([each for each in rows if each.topic in TOPICS])
+        return [stream for part in parts if (stream := self._stream(part)) is not None]
+
+    def _stream(self, part: Part) -> Stream | None:
+        for reason, count in part.left_out.items():
+            self._told[f"{part.topic}: left out {reason}"] += count
+        if not len(part.time_us):
+            return None
+        bad = not_finite(part.schema, dict(part.columns)) | (part.time_us < 0)
+        self._told[f"{part.topic}: left out, NaN or infinite"] += int(bad.sum())
+        kept = part.take(np.flatnonzero(~bad)[np.argsort(part.time_us[~bad], kind="stable")])
+        if not len(kept.time_us):
+            return None
+        published = 1000 * kept.time_us
+        first_ns = int(published[0])
+        self._first_ns = first_ns if self._first_ns is None else min(self._first_ns, first_ns)
+        stream = make_stream(
+            part.topic,
+            part.schema,
+            published,
+            log_time_ns=1000 * kept.logged_us,
+            metadata={**part.metadata, **self._noise.get(part.topic.rpartition("/")[2], {})},
+            **kept.columns,
+        )
+        return in_plane(stream, self._origin)
+
+    def last(self) -> list[Stream]:
+        """The streams that are whole only at the end: parameters, and what the logger lost."""
+        file = self._file
+        streams = []
+        if file.parameters:
+            names = list(file.parameters)
+            values = [list(file.parameters.values())]
+            times = [file.start_us]
+            for time_us, name, value in file.changes:
+                if name in file.parameters:
+                    values.append(
+                        [
+                            value if each == name else old
+                            for each, old in zip(names, values[-1], strict=True)
+                        ]
+                    )
+                    times.append(max(time_us, times[-1]))
+            metadata = {"components": ",".join(names), "kinds": ",".join(["linear"] * len(names))}
+            streams.append(
+                make_stream(
+                    f"{BODY}/parameters",
+                    schemas.VECTOR_MEASUREMENT,
+                    1000 * np.array(times),
+                    metadata=metadata,
+                    value=np.array(values),
+                )
+            )
+        if file.dropouts:
+            begin, length = np.array(file.dropouts, np.int64).T
+            streams.append(
+                make_stream(
+                    f"{BODY}/dropouts", schemas.OUTAGE, 1000 * begin, end_time_ns=1000 * (begin + length)
+                )
+            )
+        return streams
+
+    @property
+    def epoch_ns(self) -> int:
+        """The first stamp."""
+        return self._first_ns or 0
+
+    def check(self) -> None:
+        """Raise BadInput where nothing has come of the file."""
+        if self._first_ns is None:
+            topics = some_of(sorted({topic for topic, _ in self._file.rows})) or "none"
+            raise BadInput(
+                f"{self._file.path}: none of its topics can be imported; it has {topics}: log "
+                "sensor_combined, vehicle_gps_position and estimator_states"
+            )
+
+    def notes(self) -> dict[str, str]:
+        """What the file had, by subject."""
+        file = self._file
+        notes = {
+            "frames": "north, east, down became east, north, up; forward, right, down became forward, "
+            "left, up",
+            "parameters": f"{len(file.parameters)}, {len(file.changes)} changes; in {BODY}/parameters",
+        }
+        notes |= {key: file.info[key] for key in ("sys_name", "ver_hw", "ver_sw") if key in file.info}
+        notes |= carried(file.parameters)
+        for number, text in enumerate(file.texts, start=1):
+            notes[f"text {number}, {text.time_us * 1e-6:.3f} s, {text.level}"] = text.text
+        for what, count in (+self._told).items():
+            notes[what] = str(count)
+        for what, count in (+file.losses).items():
+            notes[f"lost, {what}"] = str(count)
+        taken = {*SENSORS, *TOPICS}
+        rest = Counter({topic: 0 for topic, _ in file.rows if topic not in taken})
+        for (topic, _), count in file.rows.items():
+            if topic in rest:
+                rest[topic] += count
+        if rest:
+            named = some_of([f"{topic} ({count})" for topic, count in sorted(rest.items())])
+            notes["not taken"] = named
+        return notes
+
+
+def read(path: Path, parameters: UlogParameters) -> Blocks:  # noqa: ARG001
+    """Read a ULog block by block; what is lost, left out or not taken is told in the notes.
+
+    The blocks raise BadInput where the file is no ULog, its definitions are damaged, or nothing of it
+    can be imported.
+    """
+    if path.is_dir():
+        raise BadInput(f"{path}: is a folder; give one .ulg file")
+    found = Blocks(iter(()))
+    found.blocks = _blocks(path, found)
+    return found
+
+
+def _blocks(path: Path, told: Blocks) -> Iterator[list[Stream]]:
+    origin = _surroundings(path).origin
+    file = UlogFile(path)
+    work = _Import(file, origin)
+    for rows in file.blocks(lambda topic: topic in SENSORS or topic in TOPICS):
+        yield work.block(rows)
+    work.check()
+    yield work.last()
+    told.notes.update(work.notes())
+    told.epoch_ns = work.epoch_ns
+
+
+ULOG = Importer("ULog, the logs of PX4 autopilots: a .ulg file", UlogParameters, read)

@@ -1,0 +1,254 @@
+"""What becomes of the topics of sensors: one function for each, which makes parts of their rows."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recorders.importers.ulog.file import Rows
+from recorders.importers.ulog.frames import to_enu, to_flu
+from recorders.log import Schema, schemas
+
+Floats = NDArray[np.float64]
+BODY = "/vehicle"
+_GAUSS_UT = 100.0
+# A time that is not known, as PX4 has it in microseconds relative to the stamp.
+_INVALID_US = 2**31 - 1
+
+
+@dataclass(frozen=True)
+class Part:
+    """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
+
+    Rows where a required number is not finite are left out by whoever makes the stream; `left_out`
+    counts others by reason.
+    """
+
+    topic: str
+    schema: Schema
+    time_us: NDArray[np.int64]
+    logged_us: NDArray[np.int64]
+    columns: Mapping[str, NDArray]
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, int] = field(default_factory=dict)
+
+    def take(self, which: NDArray) -> "Part":
+        """The messages of some rows."""
+        columns = {name: column[which] for name, column in self.columns.items()}
+        return Part(
+            self.topic, self.schema, self.time_us[which], self.logged_us[which], columns, self.metadata,
+            self.left_out,
+        )  # fmt: skip
+
+
+class Fields(NamedTuple):
+    """The fields of a topic's rows, as numbers."""
+
+    rows: Rows
+
+    def has(self, name: str) -> bool:
+        """Whether there is such a field."""
+        return name in (self.rows.data.dtype.names or ())
+
+    def of(self, name: str) -> Floats:
+        """A field (n,); NaN where there is none of the name."""
+        if not self.has(name):
+            return np.full(len(self.rows.data), np.nan)
+        return self.rows.data[name].astype(float)
+
+    def vector(self, *names: str, width: int = 0) -> Floats:
+        """Fields as (n, width): those of these names, or the `width` of an array."""
+        every = [f"{names[0]}[{index}]" for index in range(width)] if width else names
+        return np.stack([self.of(name) for name in every], axis=1)
+
+    @property
+    def measured_us(self) -> NDArray[np.int64]:
+        """When the rows were measured: by the sample's stamp where there is one, else by the row's."""
+        if not self.has("timestamp_sample"):
+            return self.rows.time_us
+        sample = self.rows.data["timestamp_sample"].astype(np.int64)
+        near = np.abs(sample - self.rows.time_us) < 10_000_000
+        return np.where(near & (sample > 0), sample, self.rows.time_us)
+
+    def part(
+        self, topic: str, schema: Schema, metadata: Mapping[str, str] | None = None, **columns: Floats
+    ) -> Part:
+        """All rows as messages of a stream."""
+        return Part(
+            f"{BODY}/{topic}", schema, self.measured_us, self.rows.time_us, columns, metadata or {}
+        )
+
+    def values(self, topic: str, components: Mapping[str, str]) -> Part:
+        """Fields as they are, under names that say their units."""
+        there = {name: of for name, of in components.items() if self.has(of)}
+        metadata = {"components": ",".join(there), "kinds": ",".join(["linear"] * len(there))}
+        value = self.vector(*there.values())
+        return self.part(topic, schemas.VECTOR_MEASUREMENT, metadata, value=value)
+
+
+def combined(fields: Fields) -> Iterator[Part]:
+    """The inertial unit that the filter uses; of old firmware also magnetometer and barometer."""
+    force = to_flu(fields.vector("accelerometer_m_s2", width=3))
+    rate = to_flu(fields.vector("gyro_rad", width=3))
+    yield _inertial(fields, "inertial", force, rate)
+    if fields.has("magnetometer_ga[0]"):
+        field_ut = _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
+        yield _at_own_time(fields, "magnetometer", _magnetic(fields, "magnetometer", field_ut))
+    if fields.has("baro_alt_meter"):
+        yield _at_own_time(fields, "baro", fields.values("barometer", {"altitude_m": "baro_alt_meter"}))
+
+
+def _inertial(fields: Fields, topic: str, force: Floats, rate: Floats) -> Part:
+    none = np.full((len(force), 3), np.nan)
+    return fields.part(
+        topic,
+        schemas.INERTIAL_SAMPLE,
+        specific_force_mps2=force,
+        turn_rate_radps=rate,
+        magnetic_field_ut=none,
+    )
+
+
+def _magnetic(fields: Fields, topic: str, field_ut: Floats) -> Part:
+    unknown = np.full((len(field_ut), 9), np.nan)
+    return fields.part(topic, schemas.MAGNETIC_FIELD, magnetic_field_ut=field_ut, covariance_ut2=unknown)
+
+
+def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
+    """The messages of a sensor whose time is stated relative to the row's, each of them once."""
+    relative_us = fields.rows.data[f"{sensor}_timestamp_relative"].astype(np.int64)
+    is_valid = relative_us != _INVALID_US
+    time_us = part.time_us + np.where(is_valid, relative_us, 0)
+    is_new = is_valid & (np.diff(time_us, prepend=-1) != 0)
+    counts = {"without a time": int((~is_valid).sum())}
+    timed = Part(part.topic, part.schema, time_us, part.logged_us, part.columns, part.metadata, counts)
+    return timed.take(is_new)
+
+
+def unit(fields: Fields) -> Iterator[Part]:
+    """One of several inertial units: what it turned and gained, over how long that took."""
+    spans = {}
+    for of in ("angle", "velocity"):
+        span = fields.of(f"delta_{of}_dt")
+        is_us = fields.rows.data.dtype[f"delta_{of}_dt"].kind == "u"
+        spans[of] = (span * 1e-6 if is_us else span)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        force = to_flu(fields.vector("delta_velocity", width=3)) / spans["velocity"]
+        rate = to_flu(fields.vector("delta_angle", width=3)) / spans["angle"]
+    yield _inertial(fields, f"imu_{fields.rows.instance}", force, rate)
+
+
+def accelerometer(fields: Fields) -> Iterator[Part]:
+    """One accelerometer as it is, in its own axes."""
+    names = {f"force_{axis}_mps2": axis for axis in "xyz"}
+    yield fields.values(f"accelerometer_{fields.rows.instance}", names)
+
+
+def gyro(fields: Fields) -> Iterator[Part]:
+    """One gyro as it is, in its own axes."""
+    yield fields.values(f"gyro_{fields.rows.instance}", {f"rate_{axis}_radps": axis for axis in "xyz"})
+
+
+def magnetometer(fields: Fields) -> Iterator[Part]:
+    """The magnetometer that the filter uses, under a name by which no model takes it unasked.
+
+    A model needs to be told the field of the place: `--set topics.magnetic_field=/vehicle/magnetometer`.
+    """
+    yield _magnetic(
+        fields, "magnetometer", _GAUSS_UT * to_flu(fields.vector("magnetometer_ga", width=3))
+    )
+
+
+def raw_magnetometer(fields: Fields) -> Iterator[Part]:
+    """One magnetometer."""
+    field_ut = _GAUSS_UT * to_flu(fields.vector("x", "y", "z"))
+    yield _magnetic(fields, f"magnetometer_{fields.rows.instance}", field_ut)
+
+
+def gnss(fields: Fields) -> Iterator[Part]:
+    """A receiver's position and velocity; eph, epv and s_variance_m_s are standard deviations."""
+    if fields.has("latitude_deg"):
+        place = fields.vector("latitude_deg", "longitude_deg", "altitude_ellipsoid_m")
+    else:
+        place = fields.vector("lat", "lon", "alt_ellipsoid") * [1e-7, 1e-7, 1e-3]
+    # Old firmware leaves the height above the ellipsoid empty.
+    above_sea = fields.of("altitude_msl_m") if fields.has("altitude_msl_m") else 1e-3 * fields.of("alt")
+    place[:, 2] = np.where(place[:, 2] == 0.0, above_sea, place[:, 2])
+    own = fields.rows.topic == "vehicle_gps_position"
+    name = "{}" if own else f"{{}}_{fields.rows.instance}"
+    has_fix = fields.of("fix_type") >= 3
+    horizontal, vertical, speed = (fields.of(each) ** 2 for each in ("eph", "epv", "s_variance_m_s"))
+    without = {"without a fix": int((~has_fix).sum())}
+    fix = fields.part(
+        name.format("fix"),
+        schemas.GEODETIC_FIX,
+        latitude_deg=place[:, 0],
+        longitude_deg=place[:, 1],
+        altitude_m=place[:, 2],
+        covariance_m2=np.stack([horizontal, horizontal, vertical], axis=1),
+    )
+    yield Part(**{**vars(fix), "left_out": without}).take(has_fix)
+    is_valid = has_fix & (fields.of("vel_ned_valid") != 0)
+    velocity = to_enu(fields.vector("vel_n_m_s", "vel_e_m_s", "vel_d_m_s"))
+    covariance = speed[:, None] * np.eye(3).ravel()
+    yield fields.part(
+        name.format("velocity"), schemas.VELOCITY_FIX, velocity_mps=velocity, covariance_m2ps2=covariance
+    ).take(is_valid)
+
+
+def air(fields: Fields) -> Iterator[Part]:
+    """The barometer that the filter uses: its height in the standard atmosphere."""
+    yield fields.values(
+        "barometer",
+        {"altitude_m": "baro_alt_meter", "pressure_pa": "baro_pressure_pa",
+         "temperature_degc": "baro_temp_celcius"},
+    )  # fmt: skip
+
+
+def barometer(fields: Fields) -> Iterator[Part]:
+    """One barometer; its pressure is in Pa, of old firmware in hPa."""
+    names = {"pressure": "pressure", "temperature_degc": "temperature"}
+    yield fields.values(f"barometer_{fields.rows.instance}", names)
+
+
+def airspeed(fields: Fields) -> Iterator[Part]:
+    """The speed through the air."""
+    names = {"indicated_mps": "indicated_airspeed_m_s", "true_mps": "true_airspeed_m_s"}
+    yield fields.values(f"airspeed_{fields.rows.instance}", names)
+
+
+def flow(fields: Fields) -> Iterator[Part]:
+    """The angle by which a camera saw the ground move, about the body's x and y, and over how long."""
+    old = fields.has("pixel_flow_x_integral")
+    x, y = (
+        ("pixel_flow_x_integral", "pixel_flow_y_integral") if old else ("pixel_flow[0]", "pixel_flow[1]")
+    )
+    span = "integration_timespan" if old else "integration_timespan_us"
+    names = {"flow_x_rad": x, "flow_y_rad": y, "span_us": span, "quality": "quality"}
+    yield fields.values(f"flow_{fields.rows.instance}", names)
+
+
+def distance(fields: Fields) -> Iterator[Part]:
+    """The range of a distance sensor."""
+    names = {"distance_m": "current_distance", "variance_m2": "variance"}
+    yield fields.values(f"distance_{fields.rows.instance}", names)
+
+
+SENSORS: dict[str, Callable[[Fields], Iterator[Part]]] = {
+    "sensor_combined": combined,
+    "vehicle_imu": unit,
+    "sensor_accel": accelerometer,
+    "sensor_gyro": gyro,
+    "vehicle_magnetometer": magnetometer,
+    "sensor_mag": raw_magnetometer,
+    "vehicle_gps_position": gnss,
+    "sensor_gps": gnss,
+    "vehicle_air_data": air,
+    "sensor_baro": barometer,
+    "airspeed": airspeed,
+    "sensor_optical_flow": flow,
+    "optical_flow": flow,
+    "distance_sensor": distance,
+}

@@ -1,0 +1,244 @@
+"""ULog: what pyulog reads too, the sheet's numbers, EKF2 as an estimator, and damage."""
+
+import re
+import struct
+import tarfile
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyulog import ULog
+
+from recorders.errors import BadInput
+from recorders.importers.ulog.file import MAGIC, UlogFile
+from recorders.importers.ulog.importer import ULOG, UlogParameters
+from recorders.models.orientation import rotate
+
+# Of the sheet, section 6: streams, rows, changed parameters, defaults, texts, dropouts and their ms.
+FILES = {
+    "sample": (15, 64542, 2516782253, 6, 0, 4, 4, 119),
+    "sample_appended_multiple": (20, 6852, 2525081892, 0, 0, 1, 0, 0),
+    "sample_log_small": (70, 14604, 591159555.1, 0, 0, 3, 1, 30),
+    "sample_logging_tagged_and_default_params": (96, 21229, 608626555.2, 0, 44, 7, 0, 0),
+    "sample_px4_events": (69, 29480, 1283080374, 0, 62, 18, 0, 0),
+}
+GYRO_SUMS = {
+    "sample": (-3.158471702941, -52.665881052214, -103.921215853254),
+    "sample_log_small": (5.786301962234, 0.40459157813, 1.310431911354),
+}
+TAGGED = "sample_logging_tagged_and_default_params"
+
+
+@pytest.fixture(scope="module")
+def logs(real_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ulog")
+    with tarfile.open(real_data / "sensors" / "sensors-data.tar.xz") as archive:
+        archive.extractall(folder, filter="data")
+    return folder / "ulog"
+
+
+def columns_of(file: UlogFile) -> dict:
+    parts = defaultdict(list)
+    for block in file.blocks(bool):
+        for rows in block:
+            parts[rows.topic, rows.instance].append(rows.data)
+    return {key: np.concatenate(each) for key, each in parts.items()}
+
+
+def streams_of(path: Path) -> dict:
+    return {stream.topic: stream for stream in ULOG.read(path, UlogParameters()).together().streams}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_column_is_that_of_pyulog_and_the_counts_are_the_sheets(logs: Path, name: str):
+    file, peer = UlogFile(logs / f"{name}.ulg"), ULog(str(logs / f"{name}.ulg"))
+    columns = columns_of(file)
+    assert columns.keys() == {(each.name, each.multi_id) for each in peer.data_list}
+    for each in peer.data_list:
+        own = columns[each.name, each.multi_id]
+        assert list(own.dtype.names) == list(each.data)
+        for field, values in each.data.items():
+            np.testing.assert_array_equal(own[field], values)
+    assert file.parameters == peer.initial_parameters
+    assert file.changes == peer.changed_parameters
+    assert file.dropouts == [(each.timestamp, 1000 * each.duration) for each in peer.dropouts]
+    assert not +file.losses
+    found = (
+        len(columns), sum(map(len, columns.values())), sum(file.parameters.values()), len(file.changes),
+        len(file.defaults), len(file.texts), len(file.dropouts),
+        sum(length for _, length in file.dropouts) // 1000,
+    )  # fmt: skip
+    assert found == pytest.approx(FILES[name], rel=1e-9)
+
+
+@pytest.mark.parametrize("name", GYRO_SUMS)
+def test_inertial_samples_have_the_sheets_sums_in_our_axes(logs: Path, name: str):
+    inertial = streams_of(logs / f"{name}.ulg")["/vehicle/inertial"]
+    sums = inertial["turn_rate_radps"].sum(axis=0) * [1.0, -1.0, -1.0]
+    np.testing.assert_allclose(sums, GYRO_SUMS[name], rtol=1e-9)
+    assert inertial["specific_force_mps2"][:, 2].mean() > 9.5
+
+
+def test_the_filters_state_is_an_estimate_near_the_simulators_truth(logs: Path):
+    """The sheet's comparison: the orientation errs by .23 deg on average, the position by 1 cm."""
+    streams = streams_of(logs / f"{TAGGED}.ulg")
+    estimate, truth = streams["/estimates/ekf2/vehicle/state"], streams["/vehicle/truth"]
+    late = estimate.publish_time_ns > 5e9
+    at = np.stack(
+        [np.interp(estimate.publish_time_ns, truth.publish_time_ns, each) for each in truth["state"].T],
+        1,
+    )[late]
+    error = estimate["mean"][late] - at
+    assert np.sqrt((error[:, :3] ** 2).mean(axis=0)) == pytest.approx([0.011, 0.011, 0.007], abs=0.004)
+    half = np.abs((estimate["mean"][late, 6:] * at[:, 6:]).sum(axis=1)).clip(max=1.0)
+    assert np.degrees(2 * np.arccos(half)).mean() == pytest.approx(0.2261, abs=0.02)
+    up = rotate(at[:, 6:], [0.0, 0.0, 1.0])
+    assert up[:, 2].min() > 0.99  # it stands upright
+    covariance = estimate["covariance"].reshape(-1, 9, 9)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+
+
+def test_innovations_are_new_ones_of_sensors_that_were_fused(logs: Path):
+    streams = streams_of(logs / f"{TAGGED}.ulg")
+    found = {topic.split("/")[4] for topic in streams if topic.startswith("/estimates/ekf2/v")}
+    assert found == {"barometer", "gnss_position", "heading", "state"}
+    stream = streams["/estimates/ekf2/vehicle/gnss_position/innovation"]
+    assert (np.diff(stream["innovation"][:, :2], axis=0) != 0.0).any(axis=1).all()
+    assert np.isnan(stream["innovation"][:, 2]).all()  # the height is the barometer's
+    variance = stream["covariance"].reshape(-1, 3, 3)[:, [0, 1], [0, 1]]
+    nis = (stream["innovation"][:, :2] ** 2 / variance).sum(axis=1)
+    np.testing.assert_allclose(stream["normalised_innovation_squared"], nis)
+
+
+def test_rows_without_a_stamp_lie_between_their_neighbours(logs: Path):
+    blocks = UlogFile(logs / "sample.ulg").blocks("ekf2_innovations".__eq__)
+    found = [rows for block in blocks for rows in block]
+    time_us = np.concatenate([rows.time_us for rows in found])
+    assert sum(rows.untimed for rows in found) == len(time_us) == 3271
+    assert np.ptp(time_us) == pytest.approx(68.9e6, rel=0.02)
+    assert 0 < np.diff(time_us).min() < np.diff(time_us).max() < 100_000
+
+
+# Files by hand.
+
+
+def message(kind: str, body: bytes, size: int | None = None) -> bytes:
+    return struct.pack("<HB", len(body) if size is None else size, ord(kind)) + body
+
+
+def by_hand(*extra: bytes, formats: tuple[str, ...] = (), last: bytes = b"", rows: int = 300) -> bytes:
+    """A log of `sensor_combined`, with more definitions, then messages before its rows."""
+    layout = "sensor_combined:uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"
+    parts = [MAGIC + b"\x01" + struct.pack("<Q", 1_000_000)]
+    parts += [message("F", each.encode()) for each in (layout, *formats)]
+    parts += [message("P", bytes([12]) + b"float SOME_X" + struct.pack("<f", 1.5))]
+    parts += [message("A", struct.pack("<BH", 0, 7) + b"sensor_combined"), *extra]
+    for row in range(rows):
+        values = struct.pack("<HQ6f", 7, 1_000_000 + 4000 * row, row, 2, 3, 0, 0, -9.8)
+        parts.append(message("D", values))
+        if row % 50 == 0:
+            parts.append(message("S", bytes.fromhex("2f731320250cbb12")))
+    return b"".join([*parts, last])
+
+
+def read(path: Path, content: bytes) -> tuple[np.ndarray, dict[str, str]]:
+    """The rows that come of a file, each of them one that was written, and the notes."""
+    path.write_bytes(content)
+    blocks = ULOG.read(path, UlogParameters())
+    stream = next(each for each in blocks.together().streams if each.topic == "/vehicle/inertial")
+    row = np.rint((stream.publish_time_ns / 1000 - 1_000_000) / 4000)
+    return stream["turn_rate_radps"][:, 0] - row, blocks.notes
+
+
+def test_a_log_that_is_cut_gives_what_is_whole(tmp_path: Path):
+    whole = by_hand()
+    for cut in np.unique(np.linspace(0, len(whole), 100).astype(int)):
+        off, said = np.zeros(0), ""
+        try:
+            off, _ = read(tmp_path / "cut.ulg", whole[:cut])
+        except BadInput as error:
+            said = str(error)
+        assert not off.any()
+        assert len(off) or re.fullmatch(rf"{tmp_path}/cut.ulg: [^:]*[;:][^:]*(: log .*)?", said), said
+        begin = whole.index(b"D\x07\x00") - 2
+        assert len(off) >= (cut - begin - 6 * 11) // 37
+    assert len(read(tmp_path / "whole.ulg", whole)[0]) == 300
+
+
+def test_what_flips_in_heads_costs_rows_and_no_wrong_number(tmp_path: Path):
+    """Heads are length and type; numbers have no checksum, so that nobody can know of theirs."""
+    whole = by_hand()
+    begin = whole.index(message("S", bytes.fromhex("2f731320250cbb12")))
+    places = [
+        match.start() for match in re.finditer(b"\x22\x00D\x07\x00", whole) if match.start() > begin
+    ]
+    rng = np.random.default_rng(5)
+    for place in places[::6]:
+        for offset in range(3):
+            content = bytearray(whole)
+            content[place + offset] ^= 1 << int(rng.integers(8))
+            off, notes = read(tmp_path / "flip.ulg", bytes(content))
+            assert not off.any()
+            assert 300 > len(off) >= 240
+            assert any(each.startswith("lost, ") for each in notes)
+
+
+@pytest.mark.parametrize("size", [0, 65535])
+def test_an_impossible_length_costs_no_more_than_up_to_the_next_mark(tmp_path: Path, size: int):
+    off, notes = read(tmp_path / "length.ulg", by_hand(message("D", b"", size=size)))
+    assert not off.any()
+    assert len(off) >= 250
+    assert any(each.startswith("lost, ") for each in notes)
+
+
+@pytest.mark.parametrize(
+    ("formats", "said"),
+    [
+        (("loop:uint64_t timestamp;loop again;",), "lost, format loop refers to itself"),
+        (("loop:uint64_t timestamp;b x;", "b:loop y;"), "lost, format loop refers to itself"),
+        (
+            ("loop:uint64_t timestamp;uint8_t[65535] x;",),
+            "lost, format loop is longer than a message can be",
+        ),
+        (("loop:uint64_t timestamp;none x;",), "lost, format none is not defined"),
+        (("loop:uint64_t timestamp;e[60000] x;", "e:"), "lost, format e has no fields"),
+    ],
+)
+def test_a_format_that_cannot_be_costs_its_own_topic(
+    tmp_path: Path, formats: tuple[str, ...], said: str
+):
+    subscribed = message("A", struct.pack("<BH", 0, 9) + b"loop")
+    off, notes = read(tmp_path / "format.ulg", by_hand(subscribed, formats=formats))
+    assert len(off) == 300
+    assert not off.any()
+    assert notes[said] == "1"
+
+
+def test_a_number_that_two_topics_have_gives_rows_of_the_first_until_then(tmp_path: Path):
+    other = "other:uint64_t timestamp;float[6] x;"
+    again = message("A", struct.pack("<BH", 0, 7) + b"sensor_combined")
+    off, _ = read(tmp_path / "same.ulg", by_hand(again))
+    assert len(off) == 300
+    content = by_hand(formats=(other,), last=message("A", struct.pack("<BH", 0, 7) + b"other"))
+    foreign = message("D", struct.pack("<HQ6f", 7, 2_000_000, *range(6)))
+    off, notes = read(tmp_path / "twice.ulg", content + foreign)
+    assert len(off) == 300
+    assert not off.any()
+    assert notes["lost, number of sensor_combined that other has too"] == "1"
+
+
+@pytest.mark.parametrize("content", [b"", b"no ULog at all", MAGIC], ids=["empty", "magic", "short"])
+def test_what_is_no_ulog_is_refused_in_a_sentence(tmp_path: Path, content: bytes):
+    with pytest.raises(BadInput, match=r"bad\.ulg: is (empty|no ULog); give a \.ulg file of PX4"):
+        read(tmp_path / "bad.ulg", content)
+
+
+def test_a_parameter_that_changes_is_no_value_from_the_start(tmp_path: Path):
+    change = message("P", bytes([12]) + b"float SOME_X" + struct.pack("<f", 2.5))
+    path = tmp_path / "change.ulg"
+    path.write_bytes(by_hand(last=change))
+    stream = streams_of(path)["/vehicle/parameters"]
+    assert stream.components == ["SOME_X"]
+    assert stream["value"].ravel().tolist() == [1.5, 2.5]
+    assert stream.publish_time_ns[1] == 1000 * (1_000_000 + 299 * 4000)
