@@ -90,7 +90,7 @@ DRAWN = [
         "pipeline/output/report/__init__.py",
         "names = distinct_names(results, folders)",
         "names = [result.experiment for result in results]",
-        "tests/pipeline/test_alarms.py tests/pipeline/test_command_line.py tests/pipeline/test_python.py",
+        "tests/pipeline/test_report.py",
     ),
     Fault(
         "pipeline/output/report/verdict.py",
