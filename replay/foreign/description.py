@@ -62,8 +62,8 @@ class TopicRead(_Part):
     @classmethod
     def _are_fields(cls, fields: tuple[str, ...]) -> tuple[str, ...]:
         for field in fields:
-            name, _, size = field.partition("[")
-            if not name or (size and not (size.endswith("]") and size[:-1].isdecimal())):
+            name, bracket, size = field.partition("[")
+            if not name or (bracket and not (size.endswith("]") and size[:-1].isdecimal())):
                 raise ValueError(f"'{field}' is no field; name it, or name[SIZE] for a vector")
         return fields
 

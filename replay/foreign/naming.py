@@ -33,6 +33,8 @@ def shorthand(name: str) -> tuple[str, dict[str, Any]]:
     ('libmine', {'kind': 'lib', 'path': './filters/libmine.so'})
     >>> shorthand("exec:python my.py {log} {out}")[0], shorthand("ekf")
     ('my', ('ekf', {}))
+    >>> shorthand("exec:./mine --at host:80")[1]["command"]
+    './mine --at host:80'
     """
     kind, colon, rest = name.partition(":")
     if not colon or kind not in KINDS:

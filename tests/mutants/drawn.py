@@ -48,7 +48,7 @@ DRAWN = [
         "pipeline/api/catalog.py",
         '["parameter", "default", "unit", "accepts", "meaning"]',
         '["parameter", "unit", "default", "accepts", "meaning"]',
-        "tests/pipeline/test_command_line.py",
+        "tests/words/test_words.py",
     ),
     Fault(
         "pipeline/api/replays.py",
@@ -90,13 +90,13 @@ DRAWN = [
         "pipeline/output/report/__init__.py",
         "names = distinct_names(results, folders)",
         "names = [result.experiment for result in results]",
-        "tests/pipeline/test_alarms.py tests/pipeline/test_command_line.py tests/pipeline/test_python.py",
+        "tests/pipeline/test_report.py",
     ),
     Fault(
         "pipeline/output/report/kinds.py",
         "if len(estimators) > MOST_NAMED:",
         "if len(estimators) >= MOST_NAMED:",
-        "tests/pipeline/test_alarms.py tests/pipeline/test_bad_input.py tests/pipeline/test_python.py",
+        "tests/words/test_words.py",
     ),
     Fault(
         "pipeline/runs/settings.py",
@@ -436,15 +436,15 @@ DRAWN = [
     ),
     Fault(
         "replay/foreign/description.py",
-        "if not name or (size and not",
-        "if name and (size and not",
-        "tests/replay/foreign/test_isolation.py tests/replay/foreign/test_page.py tests/replay/foreign/test_everywhere.py",
+        "if not name or (bracket and not",
+        "if name and (bracket and not",
+        "tests/replay/foreign/test_programs.py",
     ),
     Fault(
         "replay/foreign/files/estimates.py",
         "np.rint(whole * 1e9).astype(np.int64)",
         "(whole * 1e9).astype(np.int64)",
-        "tests/replay/foreign/test_programs.py tests/replay/foreign/test_page.py",
+        "tests/replay/foreign/test_programs.py",
     ),
     Fault(
         "replay/foreign/messages.py",
@@ -456,7 +456,7 @@ DRAWN = [
         "replay/foreign/naming.py",
         'kind, colon, rest = name.partition(":")',
         'kind, colon, rest = name.rpartition(":")',
-        "tests/replay/foreign/test_page.py tests/replay/foreign/test_everywhere.py tests/docs/test_worked_pages.py",
+        "tests/house/test_examples.py",
     ),
     Fault(
         "replay/foreign/native/library.py",
@@ -468,7 +468,7 @@ DRAWN = [
         "replay/foreign/processes/isolation.py",
         "        self._is_over = True\n        for worker in list(self._working):",
         "        for worker in list(self._working):",
-        "tests/replay/foreign/test_page.py tests/replay/foreign/test_library.py tests/replay/foreign/test_everywhere.py",
+        "tests/replay/foreign/test_isolation.py",
     ),
     Fault(
         "replay/foreign/processes/streaming.py",
@@ -480,7 +480,7 @@ DRAWN = [
         "replay/foreign/processes/streaming.py",
         "if frame.body[:1] != letter:",
         "if frame.body[:1] > letter:",
-        "tests/replay/foreign/test_page.py",
+        "tests/replay/foreign/test_programs.py",
     ),
     Fault(
         "replay/inference/association/clusters.py",
@@ -666,13 +666,13 @@ DRAWN = [
         "replay/timeline/drawing/events.py",
         'yield Happened(estimator, "INFO", times[:1], [text])',
         'yield Happened(estimator, "INFO", times[-1:], [text])',
-        "tests/replay/timeline/test_timeline.py",
+        "tests/replay/timeline/test_drawn_sets.py",
     ),
     Fault(
         "replay/timeline/drawing/events.py",
         "if (time_ns, target) in messages]",
         "if (time_ns, 0) in messages]",
-        "tests/replay/timeline/test_set_timelines.py tests/replay/timeline/test_panels.py tests/replay/timeline/test_timeline.py",
+        "tests/replay/timeline/test_drawn.py",
     ),
     Fault(
         "replay/timeline/drawing/thinning.py",
@@ -684,13 +684,13 @@ DRAWN = [
         "replay/timeline/families/acoustic.py",
         "Cone(CONE_SHARE * extent_m, ",
         "Cone(CONE_SHARE, ",
-        "tests/replay/timeline/test_timeline.py",
+        "tests/replay/timeline/test_drawn.py",
     ),
     Fault(
         "replay/timeline/families/biometrics.py",
         'f"{matchers[index].name}: score of each probe"',
         'f"{matchers[0].name}: score of each probe"',
-        "tests/replay/timeline/test_timeline.py tests/pipeline/test_acoustic_studies.py",
+        "tests/replay/timeline/test_drawn_sets.py",
     ),
     Fault(
         "replay/timeline/families/networks.py",
@@ -702,7 +702,7 @@ DRAWN = [
         "replay/timeline/families/vehicles.py",
         "covariance = covariances_of(stream, PLANE)\n    shown = np.abs(apart).max(axis=1)",
         "covariance = covariances_of(stream, PLANE)\n    shown = np.abs(apart).min(axis=1)",
-        "tests/replay/timeline/test_timeline.py",
+        "tests/replay/timeline/test_drawn.py",
     ),
     Fault(
         "replay/timeline/show.py",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from fuselog.testing import assert_golden
+from fuselog.testing import _require, assert_golden
 from pipeline.checking.checking import Checked
 from pipeline.checking.discrepancies import Discrepancy, discrepancies
 from pipeline.checking.golden import Replayed, checksums
@@ -170,6 +170,15 @@ def test_a_third_party_tests_its_own_estimator(
     assert_golden(runs, golden)
     with pytest.raises(AssertionError, match=r"seed 4 /estimates/mine/.* the golden has"):
         assert_golden(runs, golden, {"mine": {"kind": "ekf", "sigma_range_m": 0.2}})
+
+
+def test_a_failed_golden_says_each_of_ten_once(tmp_path: Path) -> None:
+    """The first in the sentence on it, and nine more."""
+    found = [Discrepancy("", f"/{number}", "mean", 1.0, 0.1) for number in range(12)]
+    with pytest.raises(AssertionError) as raised:
+        _require(Checked({}, found, ["the first"]), tmp_path)
+    more = [each.sentence for each in found[1:10]]
+    assert str(raised.value).splitlines() == [f"{tmp_path}:", "the first", *more]
 
 
 def test_bad_input(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) -> None:

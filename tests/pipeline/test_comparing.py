@@ -13,6 +13,7 @@ import pytest
 import rerun.blueprint as rrb
 
 import fuselog as fl
+from pipeline.comparing.candidates import _stored
 from pipeline.comparing.groups import unlike_runs
 from replay.timeline.side_by_side import _alone
 
@@ -231,3 +232,19 @@ def test_the_page(fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "all 430 fields" in told[4].out
     assert (tmp_path / "check.xml").exists()
     assert {path.suffix for path in Path("compared").rglob("*")} >= {".rrd", ".svg", ".csv", ".json"}
+
+
+def test_a_component_that_a_run_lacks_counts_in_the_degrees_of_nees() -> None:
+    """Of the case that has it in any run, and not of a case that has it in none."""
+    rows = pd.DataFrame(
+        {
+            "estimator": "ekf",
+            "estimates": 9,
+            "case": ["a", "a", "b", "b"],
+            "run": [0, 1, 0, 1],
+            "rmse_x_m": [1.0, 2.0, 3.0, 4.0],
+            "rmse_heading_rad": [0.1, np.nan, np.nan, np.nan],
+        }
+    )
+    times = pd.DataFrame({"estimator": ["ekf"]})
+    assert _stored(rows, times, "ekf", "r", {}).sizes == {("nees", "a"): 2.0, ("nees", "b"): 1.0}

@@ -5,8 +5,23 @@ import pytest
 
 from pipeline.output.claims import decide
 from pipeline.runs.experiment import load_experiment
-from pipeline.studies.navigation.imu_grades import Span, horizontal
+from pipeline.studies.navigation.imu_grades import Span, horizontal, outage_of
+from recorders.errors import BadInput
+from recorders.log import RunMetadata
+from replay.engine.streams.sources import MemorySource
 from replay.judging.errors.evaluation import Errors
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_the_study_is_of_one_outage(count: int) -> None:
+    spans = [[10.0 * k, 10.0 * k + 5.0] for k in range(1, count + 1)]
+    run = RunMetadata("navigation", epoch_ns=0, parameters={"gnss": {"outages_s": spans}})
+    source = MemorySource({}, run, "drive")
+    if count == 1:
+        assert outage_of(source) == Span(10.0, 15.0)
+    else:
+        with pytest.raises(BadInput, match=f"{count} outages; give exactly one"):
+            outage_of(source)
 
 
 def test_errors_count_in_the_outage_alone():

@@ -10,7 +10,7 @@ import pytest
 import fuselog as fl
 from pipeline.command_line import main
 from pipeline.runs import experiment
-from pipeline.runs.sweeps import parse_over, points_of
+from pipeline.runs.sweeps import heat_maps, parse_over, points_of
 from recorders.errors import BadInput
 
 SHORT = ["--runs", "4", "--set", "duration_s=3"]
@@ -53,6 +53,7 @@ def test_a_sweep_gives_at_every_point_what_a_run_gives(tmp_path, capsys):
     assert (rmse["low"] <= rmse["value"]).all()
     assert (rmse["value"] <= rmse["high"]).all()
     assert len(rmse) == 4
+    assert rmse[list(point)].to_dict("records") == result["settings"]["sweep"]
     assert (tmp_path / "sweep" / "figures" / "position_rmse_m-robot1.svg").is_file()
     assert not (tmp_path / "sweep.unfinished").exists()
     assert main(["report", str(tmp_path / "sweep"), "--out", str(tmp_path / "sweep.html")]) == 0
@@ -78,6 +79,19 @@ def test_the_door_sweeps_as_the_command_does(tmp_path):
     values = folder.result.metrics["ekf.position_rmse_m.robot1"]
     assert len(values) == 3
     assert all(math.isfinite(value) for value in values)
+    table = pd.read_parquet(out / "tables" / "sweep.parquet")
+    of_point = table.drop_duplicates("point")["ekf.sigma_range_m"]
+    assert of_point.tolist() == pytest.approx(over["ekf.sigma_range_m"])
+
+
+def test_a_heat_map_has_the_first_parameter_upwards_and_a_cross_at_the_least():
+    over = [parse_over("a=1,2"), parse_over("b=1,2,4")]
+    table = pd.DataFrame(points_of(over)).assign(estimator="ekf", value=[6.0, 5.0, 4.0, 3.0, 1.0, 2.0])
+    [axes] = [each for each in heat_maps(table, over, "rmse").axes if each.images and each.lines]
+    assert axes.images[0].get_array().tolist() == [[6.0, 5.0, 4.0], [3.0, 1.0, 2.0]]
+    assert [each.get_text() for each in axes.get_xticklabels()] == ["1", "2", "4"]
+    assert [each.get_text() for each in axes.get_yticklabels()] == ["1", "2"]
+    assert axes.lines[0].get_xydata().tolist() == [[1.0, 1.0]]
 
 
 @pytest.mark.parametrize(

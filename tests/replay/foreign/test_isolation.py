@@ -7,6 +7,7 @@ import fuselog as fl
 from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
+from replay.foreign.processes.isolation import Ended, Workers
 from tests.replay.foreign.conftest import MISBEHAVING, Compile
 
 CRASH, LOOP, LEAK, PRINT, NOT_A_NUMBER, NEGATIVE, FAIL, LEAVE = (float(-each) for each in range(1, 9))
@@ -63,3 +64,10 @@ def test_failures_in_this_process(compile_filter: Compile) -> None:
     for command, estimates in zip(commands, done.estimates, strict=True):
         assert len(estimates["/estimates/mine/failure"]) == bool(RUNS[command])
         assert sum(RUNS[command] in each for each in done.failures) == (1 if RUNS[command] else 3)
+
+
+def test_no_process_is_taken_out_once_they_were_ended() -> None:
+    workers = Workers()
+    workers.end()
+    with pytest.raises(Ended, match="was stopped"), workers.one():
+        pass

@@ -94,7 +94,11 @@ REFUSED = {
         {"VERSION": 2},
         "was compiled with version 2 of fuselog_filter.h; this fuselog has",
     ),
-    "lacks a function": ({"WITHOUT_TAKE": 1}, "lacks the function fuselog_filter_take"),
+    "lacks a function": (
+        {"WITHOUT_TAKE": 1},
+        "lacks the function fuselog_filter_take; it has to export all of fuselog_filter.h but "
+        "fuselog_filter_innovation",
+    ),
     "no JSON": ({"DESCRIPTION": '"\\"{nothing"'}, "its description is no JSON"),
     "no topics": ({"DESCRIPTION": '"{}"'}, "parameter 'description.summary' is missing"),
     "of another log": (

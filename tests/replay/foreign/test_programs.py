@@ -10,6 +10,11 @@ import pytest
 
 import fuselog as fl
 from fuselog import BadInput
+from recorders.log import RunMetadata, make_stream, schemas
+from recorders.recording import Recording
+from replay.engine.streams.sources import memory_source
+from replay.foreign.description import TopicRead
+from replay.foreign.files.estimates import read_estimates
 from replay.foreign.naming import Allowed
 from tests.replay.foreign.conftest import EXAMPLES
 from tests.replay.foreign.test_isolation import AT, MESSAGES, SANE, run_with
@@ -167,6 +172,11 @@ def test_a_program_that_writes_no_estimates(tmp_path: Path, how: str, sentence: 
         fl.replay(log, {"mine": program(python(script, "{log}", "{out}", how, "1"))})
 
 
+def _answer(letter: str) -> str:
+    """A program that sends a frame of this letter and nothing else."""
+    return f"'{sys.executable}' -c 'import os; os.write(1, bytes([1, 0, 0, 0, {ord(letter)}]))'"
+
+
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
@@ -175,9 +185,36 @@ def test_a_program_that_writes_no_estimates(tmp_path: Path, how: str, sentence: 
         ("x {log}", "a program that streams has no places to fill"),
         ("x 'open", "close the quote"),
         (f"'{sys.executable}' -c 'print(12345)'", "wrote '12345' to standard output, which is no frame"),
+        *(
+            (_answer(letter), f"sent a frame b'{letter}' where b'D' was due")
+            for letter in "CE"  # either side of it
+        ),
     ],
 )
 def test_commands_that_cannot_be_used(command: str, sentence: str) -> None:
     with pytest.raises(BadInput) as raised:
         fl.replay(fl.record("landmarks", duration_s=1.0), {"mine": program(command)})
     assert sentence in str(raised.value)
+
+
+@pytest.mark.parametrize("field", ["", "[3]", "x[", "x[3", "x[a]", "x[-1]"])
+def test_a_field_is_a_name_with_a_size_or_without(field: str) -> None:
+    with pytest.raises(ValueError, match=r"is no field; name it, or name\[SIZE\] for a vector"):
+        TopicRead(topic="/x", fields=("y", "z[3]", field))
+
+
+def test_seconds_of_a_table_are_the_nearest_nanoseconds(tmp_path: Path) -> None:
+    """Of a millisecond each, of which floats are now above and now below."""
+    milliseconds = np.arange(2000)
+    path = tmp_path / "estimates.csv"
+    path.write_text("time_s,x_m\n" + "".join(f"{each / 1000},0\n" for each in milliseconds))
+    truth = make_stream(
+        "/truth",
+        schemas.TRUTH_STATE,
+        [0],
+        metadata={"components": "x_m", "kinds": "linear"},
+        state=[[0.0]],
+    )
+    topic = memory_source(Recording([truth]), RunMetadata("own", epoch_ns=0)).topics["/truth"]
+    [read] = read_estimates(path, "mine", topic).values()
+    np.testing.assert_array_equal(read.publish_time_ns, milliseconds * 10**6)

@@ -1,5 +1,6 @@
 """What is drawn of sets, scores, vessels and samples is what streams say; nothing is lost on the way."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -230,6 +231,19 @@ def test_two_stand_side_by_side_above_how_much_farther_off_the_second_is(tmp_pat
         assert roots[0] == "map/robot1"
         assert f"- map/robot1/{other}" in roots
         assert f"- map/robot1/{name}" not in roots
+
+
+def test_where_a_thinned_estimate_begins_it_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("replay.timeline.drawing.events.thin", lambda times: times[::2])
+    source = record("landmarks", duration_s=2.0, landmarks=3)
+    run = drawn(tmp_path, source, of_both(source, "robot1"))
+    for name, stream, _ in run.estimates("robot1"):
+        said = run.picture.moving[f"/events/robot1/{name}"]
+        assert said["sim_time"] == [stream.publish_time_ns[0] - source.epoch_ns]
+        [[text]] = said["TextLog:text"]
+        assert re.search(rf", {name}: drawn at \S+ Hz of \S+ Hz$", text)
 
 
 def test_nothing_is_lost_where_a_block_ends_or_a_number_is_missing(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
@@ -27,10 +27,12 @@ from tests.replay.timeline.test_timeline import read
     st.lists(st.integers(0, 10**6), min_size=1, max_size=200),
     st.lists(st.integers(0, 200), max_size=4),
 )
+@example([*range(0, 10**6, 10**4), *[10**6] * 3, 10**6 + 1, 10**6 + 2], [101])  # cut within a stamp
 def test_what_is_kept_is_the_same_in_any_blocks(stamps: list[int], cuts: list[int]) -> None:
     """At most so many rows, whole stamps, the last one among them."""
     times = np.sort(stamps)
-    stream = make_stream("/x", schemas.VECTOR_MEASUREMENT, times, value=times[:, None].astype(float))
+    value = np.sin(7919.0 * np.arange(len(times)))[:, None]
+    stream = make_stream("/x", schemas.VECTOR_MEASUREMENT, times, value=value)
     whole, parts = thinned_stream("x", 20), thinned_stream("x", 20)
     whole.add(stream)
     for rows in np.split(np.arange(len(times)), sorted(min(cut, len(times)) for cut in cuts)):
