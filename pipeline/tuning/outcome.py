@@ -48,6 +48,9 @@ class SearchOutcome(NamedTuple):
         has_converged, was_stopped: how it ended.
         is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
         begins_alike: whether filters begin with the optimum where they began in the search.
+        held: the parameters of a calibration that stay at their start, for the motion does not
+            determine them.
+        lacks: the sentence that says so.
     """
 
     coordinates: Coordinates
@@ -58,6 +61,8 @@ class SearchOutcome(NamedTuple):
     was_stopped: bool = False
     is_at_edge: bool = False
     begins_alike: bool = True
+    held: Sequence[str] = ()
+    lacks: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -239,17 +244,19 @@ class Tuning:
                     f"{each.name}: no channel states it; the search starts from {each.start:g}, which "
                     f"replay assumes too; --set {each.name}=... sets another start"
                 )
-            if each.is_kept:
+            if each.is_kept and each.name not in found.held:
                 yield (
                     f"{each.name}: the logs determine it not at all; it stays at {each.start:g}, where "
                     "the search began"
                 )
-            elif is_beyond:
+            elif is_beyond and not each.is_kept:
                 side = "lower" if value < each.start else "upper"
                 yield (
                     f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
                     "a wider one, or leave it out of what is searched for"
                 )
+        if found.lacks:
+            yield found.lacks
         if not found.begins_alike:
             yield (
                 "with these values the filter begins elsewhere than in the search that found them, and "
@@ -262,7 +269,7 @@ class Tuning:
                 "other values to start from"
             )
         if found.told is not None:
-            yield from doubts(found.told, free)
+            yield from doubts(found.told, found.coordinates)
 
     def _notes_of_innovations(self) -> Iterator[str]:
         rows = self.whiteness.to_dict("records")

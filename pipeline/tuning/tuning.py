@@ -18,6 +18,7 @@ from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
+from pipeline.tuning.information import in_words, information, undetermined
 from pipeline.tuning.measured import until_last_measured
 from pipeline.tuning.objective import (
     CRITERIA,
@@ -228,13 +229,16 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
             f"--free {name}: its logarithm is searched for, and it starts from {start:g}; give a start "
             f"above zero, --set {name}=..."
         )
+    useful = 0.0
+    if not is_positive and isinstance(bound, Recursive) and bound.reading is not None:
+        useful = bound.reading().calibration.get(name, 0.0)
     low, high = given or ((start / REACH, start * REACH) if is_positive else (least, greatest))
     if not (low < start < high and (low > 0.0 if is_positive else low >= least)):
         raise BadInput(
             f"--bound {name}={low:g}:{high:g}: the search starts from {start:g}, which must lie between"
             f"{' two numbers above zero' if is_positive else ''}; give other bounds, or --set {name}=..."
         )
-    return Free(name, start, low, min(high, greatest), is_positive, is_assumed)
+    return Free(name, start, low, min(high, greatest), is_positive, is_assumed, useful)
 
 
 def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOutcome:
@@ -244,13 +248,31 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
     path between the first fixes, say. That is held during a search, else likelihoods of different
     measurements would be compared; the next search holds where filters begin with the values found.
     """
-    found = _search(objective, free, grid)
+    free, open_ = _held(objective, free)
+    found = _search(objective, free, grid)._replace(**open_)
     for _ in range(ROUNDS - 1):
         if found.was_stopped or objective.begins_alike(found.optimum):
             return found
         objective.begin(found.optimum)
-        found = _search(objective, free, 1, found.coordinates.of(found.optimum))
+        point = found.coordinates.of(found.optimum)
+        found = _search(objective, free, 1, point)._replace(**open_)
     return found._replace(begins_alike=found.was_stopped or objective.begins_alike(found.optimum))
+
+
+def _held(objective: Objective, free: Sequence[Free]) -> tuple[list[Free], dict[str, Any]]:
+    """What of a calibration the motion does not determine is kept at its start, and named."""
+    places = [place for place, each in enumerate(free) if each.useful]
+    if objective.by != "likelihood" or not places:
+        return list(free), {}
+    start = np.array([each.start for each in free])
+    useful = np.array([each.useful for each in free])
+    lacking = undetermined(information(objective, start, useful, places))
+    if not lacking.places:
+        return list(free), {}
+    held = [free[places[place]].name for place in lacking.places]
+    sentence = in_words([free[place].name for place in places], lacking, free)
+    kept = [each.kept if each.name in held else each for each in free]
+    return kept, {"held": held, "lacks": sentence}
 
 
 def _search(
@@ -270,7 +292,7 @@ def _search(
         is_smooth = CRITERIA[objective.by].is_smooth
         point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
         told, is_at_edge = _told(objective, coordinates, point)
-        if told is not None and (places := unknown(told, free)):
+        if told is not None and (places := unknown(told, coordinates)):
             kept = [each.kept if place in places else each for place, each in enumerate(free)]
             nearer = replace(coordinates, free=kept)
             low, high = nearer.bounds
