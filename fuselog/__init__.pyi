@@ -40,6 +40,7 @@ from pipeline.runs.experiment import Experiment as Experiment
 from pipeline.runs.experiment import Setting as Setting
 from pipeline.runs.experiment import Study as Study
 from pipeline.runs.runner import Runner as Runner
+from pipeline.tuning.calibrating import calibrate as calibrate
 from pipeline.tuning.outcome import Tuning as Tuning
 from pipeline.tuning.tuning import tune as tune
 from recorders.errors import BadInput as BadInput

@@ -25,7 +25,7 @@ def fuselog() -> None:
 
 for each in (
     *(recording.record, recording.import_),
-    *(replaying.replay, replaying.tune, replaying.check),
+    *(replaying.replay, replaying.tune, replaying.calibrate, replaying.check),
     *(judging.evaluate, judging.compare, judging.diagnose, judging.observability),
     *(experiments.run, experiments.sweep, experiments.report),
     *(logs.info, logs.view, logs.export, logs.cut, logs.merge, logs.constrain, logs.relabel),

@@ -69,7 +69,11 @@ def unknown(told: Confidence, coordinates: Coordinates) -> list[int]:
     found = []
     for direction, value in _weak(told, coordinates):
         first, *others = _involved(direction)
-        if not others and not coordinates.free[told.places[first]].useful and _factor(value) >= MEANINGLESS:
+        if (
+            not others
+            and not coordinates.free[told.places[first]].useful
+            and _factor(value) >= MEANINGLESS
+        ):
             found.append(told.places[first])
     return found
 

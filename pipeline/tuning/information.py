@@ -45,6 +45,7 @@ def information(objective: Objective, values: Floats, useful: Floats, places: Se
     At values (k,), over all logs. Measurements that one side of a difference lacks tell nothing.
     """
     found = np.zeros((len(places), len(places)))
+    values = values + 2.0 * STEP * useful  # beside a delay of zero, at which stamps are equal
     for run in objective.runs:
         here = _innovations(objective, values, run)
         columns = []
@@ -79,14 +80,17 @@ def undetermined(scaled: Floats) -> Undetermined:
     return Undetermined(eigenvalues, _sparse(spanned.T), np.flatnonzero(share > INVOLVED).tolist())
 
 
-def in_words(names: Sequence[str], open_: Undetermined, free: Sequence[Free]) -> str:
-    """Name what the motion does not determine: parameters (m,) and combinations of them."""
+def in_words(
+    names: Sequence[str], lacking: Undetermined, free: Sequence[Free], held: Sequence[str]
+) -> str:
+    """Name what the motion does not determine: parameters (m,) and combinations of them, and what stays."""
     alone, together = [], []
-    for direction in open_.directions:
-        parts = [names[place] for place in np.argsort(-np.abs(direction)) if abs(direction[place]) > NAMED]
+    for direction in lacking.directions:
+        parts = [
+            names[place] for place in np.argsort(-np.abs(direction)) if abs(direction[place]) > NAMED
+        ]
         (together if len(parts) > 1 else alone).append(" with ".join(parts))
-    held = [each for each in free if each.name in {names[place] for place in open_.places}]
-    stay = ", ".join(f"{each.name} = {each.start:g}" for each in held)
+    stay = ", ".join(f"{each.name} = {each.start:g}" for each in free if each.name in held)
     return (
         f"the motion in the logs does not determine {', '.join([*alone, *together])}: held where they "
         f"started ({stay}), without an interval; record turns in both senses at changing speed"
@@ -103,7 +107,11 @@ def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | No
     A delay changes the order among topics, never within one.
     """
     shape = here["innovation"].shape
-    if ahead is None or behind is None or {ahead["innovation"].shape, behind["innovation"].shape} != {shape}:
+    if (
+        ahead is None
+        or behind is None
+        or {ahead["innovation"].shape, behind["innovation"].shape} != {shape}
+    ):
         return np.zeros(shape).ravel()
     difference = {**here.columns, "innovation": ahead["innovation"] - behind["innovation"]}
     found = whitened(replace(here, columns=difference))

@@ -48,8 +48,7 @@ class SearchOutcome(NamedTuple):
         has_converged, was_stopped: how it ended.
         is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
         begins_alike: whether filters begin with the optimum where they began in the search.
-        held: the parameters of a calibration that stay at their start, for the motion does not
-            determine them.
+        held: parameters of a calibration that the motion does not determine; they stay at their start.
         lacks: the sentence that says so.
     """
 

@@ -248,8 +248,14 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
     path between the first fixes, say. That is held during a search, else likelihoods of different
     measurements would be compared; the next search holds where filters begin with the values found.
     """
-    free, open_ = _held(objective, free)
+    start = np.array([each.start for each in free])
+    free, open_ = _held(objective, free, start)
     found = _search(objective, free, grid)._replace(**open_)
+    if not found.was_stopped:
+        nearer, there = _held(objective, free, found.optimum)
+        if nearer != free:
+            free, open_ = nearer, there
+            found = _search(objective, free, grid)._replace(**open_)
     for _ in range(ROUNDS - 1):
         if found.was_stopped or objective.begins_alike(found.optimum):
             return found
@@ -259,18 +265,27 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
     return found._replace(begins_alike=found.was_stopped or objective.begins_alike(found.optimum))
 
 
-def _held(objective: Objective, free: Sequence[Free]) -> tuple[list[Free], dict[str, Any]]:
-    """What of a calibration the motion does not determine is kept at its start, and named."""
+def _held(
+    objective: Objective, free: Sequence[Free], values: Floats
+) -> tuple[list[Free], dict[str, Any]]:
+    """What of a calibration the motion does not determine, at values (k,), is kept at its start and named.
+
+    Far from the best values innovations are large, so that it is looked at there once more. What was
+    held before stays so.
+    """
     places = [place for place, each in enumerate(free) if each.useful]
     if objective.by != "likelihood" or not places:
         return list(free), {}
-    start = np.array([each.start for each in free])
     useful = np.array([each.useful for each in free])
-    lacking = undetermined(information(objective, start, useful, places))
-    if not lacking.places:
+    lacking = undetermined(information(objective, values, useful, places))
+    held = [
+        free[place].name
+        for number, place in enumerate(places)
+        if number in lacking.places or free[place].is_kept
+    ]
+    if not held:
         return list(free), {}
-    held = [free[places[place]].name for place in lacking.places]
-    sentence = in_words([free[place].name for place in places], lacking, free)
+    sentence = in_words([free[place].name for place in places], lacking, free, held)
     kept = [each.kept if each.name in held else each for each in free]
     return kept, {"held": held, "lacks": sentence}
 
