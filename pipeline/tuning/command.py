@@ -1,4 +1,4 @@
-"""The commands `fuselog tune` and `calibrate`: they print what was found, and write the result folder."""
+"""The commands `fuselog tune` and `calibrate`: they print what was found, and write its folder."""
 
 from collections.abc import Sequence
 from functools import partial

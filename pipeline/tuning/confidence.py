@@ -47,6 +47,34 @@ class Confidence(NamedTuple):
             return self.covariance / np.outer(self.errors, self.errors)
 
 
+class SearchOutcome(NamedTuple):
+    """States where a search ended.
+
+    Attributes:
+        coordinates: what was searched for.
+        optimum: (k,) the values of that at which the cost is least.
+        told: how well the logs tell them; None where the search was no maximum likelihood, was
+            stopped, or ended at bounds alone.
+        evaluations: how many values were tried.
+        has_converged, was_stopped: how it ended.
+        is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
+        begins_alike: whether filters begin with the optimum where they began in the search.
+        held: parameters of a calibration that the motion does not determine; they stay at their start.
+        lacks: the sentence that says so.
+    """
+
+    coordinates: Coordinates
+    optimum: Floats
+    evaluations: int
+    told: Confidence | None = None
+    has_converged: bool = True
+    was_stopped: bool = False
+    is_at_edge: bool = False
+    begins_alike: bool = True
+    held: Sequence[str] = ()
+    lacks: str = ""
+
+
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     """Compute what a curvature (m, m) tells of the parameters at these places."""
     values, vectors = np.linalg.eigh(curvature)

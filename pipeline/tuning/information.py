@@ -30,7 +30,7 @@ class Undetermined(NamedTuple):
 
     Attributes:
         eigenvalues: (m,) of the information in useful units, the least first.
-        directions: (d, m) that are not determined, in useful units, each with as few parameters as can be.
+        directions: (d, m) that are not determined, in useful units, each of few parameters.
         places: of the parameters that take part in these.
     """
 
@@ -40,7 +40,7 @@ class Undetermined(NamedTuple):
 
 
 def information(objective: Objective, values: Floats, useful: Floats, places: Sequence[int]) -> Floats:
-    """The information (m, m) on the parameters at these m of k places, in their useful units (k,).
+    """The information (m, m) on the parameters at m of k places, in their useful units (k,).
 
     At values (k,), over all logs. Measurements that one side of a difference lacks tell nothing.
     """
@@ -83,8 +83,9 @@ def undetermined(scaled: Floats) -> Undetermined:
 def in_words(
     names: Sequence[str], lacking: Undetermined, free: Sequence[Free], held: Sequence[str]
 ) -> str:
-    """Name what the motion does not determine: parameters (m,) and combinations of them, and what stays."""
-    alone, together = [], []
+    """Name what the motion does not determine: parameters (m,), combinations of them; what stays."""
+    alone: list[str] = []
+    together: list[str] = []
     for direction in lacking.directions:
         parts = [
             names[place] for place in np.argsort(-np.abs(direction)) if abs(direction[place]) > NAMED
@@ -123,7 +124,7 @@ def _sparse(directions: Floats) -> Floats:
     rows = directions.copy()
     for number in range(len(rows)):
         rest = np.abs(rows[number:])
-        row, column = np.unravel_index(np.argmax(rest), rest.shape)
+        row, column = divmod(int(np.argmax(rest)), rest.shape[1])
         rows[[number, number + row]] = rows[[number + row, number]]
         rows[number] /= rows[number, column]
         others = np.arange(len(rows)) != number

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,8 @@ from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.output.summary import summarise, summary_table
-from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, profiles
+from pipeline.tuning.confidence import QUANTILE, Profile, SearchOutcome, doubts, profiles
 from pipeline.tuning.objective import Objective, innovations_in
-from pipeline.tuning.search import Coordinates
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
@@ -34,34 +33,6 @@ Source = LogSource | MemorySource
 START, TUNED = "start", "tuned"  # what the estimator is called with either values
 SETTINGS = "settings.toml"
 IMPROBABLE = 1e-3  # of white innovations: they are none
-
-
-class SearchOutcome(NamedTuple):
-    """States where a search ended.
-
-    Attributes:
-        coordinates: what was searched for.
-        optimum: (k,) the values of that at which the cost is least.
-        told: how well the logs tell them; None where the search was no maximum likelihood, was
-            stopped, or ended at bounds alone.
-        evaluations: how many values were tried.
-        has_converged, was_stopped: how it ended.
-        is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
-        begins_alike: whether filters begin with the optimum where they began in the search.
-        held: parameters of a calibration that the motion does not determine; they stay at their start.
-        lacks: the sentence that says so.
-    """
-
-    coordinates: Coordinates
-    optimum: Floats
-    evaluations: int
-    told: Confidence | None = None
-    has_converged: bool = True
-    was_stopped: bool = False
-    is_at_edge: bool = False
-    begins_alike: bool = True
-    held: Sequence[str] = ()
-    lacks: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

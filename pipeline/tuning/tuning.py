@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
-from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
+from pipeline.tuning.confidence import QUANTILE, Confidence, SearchOutcome, confidence, unknown
 from pipeline.tuning.information import in_words, information, undetermined
 from pipeline.tuning.measured import until_last_measured
 from pipeline.tuning.objective import (
@@ -30,7 +30,7 @@ from pipeline.tuning.objective import (
     silent,
     with_values,
 )
-from pipeline.tuning.outcome import START, TUNED, SearchOutcome, Source, Tuning
+from pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from pipeline.tuning.search import (
     Coordinates,
     Free,
@@ -268,7 +268,7 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
 def _held(
     objective: Objective, free: Sequence[Free], values: Floats
 ) -> tuple[list[Free], dict[str, Any]]:
-    """What of a calibration the motion does not determine, at values (k,), is kept at its start and named.
+    """What of a calibration the motion does not determine, at values (k,), is kept at its start.
 
     Far from the best values innovations are large, so that it is looked at there once more. What was
     held before stays so.

@@ -1,5 +1,6 @@
-"""Car C of the sheet of sensors, section 2: wheels, fixes of an antenna, a compass, and what each errs by."""
+"""Car C of the sheet of sensors, section 2: wheels, fixes of an antenna, a compass; each errs."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from recorders.log import RunMetadata, make_stream, schemas
 from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 
+Motion = Callable[[Floats], tuple[Floats, Floats]]
 STEP_S = 0.1
 # speed's and turn rate's factor, turn rate's bias, lever, delay of fixes, angle of the compass
 TRUTH = np.array([1.03, 0.98, 0.01, 1.2, -0.4, 0.15, 0.05])
@@ -33,7 +35,7 @@ class Measured(NamedTuple):
     compass_rad: Floats
 
 
-def drive(seed: int | None, motion=rich, duration_s: float = 120.0) -> Measured:  # noqa: ANN001
+def drive(seed: int | None, motion: Motion = rich, duration_s: float = 120.0) -> Measured:
     """Drive; without noise where there is no seed."""
     n, m = round(duration_s / STEP_S), round(2.0 * duration_s) - 1
     fix_s, compass_s = 1.0 + 0.5 * np.arange(m), 0.2 * np.arange(round(5.0 * duration_s) + 1)

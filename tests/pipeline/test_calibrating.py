@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.diagnosing.battery.car import Floats
 from pipeline.tuning.information import information
-from tests.pipeline.car_c import NAMES, TRUTH, Floats, drive, recorded, rich
+from tests.pipeline.car_c import NAMES, TRUTH, drive, recorded, rich
 
 A_V, A_W, B_W = TRUTH[:3]
 # the sheet's noise is that of the motion, ours that of the readings, which are its times the scales
