@@ -47,6 +47,7 @@ from pipeline.sensing.noise import noise as noise
 from pipeline.sensing.outcome import SensorNoise as SensorNoise
 from pipeline.stressing.stressing import stress as stress
 from pipeline.stressing.verdicts import Stress as Stress
+from pipeline.tuning.calibrating import calibrate as calibrate
 from pipeline.tuning.outcome import Tuning as Tuning
 from pipeline.tuning.tuning import tune as tune
 from recorders.errors import BadInput as BadInput

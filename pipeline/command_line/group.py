@@ -25,7 +25,8 @@ def fuselog() -> None:
 
 for each in (
     *(recording.record, recording.import_),
-    *(replaying.replay, replaying.explore, replaying.tune, replaying.check, replaying.deploy),
+    *(replaying.replay, replaying.explore, replaying.tune, replaying.calibrate, replaying.check),
+    replaying.deploy,
     *(judging.evaluate, judging.compare, judging.diagnose, judging.stress, judging.observability),
     *(experiments.run, experiments.sweep, experiments.report),
     *(logs.info, logs.lint, logs.noise, logs.view, logs.export, logs.cut, logs.merge),

@@ -184,6 +184,59 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
 
 
 @command(
+    "Search how sensors are mounted, scaled, biased and delayed.",
+    "fuselog calibrate run.mcap -e ekf",
+    "fuselog calibrate train -e ekf --fixed lever_y_m --validate test",
+)
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("-e", "--estimator", "label", required=True, help="The estimator.")
+@click.option(
+    "--fixed", multiple=True, help="A parameter of the calibration that stays as it is set (repeatable)."
+)
+@click.option(
+    "--bound",
+    "bounds",
+    multiple=True,
+    metavar="NAME=LOW:HIGH",
+    help="The bounds of a parameter (repeatable) [default: none].",
+)
+@click.option(
+    "--validate",
+    "held_out",
+    multiple=True,
+    type=ANY_PATH,
+    help="A log or a folder of logs that are held out, to judge the values by (repeatable).",
+)
+@click.option(
+    "--folds",
+    type=COUNT,
+    default=0,
+    help="Cross-validate: cut the logs into N parts, and judge by each what the others gave.",
+)
+@click.option(
+    "--out", type=RESULT, default=Path("out/calibrate"), show_default=True, help="The result folder."
+)
+@click.option("--model", help="The model to estimate, where several fit the logs.")
+@workers_option
+@scheduler_option
+@recover_option
+@gap_option
+@json_option
+@settings_option
+@set_option("estimators")
+def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
+    """Search the scales, biases, mounting angles, lever arms and delays that explain LOGS best.
+
+    The model says which parameters these are; --set NAME=VALUE is where one starts. What the motion in
+    the logs does not determine is named, stays where it started, and has no interval. settings.toml in
+    the result folder is for --settings of fuselog replay and run.
+    """
+    from pipeline.tuning.command import tune_logs
+
+    tune_logs(list(logs), **options)
+
+
+@command(
     "Check that estimators still give what a golden has.",
     "fuselog check run.mcap --against ekf.golden.xz --update -e ekf",
     "fuselog check run.mcap --against ekf.golden.xz",

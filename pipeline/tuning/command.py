@@ -1,6 +1,7 @@
-"""The command `fuselog tune`: it prints what a tuning found, and writes the result folder."""
+"""The commands `fuselog tune` and `calibrate`: they print what was found, and write its folder."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from pipeline.output.outputs import check_folder
 from pipeline.output.results import plain
 from pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
 from pipeline.runs.settings import settings_of_estimators, split_texts
+from pipeline.tuning.calibrating import calibrate
 from pipeline.tuning.objective import Best, By
 from pipeline.tuning.outcome import SETTINGS
 from pipeline.tuning.tuning import tune
@@ -22,10 +24,11 @@ def tune_logs(
     logs: Sequence[Path],
     *,
     label: str,
-    free: Sequence[str],
-    by: By,
+    free: Sequence[str] = (),
+    fixed: Sequence[str] | None = None,
+    by: By = "likelihood",
     bounds: Sequence[str],
-    grid: int,
+    grid: int = 1,
     held_out: Sequence[Path],
     folds: int,
     out: Path,
@@ -38,7 +41,10 @@ def tune_logs(
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
-    """Say what is tuned on and what is held out, tune, write the result folder, print what was found."""
+    """Say what is tuned on and what is held out, tune, write the result folder, print what was found.
+
+    With what is `fixed` a model's calibration is searched for, in place of what is `free`.
+    """
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
     check_folder(out, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))})
@@ -50,18 +56,20 @@ def tune_logs(
 
         def tell(best: Best) -> None:
             values = ", ".join(
-                f"{name} {value:.4g}" for name, value in zip(free, best.point, strict=True)
+                f"{name} {value:.4g}" for name, value in zip(free, best.point, strict=bool(free))
             )
             show(f"{best.evaluations} evaluations; best so far: {values}")
 
-        found = tune(
+        search = (
+            partial(tune, free=free, by=by, grid=grid)
+            if fixed is None
+            else partial(calibrate, fixed=fixed)
+        )
+        found = search(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             chosen,
-            free,
-            by=by,
             set=alterations,
             bounds=dict(map(_bound, bounds)),
-            grid=grid,
             validate=[LogSource(open_log(path, recover=recover)) for path in held_out],
             folds=folds,
             gap_limit_s=gap_limit_s,

@@ -14,7 +14,6 @@ from pipeline.tuning.search import UNIT, Coordinates, Cost, Free
 
 Floats = NDArray[np.float64]
 LEAST_CURVATURE = 4.0  # a standard error of one half: known no better than times or divided by 2.7
-LARGEST_CONDITION = 1e3
 INVOLVED = 0.3  # of a direction of length one
 QUANTILE = float(ndtri(0.975))
 PROFILE_POINTS = 9
@@ -48,6 +47,34 @@ class Confidence(NamedTuple):
             return self.covariance / np.outer(self.errors, self.errors)
 
 
+class SearchOutcome(NamedTuple):
+    """States where a search ended.
+
+    Attributes:
+        coordinates: what was searched for.
+        optimum: (k,) the values of that at which the cost is least.
+        told: how well the logs tell them; None where the search was no maximum likelihood, was
+            stopped, or ended at bounds alone.
+        evaluations: how many values were tried.
+        has_converged, was_stopped: how it ended.
+        is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
+        begins_alike: whether filters begin with the optimum where they began in the search.
+        held: parameters of a calibration that the motion does not determine; they stay at their start.
+        lacks: the sentence that says so.
+    """
+
+    coordinates: Coordinates
+    optimum: Floats
+    evaluations: int
+    told: Confidence | None = None
+    has_converged: bool = True
+    was_stopped: bool = False
+    is_at_edge: bool = False
+    begins_alike: bool = True
+    held: Sequence[str] = ()
+    lacks: str = ""
+
+
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     """Compute what a curvature (m, m) tells of the parameters at these places."""
     values, vectors = np.linalg.eigh(curvature)
@@ -58,35 +85,43 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     return Confidence(places, curvature, covariance)
 
 
-def doubts(told: Confidence, free: Sequence[Free]) -> Iterator[str]:
+def doubts(told: Confidence, coordinates: Coordinates) -> Iterator[str]:
     """A sentence for every direction of the parameters (k,) of which the logs tell little."""
-    own = [free[place] for place in told.places]
-    for direction, value in _weak(told, free):
+    own = [coordinates.free[place] for place in told.places]
+    for direction, value in _weak(told, coordinates):
         yield _in_words(direction, value, own)
 
 
-def unknown(told: Confidence, free: Sequence[Free]) -> list[int]:
+def unknown(told: Confidence, coordinates: Coordinates) -> list[int]:
     """The parameters (k,), by their places, of which the logs tell nothing by the curvature."""
     found = []
-    for direction, value in _weak(told, free):
+    for direction, value in _weak(told, coordinates):
         first, *others = _involved(direction)
-        if not others and _factor(value) >= MEANINGLESS:
+        if (
+            not others
+            and not coordinates.free[told.places[first]].useful
+            and _factor(value) >= MEANINGLESS
+        ):
             found.append(told.places[first])
     return found
 
 
-def _weak(told: Confidence, free: Sequence[Free]) -> Iterator[tuple[Floats, float]]:
-    """The directions (m,), of length one, along which the cost hardly rises, and its curvature there."""
-    own = [free[place] for place in told.places]
+def _weak(told: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
+    """The directions (m,), of length one, along which the cost hardly rises, and its curvature there.
+
+    By the eigenvalues of the curvature in useful units: two standard errors that are useful, a factor of
+    2.7, or `UNIT` standard errors that a parameter without a useful one has alone.
+    """
+    places = list(told.places)
+    own, units = [coordinates.free[place] for place in places], coordinates.units[places]
     is_log = np.array([each.is_positive for each in own])
+    useful = np.array([each.useful for each in own])
     diagonal = np.diagonal(told.curvature)
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = np.where(is_log | (diagonal <= 0.0), 1.0, UNIT / np.sqrt(diagonal))
+        alone = np.where(diagonal <= 0.0, 1.0, UNIT / np.sqrt(diagonal))
+    scale = np.select([is_log, useful > 0.0], [1.0, 2.0 * useful / units], alone)
     values, vectors = np.linalg.eigh(told.curvature * np.outer(scale, scale))
-    weak = [index for index, value in enumerate(values) if value < LEAST_CURVATURE]
-    if not weak and values[-1] > LARGEST_CONDITION * values[0]:
-        weak = [0]
-    for index in weak:
+    for index in np.flatnonzero(values < LEAST_CURVATURE):
         yield vectors[:, index], values[index]
 
 
@@ -105,6 +140,8 @@ def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
     """What it means that the cost has only this curvature along a direction (m,) of length one."""
     names = [each.name for each in free]
     first, *others = _involved(direction)
+    if not others and free[first].useful:
+        return f"{names[first]}: the logs determine it less well than is useful"
     if not others and _factor(value) < MEANINGLESS:
         return f"{names[first]}: the logs determine it within a factor of {_factor(value):.2g} (95 %)"
     if not others:

@@ -263,7 +263,7 @@ class Objective:
                     f"({failures[0]}); give others with --set"
                 )
             parts = self._parts(start, run)
-            told = max(map(_count, parts))
+            told = max(map(self._count, parts))
             cost = self._cost([self._total(parts, run, told)])
             if not np.isfinite(cost):
                 raise BadInput(
@@ -327,7 +327,7 @@ class Objective:
 
     def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, told: int) -> Sums | None:
         """What all parts tell; None where all of them fail or gave another number of messages."""
-        is_used = [not _failures(outputs) and _count(outputs) == told for outputs in parts]
+        is_used = [not _failures(outputs) and self._count(outputs) == told for outputs in parts]
         if not any(is_used):
             return None
         found = [
@@ -335,6 +335,12 @@ class Objective:
             for outputs, used in zip(parts, is_used, strict=True)
         ]
         return found[0] if len(parts) == 1 else dict(mean_likelihood(found))
+
+    def _count(self, outputs: Mapping[str, Ragged]) -> int:
+        """How many messages are compared: innovations alone, where these are; a delay adds estimates."""
+        if CRITERIA[self.by].is_smooth:
+            return sum(len(stream) for _, stream in innovations_in(outputs))
+        return sum(len(rows) for rows in outputs.values())
 
     def _measured(self, run: Run, outputs: Mapping[str, Ragged]) -> Sums:
         return CRITERIA[self.by].sums(run, outputs, self.gap_limit_s)
@@ -381,8 +387,3 @@ def _failures(outputs: Mapping[str, Ragged]) -> list[str]:
         if rows.stream.schema.full_name == FAILURE
         for sentence in sentences_of(rows.stream)
     ]
-
-
-def _count(outputs: Mapping[str, Ragged]) -> int:
-    """How many messages the estimator gave."""
-    return sum(len(rows) for rows in outputs.values())

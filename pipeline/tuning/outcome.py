@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,8 @@ from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.output.summary import summarise, summary_table
-from pipeline.tuning.confidence import QUANTILE, Confidence, Profile, doubts, profiles
+from pipeline.tuning.confidence import QUANTILE, Profile, SearchOutcome, doubts, profiles
 from pipeline.tuning.objective import Objective, innovations_in
-from pipeline.tuning.search import Coordinates
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
@@ -34,30 +33,6 @@ Source = LogSource | MemorySource
 START, TUNED = "start", "tuned"  # what the estimator is called with either values
 SETTINGS = "settings.toml"
 IMPROBABLE = 1e-3  # of white innovations: they are none
-
-
-class SearchOutcome(NamedTuple):
-    """States where a search ended.
-
-    Attributes:
-        coordinates: what was searched for.
-        optimum: (k,) the values of that at which the cost is least.
-        told: how well the logs tell them; None where the search was no maximum likelihood, was
-            stopped, or ended at bounds alone.
-        evaluations: how many values were tried.
-        has_converged, was_stopped: how it ended.
-        is_at_edge: whether a run fails, or uses fewer measurements, beside the optimum.
-        begins_alike: whether filters begin with the optimum where they began in the search.
-    """
-
-    coordinates: Coordinates
-    optimum: Floats
-    evaluations: int
-    told: Confidence | None = None
-    has_converged: bool = True
-    was_stopped: bool = False
-    is_at_edge: bool = False
-    begins_alike: bool = True
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -239,17 +214,19 @@ class Tuning:
                     f"{each.name}: no channel states it; the search starts from {each.start:g}, which "
                     f"replay assumes too; --set {each.name}=... sets another start"
                 )
-            if each.is_kept:
+            if each.is_kept and each.name not in found.held:
                 yield (
                     f"{each.name}: the logs determine it not at all; it stays at {each.start:g}, where "
                     "the search began"
                 )
-            elif is_beyond:
+            elif is_beyond and not each.is_kept:
                 side = "lower" if value < each.start else "upper"
                 yield (
                     f"{each.name}: is best at its {side} bound {value:g}, and so has no interval; give "
                     "a wider one, or leave it out of what is searched for"
                 )
+        if found.lacks:
+            yield found.lacks
         if not found.begins_alike:
             yield (
                 "with these values the filter begins elsewhere than in the search that found them, and "
@@ -262,7 +239,7 @@ class Tuning:
                 "other values to start from"
             )
         if found.told is not None:
-            yield from doubts(found.told, free)
+            yield from doubts(found.told, found.coordinates)
 
     def _notes_of_innovations(self) -> Iterator[str]:
         rows = self.whiteness.to_dict("records")

@@ -34,7 +34,7 @@ class Free(NamedTuple):
     """A parameter that is searched for: where from, and between what bounds.
 
     Where it is positive, its logarithm is searched for. `is_assumed` says that neither a setting nor the
-    log states the start.
+    log states the start. `useful` is the standard error that a calibration wants; zero of what is none.
     """
 
     name: str
@@ -43,6 +43,7 @@ class Free(NamedTuple):
     high: float
     is_positive: bool
     is_assumed: bool = False
+    useful: float = 0.0
 
     @property
     def kept(self) -> "Free":
@@ -104,6 +105,8 @@ def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
     start = np.array([each.start for each in free])
     units = np.ones(len(free))
     for place, each in enumerate(free):
+        if each.is_kept:
+            continue
 
         def near(steps: Sequence[float], place: int = place, each: Free = each) -> Floats:
             """What it costs so far from the start along this parameter."""

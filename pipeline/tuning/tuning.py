@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.runs.executors import WorkerPool, pool_for
-from pipeline.tuning.confidence import QUANTILE, Confidence, confidence, unknown
+from pipeline.tuning.confidence import QUANTILE, Confidence, SearchOutcome, confidence, unknown
+from pipeline.tuning.information import in_words, information, undetermined
 from pipeline.tuning.measured import until_last_measured
 from pipeline.tuning.objective import (
     CRITERIA,
@@ -29,7 +30,7 @@ from pipeline.tuning.objective import (
     silent,
     with_values,
 )
-from pipeline.tuning.outcome import START, TUNED, SearchOutcome, Source, Tuning
+from pipeline.tuning.outcome import START, TUNED, Source, Tuning
 from pipeline.tuning.search import (
     Coordinates,
     Free,
@@ -220,13 +221,16 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
             f"--free {name}: its logarithm is searched for, and it starts from {start:g}; give a start "
             f"above zero, --set {name}=..."
         )
+    useful = 0.0
+    if not is_positive and isinstance(bound, Recursive) and bound.reading is not None:
+        useful = bound.reading().calibration.get(name, 0.0)
     low, high = given or ((start / REACH, start * REACH) if is_positive else (least, greatest))
     if not (low < start < high and (low > 0.0 if is_positive else low >= least)):
         raise BadInput(
             f"--bound {name}={low:g}:{high:g}: the search starts from {start:g}, which must lie between"
             f"{' two numbers above zero' if is_positive else ''}; give other bounds, or --set {name}=..."
         )
-    return Free(name, start, low, min(high, greatest), is_positive, is_assumed)
+    return Free(name, start, low, min(high, greatest), is_positive, is_assumed, useful)
 
 
 def value_at_start(name: str, source: Source, bound: Bound) -> tuple[float, bool]:
@@ -253,13 +257,46 @@ def _settled(objective: Objective, free: Sequence[Free], grid: int) -> SearchOut
     path between the first fixes, say. That is held during a search, else likelihoods of different
     measurements would be compared; the next search holds where filters begin with the values found.
     """
-    found = _search(objective, free, grid)
+    start = np.array([each.start for each in free])
+    free, open_ = _held(objective, free, start)
+    found = _search(objective, free, grid)._replace(**open_)
+    if not found.was_stopped:
+        nearer, there = _held(objective, free, found.optimum)
+        if nearer != free:
+            free, open_ = nearer, there
+            found = _search(objective, free, grid)._replace(**open_)
     for _ in range(ROUNDS - 1):
         if found.was_stopped or objective.begins_alike(found.optimum):
             return found
         objective.begin(found.optimum)
-        found = _search(objective, free, 1, found.coordinates.of(found.optimum))
+        point = found.coordinates.of(found.optimum)
+        found = _search(objective, free, 1, point)._replace(**open_)
     return found._replace(begins_alike=found.was_stopped or objective.begins_alike(found.optimum))
+
+
+def _held(
+    objective: Objective, free: Sequence[Free], values: Floats
+) -> tuple[list[Free], dict[str, Any]]:
+    """What of a calibration the motion does not determine, at values (k,), is kept at its start.
+
+    Far from the best values innovations are large, so that it is looked at there once more. What was
+    held before stays so.
+    """
+    places = [place for place, each in enumerate(free) if each.useful]
+    if objective.by != "likelihood" or not places:
+        return list(free), {}
+    useful = np.array([each.useful for each in free])
+    lacking = undetermined(information(objective, values, useful, places))
+    held = [
+        free[place].name
+        for number, place in enumerate(places)
+        if number in lacking.places or free[place].is_kept
+    ]
+    if not held:
+        return list(free), {}
+    sentence = in_words([free[place].name for place in places], lacking, free, held)
+    kept = [each.kept if each.name in held else each for each in free]
+    return kept, {"held": held, "lacks": sentence}
 
 
 def _search(
@@ -279,7 +316,7 @@ def _search(
         is_smooth = CRITERIA[objective.by].is_smooth
         point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
         told, is_at_edge = _told(objective, coordinates, point)
-        if told is not None and (places := unknown(told, free)):
+        if told is not None and (places := unknown(told, coordinates)):
             kept = [each.kept if place in places else each for place, each in enumerate(free)]
             nearer = replace(coordinates, free=kept)
             low, high = nearer.bounds

@@ -71,6 +71,8 @@ class Reading:
         biases, factors: by topic and the place of a number, the parameter that is added to it, or that
             it is multiplied by: to a control, or to what is measured.
         delays: by topic, the parameter that says how late its messages are.
+        calibration: parameters that say how its sensors are mounted, scaled, biased and delayed, each
+            with a useful standard deviation.
     """
 
     controls: tuple[str, ...]
@@ -81,6 +83,7 @@ class Reading:
     biases: Mapping[tuple[str, int], str]
     factors: Mapping[tuple[str, int], str]
     delays: Mapping[str, str]
+    calibration: Mapping[str, float]
 
 
 @renamed(whole="static", rewinding="out_of_sequence", opening="initialization")

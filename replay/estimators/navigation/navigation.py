@@ -235,4 +235,10 @@ INERTIAL = Model(
     start=Start({}, HANDHELD, find=align, check_prior=check_prior),
     correct=WITH_HEADING,
     augmentable={**LEVER, **MOUNTING, **SCALES, **WHEEL},
+    calibration={
+        **dict.fromkeys(LEVER, 0.2),
+        **dict.fromkeys(MOUNTING, 0.02),
+        **dict.fromkeys((*SCALES, "wheel_scale"), 0.01),
+        **dict.fromkeys(("fix_delay_s", "velocity_delay_s"), 0.05),
+    },
 )

@@ -283,6 +283,8 @@ class Model:
         by_name: whether it is only taken where it is named, since it fits the logs of other models too.
         augmentable: the parameters that may become part of the state, linear or angles, see
             `replay.inference.model.augmentation`: those that motion and sensors read, and no noise.
+        calibration: the parameters that say how sensors are mounted, scaled, biased and delayed, each
+            with a useful standard deviation: what is known no better counts as not determined.
 
     A thing on a line, whose range from the origin is measured:
 
@@ -331,6 +333,7 @@ class Model:
     system: str = ""
     needs_sensor: bool = True
     augmentable: Components = field(default_factory=dict)
+    calibration: Mapping[str, float] = field(default_factory=dict)
     start: Start | None = None
     correct: Correction | None = None
     takes_fixes: bool = True

@@ -61,6 +61,7 @@ def reading_of(stage: Stage, found: Found) -> Reading:
         _augmentable(stage, found),
         *_own_errors(stage, found),
         {topic.name: sensor.delay for sensor, topic in found.sensors if sensor.delay},
+        _calibration(stage, found),
     )
 
 
@@ -111,6 +112,23 @@ def _squared(variances: Callable[[Any], Any], names: tuple[str, ...]) -> list[st
 
 def _augmentable(stage: Stage, found: Found) -> dict[str, tuple[str, tuple[str, ...]]]:
     """List the parameters that may be estimated, with what reads them."""
+    readers = _readers(stage, found)
+    by_name = {
+        name: (kind, tuple(dict.fromkeys(topic for topic, read in readers if name in read)))
+        for name, kind in stage.model.augmentable.items()
+    }
+    return {name: (kind, topics) for name, (kind, topics) in by_name.items() if topics}
+
+
+def _calibration(stage: Stage, found: Found) -> dict[str, float]:
+    """List the parameters of the calibration that something reads here, with their useful sigmas."""
+    used = set().union(*(read for _, read in _readers(stage, found)))
+    used |= {sensor.delay for sensor, _ in found.sensors}
+    return {name: sigma for name, sigma in stage.model.calibration.items() if name in used}
+
+
+def _readers(stage: Stage, found: Found) -> list[tuple[str, set[str]]]:
+    """List the parameters that motion, under "", and sensors, under their topics, read."""
     model = stage.model
     names = number_fields(model.parameters)
     state, control = trial_state(model.kinds), (0.0,) * model.controls
@@ -128,11 +146,7 @@ def _augmentable(stage: Stage, found: Found) -> dict[str, tuple[str, tuple[str, 
     for sensor, topic in found.sensors:
         entering = ((0.0,) * sensor.noises,) if sensor.noises else ()
         note(topic.name, sensor.measure, state, *entering, (1.0,) * sensor.reference_size)
-    by_name = {
-        name: (kind, tuple(dict.fromkeys(topic for topic, read in readers if name in read)))
-        for name, kind in model.augmentable.items()
-    }
-    return {name: (kind, topics) for name, (kind, topics) in by_name.items() if topics}
+    return readers
 
 
 def _own_errors(

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pipeline.tuning.confidence import confidence, doubts
-from pipeline.tuning.outcome import SearchOutcome, Tuning
+from pipeline.tuning.confidence import SearchOutcome, confidence, doubts
+from pipeline.tuning.outcome import Tuning
 from pipeline.tuning.search import Coordinates, Free
 
 NAMES = ("sigma_range_m", "sigma_bearing_rad", "density")

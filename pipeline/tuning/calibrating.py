@@ -1,0 +1,68 @@
+"""Calibration: how sensors are mounted, scaled, biased and delayed, by the search of `tune`.
+
+A model says which of its parameters these are, see `replay.inference.model.model.Model`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from pipeline.altering.sources import split_settings
+from pipeline.api.planning import Log, Named, settings_of, sources_of
+from pipeline.tuning.outcome import Tuning
+from pipeline.tuning.tuning import tune
+from recorders.errors import BadInput
+from recorders.parameters import merge
+from replay.engine.replaying.estimator import Recursive, bind
+from replay.foreign.naming import allowed
+
+OPTIONS = ("by", "free")  # of `tune`, which a calibration chooses itself
+
+
+def calibrate(
+    logs: Log | Iterable[Log],
+    estimator: Named,
+    *,
+    set: Mapping[str, Any] | None = None,  # noqa: A002
+    fixed: Sequence[str] = (),
+    **options: Any,
+) -> Tuning:
+    """Search the parameters that say how sensors are mounted, scaled, biased and delayed.
+
+    Those that the model marks as its calibration, and that something in the logs reads, are searched for
+    together by maximum likelihood. What the motion does not determine is named, stays where it started,
+    and has no interval.
+
+    Args:
+        logs: paths, logs that were opened, or recordings: one, or several that hold the same topics.
+        estimator: a registered name, or a label of your own with what it stands for; see `replay`.
+        set: other parameters, and where the search starts; see `tune`.
+        fixed: parameters of the calibration that are known, and stay as they are set.
+        options: as for `tune`, but for `free` and `by`.
+
+    Raises BadInput where the model marks none, or nothing in the logs depends on what it marks.
+    """
+    for name in OPTIONS:
+        if name in options:
+            raise BadInput(f"calibrate: {name} is for tune; a calibration chooses it itself")
+    alterations, given = split_settings(set or {})
+    sources = sources_of(logs, alterations)
+    [(label, own), *others] = settings_of(estimator).items()
+    if others:
+        raise BadInput(f"{label}, {others[0][0]}: one estimator is calibrated at a time; give one")
+    bound = bind(label, sources, {"kind": label, **merge(own, allowed(given))})
+    marked = [
+        name
+        for each in bound[:1]
+        if isinstance(each, Recursive) and each.reading is not None
+        for name in each.reading().calibration
+    ]
+    if not marked:
+        raise BadInput(
+            f"estimator {label}: its model marks no parameter that the logs read as its calibration; "
+            "name parameters yourself, fuselog tune --free NAME"
+        )
+    for name in fixed:
+        if name not in marked:
+            raise BadInput(f"--fixed {name}: is not of the calibration; it is {', '.join(marked)}")
+    free = [name for name in marked if name not in fixed]
+    return tune(logs, estimator, free, set=set, **options)

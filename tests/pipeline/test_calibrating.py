@@ -1,0 +1,97 @@
+"""Calibration: car C of the sheet of sensors, section 2, and what its motion does not determine."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.diagnosing.battery.car import Floats
+from pipeline.tuning.information import information
+from tests.pipeline.car_c import NAMES, TRUTH, drive, recorded, rich
+
+A_V, A_W, B_W = TRUTH[:3]
+# the sheet's noise is that of the motion, ours that of the readings, which are its times the scales
+OPEN = {
+    "gate_probability": 1.0,
+    "forward_noise_density": 0.05 * A_V,
+    "turn_noise_density": 0.01 * A_W,
+}
+# our scales and bias are of the motion by the reading; the sheet's of the reading by the motion
+OURS = np.array([1.0 / A_V, 1.0 / A_W, -B_W / A_W, *TRUTH[3:]])
+USEFUL = np.array([0.01, 0.01, 0.01, 0.2, 0.2, 0.05, 0.02])
+
+
+def straight(time_s: Floats) -> tuple[Floats, Floats]:
+    return 8.0 + 0.0 * time_s, 0.0 * time_s
+
+
+def circle(time_s: Floats) -> tuple[Floats, Floats]:
+    return 8.0 + 0.0 * time_s, 0.4 + 0.0 * time_s
+
+
+def slalom(time_s: Floats) -> tuple[Floats, Floats]:
+    return 8.0 + 0.0 * time_s, 0.4 * np.sin(0.8 * time_s)
+
+
+def test_the_car_of_the_sheet() -> None:
+    car = drive(1)
+    sums = [car.odometry[:, 0].sum(), car.odometry[:, 1].sum(), car.fix_m.sum(), car.compass_rad.sum()]
+    assert sums == pytest.approx([10018.5904476, 14.594704982, 96427.5316865, 895.280996548], rel=1e-9)
+    found = fl.calibrate(recorded(car), "ekf", set=OPEN)
+    rows = found.parameters.set_index("parameter").loc[list(NAMES)]
+    forward, turn, bias, *others = rows["value"]
+    values = np.array([1.0 / forward, 1.0 / turn, -bias / turn, *others])
+    best = [1.029874887, 0.9787886879, 0.01148981965, 1.249610803, -0.3824990073, 0.1636707698]
+    sigma = np.array([7.1829e-4, 0.0044225, 8.9938e-4, 0.102798, 0.037706, 0.011212, 9.2673e-4])
+    assert np.all(np.abs(values - [*best, 0.04897362472]) < 0.1 * sigma)
+    errors = (rows["high"] - rows["low"]).to_numpy() / 2.0 / 1.959964
+    assert errors[3:] == pytest.approx(sigma[3:], rel=0.02)
+    assert -found.costs[1] == pytest.approx(1304.018371, abs=0.5)
+    assert not found.found.held
+
+
+@pytest.mark.parametrize(
+    ("motion", "eigenvalues", "held"),
+    [
+        (rich, [3.276, 5.103, 28.15, 110.2, 123.3, 195.3, 466.0], []),
+        (straight, [123.3, 267.8, 566.3], ["turn_scale", "lever_x_m", "lever_y_m", "fix_delay_s"]),
+        (circle, [143.0, 150.0, 559.0], list(NAMES)),
+        (slalom, [0.142, 6.93, 11.5, 56.4, 123.0, 232.0, 534.0], ["lever_x_m", "fix_delay_s"]),
+    ],
+)
+def test_what_the_motion_does_not_determine_is_named_and_held(
+    motion: Callable[[Floats], tuple[Floats, Floats]], eigenvalues: list[float], held: list[str]
+) -> None:
+    log = recorded(drive(None, motion), (1000.0, 1000.0, 1.0))
+    found = fl.calibrate(log, "ekf", set=OPEN)
+    assert {*found.found.held} == {*held}
+    rows = found.parameters.set_index("parameter")
+    assert rows.loc[held, "low"].isna().all()
+    assert (rows.loc[held, "value"] == rows.loc[held, "start"]).all()
+    assert rows.drop(held)["low"].notna().all()
+    assert any("the motion in the logs does not determine" in each for each in found.notes) == bool(held)
+
+    names = [each.name for each in found.found.coordinates.free]
+    order = [names.index(name) for name in NAMES]
+    values, useful = np.empty(7), np.empty(7)
+    values[order], useful[order] = OURS, USEFUL
+    by_sheet = np.eye(7)
+    by_sheet[0, 0], by_sheet[1, 1] = -1.0 / A_V**2, -1.0 / A_W**2
+    by_sheet[2, 1:3] = B_W / A_W**2, -1.0 / A_W
+    turned = by_sheet * USEFUL / USEFUL[:, None]
+    told = turned.T @ information(found.objective, values, useful, order) @ turned
+    known = len(eigenvalues)
+    computed = np.linalg.eigvalsh(told)
+    assert computed[-known:] == pytest.approx(eigenvalues, rel=0.02)
+    assert np.all(computed[: 7 - known] < 1e-3)
+
+
+def test_what_cannot_be_calibrated_is_refused() -> None:
+    log = recorded(drive(None, duration_s=3.0))
+    with pytest.raises(
+        fl.BadInput, match="--fixed lever_z_m: is not of the calibration; it is forward_"
+    ):
+        fl.calibrate(log, "ekf", fixed=["lever_z_m"])
+    with pytest.raises(fl.BadInput, match="calibrate: by is for tune"):
+        fl.calibrate(log, "ekf", by="rmse")
