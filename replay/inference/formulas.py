@@ -33,7 +33,7 @@ def formulas(model: str | Model) -> str:
 
     >>> print(formulas("robot").partition("v3")[0].strip())
     motion, move:
-      v1 = turn_radps + turn_bias_radps
+      v1 = turn_scale * turn_radps + turn_bias_radps
       v2 = 0.5 * v1 * duration_s
     """
     return "\n\n".join(

@@ -13,18 +13,19 @@ from pipeline.tuning.search import Coordinates, Free
 
 NAMES = ("sigma_range_m", "sigma_bearing_rad", "density")
 FREE = [Free(name, 1.0, 0.01, 100.0, is_positive=True) for name in NAMES]
+SEARCHED = Coordinates(FREE, np.ones(len(FREE)))
 
 
 def told() -> Iterator[str]:
     """What the logs determine: each by itself, ever less, and two that they hardly distinguish."""
     for curvature in (4.1, 3.9, 0.5, 0.1, 0.0, -1.0):
         made = np.diag([curvature, 500.0, 500.0])
-        yield f"{curvature:g}: {' / '.join(doubts(confidence([0, 1, 2], made), FREE)) or 'nothing'}"
+        yield f"{curvature:g}: {' / '.join(doubts(confidence([0, 1, 2], made), SEARCHED)) or 'nothing'}"
     for mixed in (-0.999, 0.999):
         made = 400.0 * np.array([[1.0, mixed, 0.0], [mixed, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        yield f"{mixed:g}: {' / '.join(doubts(confidence([0, 1, 2], made), FREE)) or 'nothing'}"
+        yield f"{mixed:g}: {' / '.join(doubts(confidence([0, 1, 2], made), SEARCHED)) or 'nothing'}"
     made = np.diag([1.0, 500.0])
-    yield f"at other places: {' / '.join(doubts(confidence([1, 2], made), FREE))}"
+    yield f"at other places: {' / '.join(doubts(confidence([1, 2], made), SEARCHED))}"
 
 
 def search() -> Iterator[str]:
