@@ -202,8 +202,8 @@ DRAWN = [
     ),
     Fault(
         "pipeline/tuning/tuning.py",
-        "        objective.begin(found.optimum)\n        found =",
-        "        found =",
+        "        objective.begin(found.optimum)\n        point =",
+        "        point =",
         "tests/pipeline/test_tuning.py",
     ),
     Fault(
@@ -657,7 +657,7 @@ DRAWN = [
         "tests/replay/tracing/test_functions.py tests/replay/tracing/test_derivatives.py tests/docs/test_site.py",
     ),
     Fault(
-        "replay/tracing/functions.py",
+        "replay/tracing/inlining.py",
         "        return (getattr(self, name) for name in self._names)",
         "        return (getattr(self, name) for name in sorted(self._names))",
         "tests/replay/tracing/test_functions.py",

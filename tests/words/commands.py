@@ -39,6 +39,7 @@ observability run.mcap
 explore run.mcap -e ekf -e ukf -e iekf
 explore run.mcap -e network
 tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
+calibrate run.mcap -e ekf
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz
 check other.mcap --against ekf.golden.xz
@@ -118,8 +119,12 @@ def _said(arguments: list[str]) -> str:
 
 def _masked(text: str) -> str:
     """A text without what is of this machine: how long it took, where it is, and its version."""
-    timed = r"(estimator +time \(s\) *\n─+\n)((?: .*\n)+)"
-    text = re.sub(timed, lambda found: found[1] + re.sub(r"  [-+\d.e]+", "  TIME", found[2]), text)
+    timed = r" *estimator +time \(s\) *\n─+\n((?: .*\n)+)"
+    text = re.sub(
+        timed,
+        lambda found: "estimator: TIME\n" + re.sub(r"  [-+\d.e]+ *$", ": TIME", found[1], flags=re.M),
+        text,
+    )
     text = re.sub(r"(fuselog \S+, input )[0-9a-f]+", r"\1SHA-256", text)
     return text.replace(str(ROOT), "ROOT").replace(f"fuselog {version('fuselog')}", "fuselog VERSION")
 
