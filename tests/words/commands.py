@@ -122,7 +122,7 @@ def _masked(text: str) -> str:
     timed = r" *estimator +time \(s\) *\n─+\n((?: .*\n)+)"
     text = re.sub(
         timed,
-        lambda found: "estimator: TIME\n" + re.sub(r"  [-+\d.e]+ *$", ": TIME", found[1], flags=re.M),
+        lambda found: "estimator: TIME\n" + re.sub(r" {2,}[-+\d.e]+ *$", ": TIME", found[1], flags=re.M),
         text,
     )
     text = re.sub(r"(fuselog \S+, input )[0-9a-f]+", r"\1SHA-256", text)
