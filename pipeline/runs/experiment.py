@@ -34,7 +34,8 @@ class Experiment(Parameters):
     The runs are recorded from a scenario, imported, or logs that are there.
 
     Attributes:
-        title: what it is, in a line; text: more of it for the report, in Markdown.
+        title: what it is, in a line.
+        text: more of it for the report, in Markdown.
         study: name of the study that does its work.
         seed: seed of the recorded runs.
         runs: number of recorded runs.

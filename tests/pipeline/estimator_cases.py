@@ -167,7 +167,14 @@ MODELS = {
             ("start_reach_m", "start_s", "start_sigma_m", "start_sigma_mps"), WITH_PRIOR
         ),
     ),
-    "robot": Case("ekf", robot(), nothing={"sigma_heading_rad": "no robot has a compass"}),
+    "robot": Case(
+        "ekf",
+        robot(),
+        nothing={
+            "sigma_heading_rad": "no robot has a compass",
+            "bias_heading_rad": "no robot has a compass",
+        },
+    ),
     "sound-source": Case("ekf", Situation("sound-source")),
     "vehicle": Case("imm:ekf", drive()),
 }

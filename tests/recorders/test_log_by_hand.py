@@ -299,7 +299,7 @@ def test_a_chunk_is_walked_in_plain_python_as_it_is_compiled(path):
     for changes in [0, *[1, 2, 8] * 100]:
         data = whole[: generator.integers(len(whole) // 2, len(whole) + 1)].copy()
         data[generator.integers(len(data), size=changes)] = generator.integers(256, size=changes)
-        words = loops._words(data), len(data)
+        words = loops.words_of(data), len(data)
         with np.errstate(over="ignore"):
             plain = loops._scan(*words)
         for ours, theirs in zip(plain, loops._compiled(loops._scan)(*words), strict=True):

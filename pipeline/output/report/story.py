@@ -1,6 +1,6 @@
 """The story of a result: what was tried, what to do, a card per estimator, what differs beyond chance.
 
-It is data: sentences and numbers. `page.html` only sets it.
+It is data: sentences and numbers. The template only sets it.
 """
 
 import math
