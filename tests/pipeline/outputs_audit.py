@@ -75,7 +75,7 @@ MORE = {
     "export --to foxglove": "export est.mcap --to foxglove -o OUT.mcap",
 }
 # These write new files only; what is in the place stays, whatever it is.
-NEW_ONLY = ("import --guess", "export --out", "export a topic", "export --to foxglove")
+NEW_ONLY = ("deploy --out", "import --guess", "export --out", "export a topic", "export --to foxglove")
 
 
 class Command(NamedTuple):

@@ -40,6 +40,8 @@ explore run.mcap -e ekf -e ukf -e iekf
 explore run.mcap -e network
 tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
 calibrate run.mcap -e ekf
+deploy run.mcap -e smoother:ekf -o never
+noise run.mcap
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz
 check other.mcap --against ekf.golden.xz

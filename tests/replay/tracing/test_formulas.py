@@ -49,7 +49,7 @@ def test_the_robot_moves_as_one_would_write_it() -> None:
     derivatives = [line for line in lines if line.startswith("d next_heading_rad")]
     assert derivatives == [
         "d next_heading_rad / d heading_rad = 1",
-        "d next_heading_rad / d turn_radps = turn_scale * duration_s",
+        "d next_heading_rad / d turn_radps = duration_s * turn_scale",
     ]
     seen = formulas_by_function("robot")["sensor range (range_m), measure"]
     assert not [line for line in seen if "heading_rad" in line]  # of which a range does not depend
