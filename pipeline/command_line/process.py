@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -70,14 +71,27 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def _stopped_by_signals() -> Iterator[None]:
-    """Have signals that end the process unwind it, so that what was begun is cleared away."""
+    """Have signals that end the process unwind it, so that what was begun is cleared away.
+
+    Where one falls into a finalizer, out of which Python lets no exception go, it is sent again.
+    """
     last_s = -math.inf
+    report = sys.unraisablehook
 
     def stop(number: int, _: FrameType | None) -> None:
         nonlocal last_s
         before_s, last_s = last_s, time.monotonic()
         if last_s - before_s > 1.0:  # `timeout` sends it twice: to the process and to its group
             raise Stopped(number)
+
+    def again(lost: "sys.UnraisableHookArgs") -> None:
+        nonlocal last_s
+        if not isinstance(lost.exc_value, KeyboardInterrupt):
+            report(lost)
+            return
+        last_s = -math.inf
+        number = lost.exc_value.number if isinstance(lost.exc_value, Stopped) else signal.SIGINT
+        threading.Timer(0.01, interrupt_main, [number]).start()  # by then the finalizer has ended
 
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -89,9 +103,11 @@ def _stopped_by_signals() -> Iterator[None]:
     ]
     for number in asked:
         signal.signal(number, stop)
+    sys.unraisablehook = again
     try:
         yield
     finally:
+        sys.unraisablehook = report
         for number in asked:
             signal.signal(number, signal.SIG_DFL)
 

@@ -474,6 +474,27 @@ def test_a_stopped_recording_or_replay_leaves_nothing(
     assert list(here.iterdir()) == []
 
 
+@pytest.mark.unix
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_that_falls_into_a_finalizer_is_not_lost(
+    number: int, here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python prints what a finalizer raises and goes on; a person who pressed Ctrl-C would wait."""
+
+    class Finalized:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    def finalize(*_: object) -> None:
+        Finalized()  # nobody holds it
+        time.sleep(5)
+
+    monkeypatch.setattr("recorders.log.LogWriter.write", finalize)
+    said = fuselog("replay", world / "log.mcap", "-e", "ekf", "--out", "new.mcap")
+    assert (said.code, said.err.strip()) == (128 + number, "fuselog: stopped")
+    assert list(here.iterdir()) == []
+
+
 @pytest.mark.usefixtures("here")
 def test_two_runs_into_one_folder_do_not_mix(fuselog: Fuselog) -> None:
     with result_folder(Path("r")) as theirs:
