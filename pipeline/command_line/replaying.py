@@ -302,6 +302,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     help="The folder to write, new or empty; its name is the filter's in C.",
 )
 @click.option("--single", is_flag=True, help="In single precision, float.")
+@json_option
 @settings_option
 @set_option("estimators")
 def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **options: Any) -> None:

@@ -11,6 +11,7 @@ from pipeline.deploying.c_header import header
 from pipeline.deploying.c_names import CFilter, identifier
 from pipeline.deploying.c_replay import replay_text, why_no_replay
 from pipeline.deploying.c_test import test_text, vectors_of, vectors_text
+from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from pipeline.deploying.folder import cmake_text, readme_text
 from recorders.atomic import whole_folder
 from recorders.errors import BadInput
@@ -52,7 +53,7 @@ def deploy(
     >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
     >>> folder = deploy("run.mcap", "ekf", "robot_ekf", model="robot")
     >>> sorted(each.name for each in folder.iterdir())[:3]
-    ['CMakeLists.txt', 'README.md', 'fuselog_filter.h']
+    ['CMakeLists.txt', 'README.md', 'certificate.json']
     """
     [(label, settings)] = settings_of(estimator).items()
     place = Path(out)
@@ -67,13 +68,16 @@ def deploy(
         f"{filtering.stage.model.summary}: {filtering.method.summary}.",
     )
     vectors = vectors_of(run, bound, filtering)
+    own_header, own_source = header(made), source(made)
+    certificate = certificate_of(made, own_source, own_header)
     files = {
-        f"{made.name}.h": header(made),
-        f"{made.name}.c": source(made),
+        f"{made.name}.h": own_header,
+        f"{made.name}.c": own_source,
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
         "CMakeLists.txt": cmake_text(made),
-        "README.md": readme_text(made, Path(log).name),
+        "README.md": readme_text(made, Path(log).name, certificate),
+        CERTIFICATE: certificate_text(made, certificate),
     }
     if not why_no_replay(made):
         files[f"{made.name}_replay.c"] = replay_text(made)

@@ -1,5 +1,6 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
 
 COMPILER = shutil.which("gcc") or shutil.which("clang")
@@ -71,6 +73,31 @@ def test_estimates_are_equal_to_the_last_bit(
             if name in own[topic].columns:
                 both = own[topic][name], foreign[topic][name]
                 np.testing.assert_array_equal(*both, err_msg=f"{topic} {name}")
+
+
+def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=2.0)
+    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot")
+    found = json.loads((folder / "certificate.json").read_text())
+    # sin and cos of the mean heading, sin of sinc, cos of its slope;
+    # roots of the range and of two pivots, atan2 of the bearing, fmod of its wrapping
+    costs = [(each["roots"], each["calls"]) for each in found["steps"].values()]
+    assert costs == [(0, 4), (3, 2)]
+    assert found["worst"]["flops"] == sum(each["flops"] for each in found["steps"].values())
+    # F P F' of 3 states, lower half of the second product, and P H', H P H' of 2 components
+    assert found["products"]["dense_flops"] == 9 * 5 + 6 * 5 + 6 * 5 + 3 * 5
+
+
+def test_stack_is_that_of_the_deepest_chain() -> None:
+    node = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:5\\n{1} bytes (static)" }}\n'
+    edge = 'edge: {{ sourcename: "{0}" targetname: "{1}" label: "x.c:2:3" }}\n'
+    calls = "".join(
+        [
+            *(node.format(*each) for each in (("wide", 100), ("top", 40), ("middle", 50), ("low", 16))),
+            *(edge.format(*each) for each in (("top", "middle"), ("middle", "low"), ("wide", "sin"))),
+        ]
+    )
+    assert deepest_stack(calls) == 40 + 50 + 16
 
 
 def test_refusals_write_nothing(tmp_path: Path) -> None:
