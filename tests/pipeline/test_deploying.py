@@ -12,6 +12,7 @@ import pytest
 import fuselog as fl
 from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
+from tests.pipeline.conftest import run_here
 
 COMPILER = shutil.which("gcc") or shutil.which("clang")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
@@ -73,6 +74,34 @@ def test_estimates_are_equal_to_the_last_bit(
             if name in own[topic].columns:
                 both = own[topic][name], foreign[topic][name]
                 np.testing.assert_array_equal(*both, err_msg=f"{topic} {name}")
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+def test_check_says_whether_the_c_is_as_the_golden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=2.0)
+    monkeypatch.chdir(tmp_path)
+    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", sigma_range_m=0.2)
+    library = compiled(folder, "-shared", "-fPIC")
+    for name, sigma_m in (("same", 0.2), ("other", 0.3)):
+        kept = f"--update -e ekf --set ekf.model=robot --set ekf.sigma_range_m={sigma_m}"
+        assert run_here("check", log, "--against", f"{name}.golden.xz", *kept.split()).code == 0
+    checked = ("check", log, "--against", "same.golden.xz", "-e", f"lib:{library}")
+    said = run_here(*checked)
+    assert said.code == 0, said.out
+    assert said.out.startswith("all ")
+    said = run_here("check", log, "--against", "other.golden.xz", "-e", f"lib:{library}")
+    assert said.code == 2
+    assert "was deployed from another filter" in said.err
+    source = folder / "robot_ekf.c"
+    text = source.read_text()
+    source.write_text(text.replace("+= C[row][i] * v[i];", "+= 1.0001 * C[row][i] * v[i];"))
+    compiled(folder, "-shared", "-fPIC")
+    said = run_here(*checked)
+    assert said.code == 1
+    assert "/estimates/ekf/robot1/" in said.out
 
 
 def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
