@@ -183,6 +183,19 @@ def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
     assert (found.cause, found.topic) == ("clock", "/car/odometry")
 
 
+def test_of_equal_stamps_the_first_is_taken() -> None:
+    """So that nothing is divided by no time: a log with each message twice says what it says with one."""
+    for streams in (recorded(faulty(2000, "nothing")).streams, recorded_unit(ride(8000)).streams):
+        twice = {
+            topic: stream.take(np.repeat(np.arange(len(stream)), 2)) for topic, stream in streams.items()
+        }
+        [body], [doubled] = bodies(streams), bodies(twice)
+        for role, again in zip(body.roles, doubled.roles, strict=True):
+            for one, two in zip(role, again, strict=True):
+                assert np.array_equal(one.times_s, two.times_s)
+                assert np.array_equal(one.values, two.values)
+
+
 def test_errors_that_are_not_white_say_nothing_of_their_variance() -> None:
     clean = recorded(faulty(2000, "fix variance x 4"))
     slow = clean.streams["/car/fix"]
