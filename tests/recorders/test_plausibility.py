@@ -184,7 +184,7 @@ def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
 
 
 def test_of_equal_stamps_the_first_is_taken() -> None:
-    """So that nothing is divided by no time: a log with each message twice says what it says with one."""
+    """Nothing is divided by no time: a log with each message twice says what it says with one."""
     for streams in (recorded(faulty(2000, "nothing")).streams, recorded_unit(ride(8000)).streams):
         twice = {
             topic: stream.take(np.repeat(np.arange(len(stream)), 2)) for topic, stream in streams.items()
