@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.diagnosing.battery import battery
-from pipeline.diagnosing.battery.car import FAULTS, UNIT_FAULTS, faulty, recorded
+from pipeline.diagnosing.battery.car import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose
 from recorders.plausibility.body import bodies
