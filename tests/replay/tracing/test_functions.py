@@ -278,6 +278,6 @@ def test_parameters_are_unpacked_in_the_order_in_which_they_stand():
         offset, gain = parameters
         return (gain * given[0] + offset,)
 
-    values = namedtuple("values", ["offset", "gain"])(7.0, 3.0)  # noqa: PYI024
+    values = namedtuple("values", ["offset", "gain"])(7.0, 3.0)
     function = traced(scaled, 1, ("offset", "gain"))
     assert function((2.0,), values) == scaled((2.0,), values) == (13.0,)
