@@ -110,7 +110,7 @@ class _Import:
             values = [list(file.parameters.values())]
             times = [file.start_us]
             for time_us, name, value in file.changes:
-                if name in file.parameters:
+                if name in file.parameters and value != values[-1][names.index(name)]:
                     values.append(
                         [
                             value if each == name else old
