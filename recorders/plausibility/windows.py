@@ -105,8 +105,9 @@ def clear_moves(places: Series) -> Windows | None:
 
 def courses(body: Body) -> Series | None:
     """The course (n,) in rad where the body moves clearly: of velocities, else of places."""
+    of: Series | None
     if body.velocities:
-        of: Series = body.velocities[0]
+        of = body.velocities[0]
         moves = np.linalg.norm(of.values, axis=1) > CLEAR * noise_of(of.values)
         times_s, values = of.times_s[moves], of.values[moves]
     elif (of := places_of(body)) is not None and (moved := clear_moves(of)) is not None:

@@ -102,7 +102,7 @@ def _sort(words, numbers, at, place, known, times):  # type: ignore[no-untyped-d
                 is_timed[row] = True
                 latest = max(latest, stamp)
         else:
-            number = NUMBERS
+            number = np.int64(NUMBERS)
         whose[row] = number
         counts[number] += 1
     reached[size] = latest
