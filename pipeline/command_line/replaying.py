@@ -194,6 +194,9 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     "--fixed", multiple=True, help="A parameter of the calibration that stays as it is set (repeatable)."
 )
 @click.option(
+    "--next", "next_motion", is_flag=True, help="Say which manoeuvre of a wheeled robot to record next."
+)
+@click.option(
     "--bound",
     "bounds",
     multiple=True,
@@ -231,9 +234,9 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     the logs does not determine is named, stays where it started, and has no interval. settings.toml in
     the result folder is for --settings of fuselog replay and run.
     """
-    from pipeline.tuning.command import tune_logs
+    from pipeline.calibrating.command import calibrate_logs
 
-    tune_logs(list(logs), **options)
+    calibrate_logs(list(logs), **options)
 
 
 @command(
