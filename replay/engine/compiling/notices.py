@@ -11,6 +11,12 @@ from threading import Timer
 
 _LOG = logging.getLogger("fuselog")
 _PATIENCE_S = 1.0  # what compiles in less time is not told of
+_spent_s = [0.0]  # by this process
+
+
+def seconds_compiling() -> float:
+    """How long this process has compiled until now, where it was told of."""
+    return _spent_s[0]
 
 
 @contextmanager
@@ -24,7 +30,8 @@ def compiling(title: str) -> Iterator[None]:
         yield
     finally:
         patience.cancel()
-    took_s = time.perf_counter() - begun_s
+        took_s = time.perf_counter() - begun_s
+        _spent_s[0] += took_s
     if took_s > _PATIENCE_S:
         _say(f"compiled {title} in {took_s:.1f} s")
 
