@@ -36,14 +36,14 @@ fast-replay-lane: .venv/with-test
 	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
-	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*_stud*.py
+	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py
 
 inference-lane: .venv/with-test
 	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py \
 		--ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
 
 pipeline-lane: .venv/with-test
-	$(BIN)/pytest tests/pipeline --ignore-glob='*_stud*.py' --ignore=tests/pipeline/test_faults.py \
+	$(BIN)/pytest tests/pipeline --ignore-glob='*stud*.py' --ignore=tests/pipeline/test_faults.py \
 		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py
 
 rooms-lane: .venv/with-test

@@ -20,6 +20,7 @@ from pipeline.api.replays import Replay as Replay
 from pipeline.api.replays import replay as replay
 from pipeline.api.trajectories import Evaluation as Evaluation
 from pipeline.api.trajectories import evaluate as evaluate
+from pipeline.calibrating.calibrating import calibrate as calibrate
 from pipeline.comparing.comparing import Differences as Differences
 from pipeline.comparing.comparing import compare as compare
 from pipeline.deploying.deploying import deploy as deploy
@@ -47,7 +48,6 @@ from pipeline.sensing.noise import noise as noise
 from pipeline.sensing.outcome import SensorNoise as SensorNoise
 from pipeline.stressing.stressing import stress as stress
 from pipeline.stressing.verdicts import Stress as Stress
-from pipeline.tuning.calibrating import calibrate as calibrate
 from pipeline.tuning.outcome import Tuning as Tuning
 from pipeline.tuning.tuning import tune as tune
 from recorders.errors import BadInput as BadInput

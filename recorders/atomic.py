@@ -137,7 +137,8 @@ def _clear_leftovers(place: Path) -> bool:
         if "." in work.name.removeprefix(f".{place.name}.").removesuffix(".part"):
             continue  # of another place, whose name goes on
         if not _is_ours(work):
-            _LOG.warning("%s: was not written by this user's fuselog; it is left as it is", work)
+            if os.path.lexists(work):  # or else its maker has removed it since
+                _LOG.warning("%s: was not written by this user's fuselog; it is left as it is", work)
             continue
         with suppress(OSError):
             work.rmdir()  # its maker was killed before anything was in it
@@ -148,7 +149,8 @@ def _clear_leftovers(place: Path) -> bool:
         except (Timeout, OSError):
             at_work = True
             continue
-        _remove(work, place, lock)
+        with suppress(FileNotFoundError):  # its maker, who has just released the lock, was faster
+            _remove(work, place, lock)
     return at_work
 
 
@@ -159,11 +161,12 @@ def _is_ours(work: Path) -> bool:
         if not stat.S_ISDIR(state.st_mode) or (hasattr(os, "geteuid") and state.st_uid != os.geteuid()):
             return False
         members = {member.name: member for member in work.iterdir()}
+        lock = members.get(_LOCK)
+        locked = lock is not None and stat.S_ISREG(lock.lstat().st_mode)
     except OSError:
         return False
     others = {name for name in members if name not in (_LOCK, _OLD) and Path(name).stem != _NEW}
-    lock = members.get(_LOCK)
-    return not others and (not members or (lock is not None and stat.S_ISREG(lock.lstat().st_mode)))
+    return not others and (not members or locked)
 
 
 def _remove(work: Path, place: Path, lock: FileLock) -> None:

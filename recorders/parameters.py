@@ -9,7 +9,7 @@ from textwrap import shorten
 from tomllib import TOMLDecodeError
 from typing import Any, NamedTuple, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, GetJsonSchemaHandler, PydanticUserError, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -28,7 +28,9 @@ class Parameters(BaseModel):
     unit is the end of its name, or stands there too. `describe` has both.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, defer_build=True
+    )
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -68,6 +70,9 @@ def build(kind: type[ParametersType], values: Mapping[str, Any], where: str) -> 
             raise BadInput(f"{where}: {message}") from None
         given = shorten(repr(first["input"]), 60)
         raise BadInput(f"{where}: parameter '{name}' is {given}; {message}") from None
+    except PydanticUserError as error:  # a type is completed when it is first used, which starts sooner
+        why = str(error.message).partition(". ")[0]
+        raise BadInput(f"{where}: its parameters, {kind.__name__}, cannot be checked: {why}") from error
 
 
 @cache

@@ -3,6 +3,8 @@
 import os
 import sys
 import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -26,6 +28,25 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops in plain Python: the reference, which a debugger can follow."""
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+
+
+@contextmanager
+def without_drawing() -> Iterator[None]:
+    """Figures are made and written, but not drawn, which takes most of a short run's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("matplotlib.figure.Figure.draw", lambda *_: None)
+        yield
+
+
+@pytest.fixture(scope="module")
+def blank_figures() -> Iterator[None]:
+    """Nothing is drawn in modules that look at no drawing.
+
+    Those of experiments, sweeps, trajectories and the report draw theirs, and so do the studies whose
+    figures are no charts: all charts are drawn by the same code.
+    """
+    with without_drawing():
+        yield
 
 
 @pytest.fixture(scope="session")

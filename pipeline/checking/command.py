@@ -1,14 +1,15 @@
 """The command `fuselog check`: it replays, compares with a golden, and says what is first different."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pipeline.checking.checking import check, runs_of, update
+from pipeline.checking.checking import Runs, check, runs_of, update
 from pipeline.checking.golden import Tolerance
 from pipeline.checking.junit import JUNIT, write_junit
-from pipeline.checking.stored import read
+from pipeline.checking.stored import Golden, read
 from pipeline.output.outputs import check_files
 from pipeline.output.terminal import print_json, say
+from pipeline.runs.ensemble import Settings
 from pipeline.runs.settings import settings_of_estimators
 from recorders.errors import BadInput
 
@@ -27,8 +28,13 @@ def check_path(
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
+    in_place: Callable[[str, Runs, Golden], Settings] | None = None,
 ) -> bool:
-    """Check a path against a golden, or write that; whether all is as in the golden."""
+    """Check a path against a golden, or write that; whether all is as in the golden.
+
+    `in_place` makes of a program's name, of runs and of a golden what is replayed in place of its
+    estimator.
+    """
     if is_update:
         chosen = settings_of_estimators(labels, settings, settings_file)
         made = update(
@@ -44,14 +50,25 @@ def check_path(
         runs = len(made["runs"])
         say(f"{golden}: {runs} run{'s' * (runs != 1)}, {streams} streams, {size_kb:.0f} kB")
         return True
-    if labels or settings or settings_file or late or arrival_order or columns or tolerances:
+    is_replaced = in_place is not None and len(labels) == 1
+    if (
+        (labels and not is_replaced)
+        or settings
+        or settings_file
+        or late
+        or arrival_order
+        or columns
+        or tolerances
+    ):
         raise BadInput(
             f"{golden}: already states what is replayed and which differences are allowed; to change "
             "that, add --update"
         )
     if junit is not None:
         check_files([(junit, JUNIT)], {"golden": [golden]})
-    done = check(runs_of(path), read(golden))
+    sources, stored = runs_of(path), read(golden)
+    replaced = in_place(labels[0], sources, stored) if in_place and labels else None
+    done = check(sources, stored, replaced)
     if junit is not None:
         write_junit(junit, golden.name, done)
     if as_json:

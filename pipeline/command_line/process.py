@@ -78,29 +78,37 @@ def _stopped_by_signals() -> Iterator[None]:
     last_s = -math.inf
     report = sys.unraisablehook
 
-    def stop(number: int, _: FrameType | None) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal last_s
+        while frame is not None:
+            if frame.f_code is again.__code__:  # the machine is so busy that it is still at work
+                send_soon(number)
+                return
+            frame = frame.f_back
         before_s, last_s = last_s, time.monotonic()
-        if last_s - before_s > 1.0:  # `timeout` sends it twice: to the process and to its group
+        if number == signal.SIGINT or last_s - before_s > 1.0:  # `timeout` sends to process and group
             raise Stopped(number)
 
     def again(lost: "sys.UnraisableHookArgs") -> None:
         nonlocal last_s
-        if not isinstance(lost.exc_value, KeyboardInterrupt):
+        if isinstance(lost.exc_value, Stopped):
+            last_s = -math.inf
+            send_soon(lost.exc_value.number)
+        else:
             report(lost)
-            return
-        last_s = -math.inf
-        number = lost.exc_value.number if isinstance(lost.exc_value, Stopped) else signal.SIGINT
-        threading.Timer(0.01, interrupt_main, [number]).start()  # by then the finalizer has ended
+
+    def send_soon(number: int) -> None:
+        threading.Timer(0.01, interrupt_main, [number]).start()
 
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    asked = [
-        getattr(signal, name)
-        for name in ("SIGTERM", "SIGHUP")
-        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is signal.SIG_DFL
-    ]
+    usual = {"SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL, "SIGINT": signal.default_int_handler}
+    asked = {
+        getattr(signal, name): handler
+        for name, handler in usual.items()
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is handler
+    }
     for number in asked:
         signal.signal(number, stop)
     sys.unraisablehook = again
@@ -108,8 +116,8 @@ def _stopped_by_signals() -> Iterator[None]:
         yield
     finally:
         sys.unraisablehook = report
-        for number in asked:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in asked.items():
+            signal.signal(number, handler)
 
 
 def _sentence(error: Exception, place: str) -> str:

@@ -194,6 +194,9 @@ def tune(logs: tuple[Path, ...], **options: Any) -> None:
     "--fixed", multiple=True, help="A parameter of the calibration that stays as it is set (repeatable)."
 )
 @click.option(
+    "--next", "next_motion", is_flag=True, help="Say which manoeuvre of a wheeled robot to record next."
+)
+@click.option(
     "--bound",
     "bounds",
     multiple=True,
@@ -231,15 +234,16 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     the logs does not determine is named, stays where it started, and has no interval. settings.toml in
     the result folder is for --settings of fuselog replay and run.
     """
-    from pipeline.tuning.command import tune_logs
+    from pipeline.calibrating.command import calibrate_logs
 
-    tune_logs(list(logs), **options)
+    calibrate_logs(list(logs), **options)
 
 
 @command(
     "Check that estimators still give what a golden has.",
     "fuselog check run.mcap --against ekf.golden.xz --update -e ekf",
     "fuselog check run.mcap --against ekf.golden.xz",
+    "fuselog check run.mcap --against ekf.golden.xz -e lib:./robot_ekf.so",
 )
 @click.argument("path", type=ANY_PATH)
 @click.option("--against", "golden", type=GOLDEN, required=True, help="The golden, a .golden.xz file.")
@@ -249,7 +253,8 @@ def calibrate(logs: tuple[Path, ...], **options: Any) -> None:
     "--estimator",
     "labels",
     multiple=True,
-    help="With --update: an estimator of the golden (repeatable).",
+    help="With --update: an estimator of the golden (repeatable). Without: a program to check in the "
+    "place of the golden's estimator, as lib:./robot_ekf.so.",
 )
 @arrival_option
 @late_option
@@ -278,11 +283,13 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     """Replay PATH, a log, a folder of logs or a result, and compare with a golden field by field.
 
     It exits with 1 where something is different, and prints the first difference with its stamp. An
-    intended change updates the golden in the same commit.
+    intended change updates the golden in the same commit. A filter that fuselog deploy wrote is checked
+    with -e lib:PATH, and has to be made of the golden's filter.
     """
     from pipeline.checking.command import check_path
+    from pipeline.deploying.deploying import in_place_of_golden
 
-    if not check_path(path, golden, **options):
+    if not check_path(path, golden, **options, in_place=in_place_of_golden):
         click.get_current_context().exit(1)
 
 
@@ -302,6 +309,7 @@ def check(path: Path, golden: Path, **options: Any) -> None:
     help="The folder to write, new or empty; its name is the filter's in C.",
 )
 @click.option("--single", is_flag=True, help="In single precision, float.")
+@json_option
 @settings_option
 @set_option("estimators")
 def deploy(name: str, settings_file: Path | None, settings: tuple[str, ...], **options: Any) -> None:

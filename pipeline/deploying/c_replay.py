@@ -70,7 +70,8 @@ def _description(made: CFilter) -> str:
         )
     return json.dumps(
         {
-            "summary": f"{made.origin.rstrip('.')}, in C ({made.digest})",
+            "summary": f"{made.origin.rstrip('.')}, in C",
+            "digest": made.digest,
             "topics": topics,
             "prior": model.prior,
             "truth": model.truth,

@@ -1,10 +1,12 @@
 """The command `fuselog deploy`: it writes a filter as C, and says how to build it."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipeline.deploying.certificate import CERTIFICATE
 from pipeline.deploying.deploying import deploy
-from pipeline.output.terminal import say
+from pipeline.output.terminal import print_json, say
 from pipeline.runs.settings import settings_of_estimators
 
 
@@ -17,9 +19,13 @@ def deploy_filter(
     model: str | None,
     out: Path,
     single: bool,
+    as_json: bool,
 ) -> None:
-    """Write a filter into a folder."""
+    """Write a filter into a folder, and say what is in it, or with `as_json` its certificate."""
     chosen = settings_of_estimators([name], settings, settings_file, model=model)
     folder = deploy(log, chosen, out, single=single)
+    if as_json:
+        print_json(json.loads((folder / CERTIFICATE).read_text(encoding="utf-8")))
+        return
     say(f"{folder}: {', '.join(sorted(each.name for each in folder.iterdir()))}")
     say(f"{folder / 'README.md'} says how to build, test and replay it")

@@ -6,20 +6,26 @@ from typing import Any
 
 from pipeline.api.planning import open as open_source
 from pipeline.api.planning import settings_of
+from pipeline.checking.checking import Runs
+from pipeline.checking.stored import Golden
 from pipeline.deploying.c_filter import source
 from pipeline.deploying.c_header import header
 from pipeline.deploying.c_names import CFilter, identifier
 from pipeline.deploying.c_replay import replay_text, why_no_replay
 from pipeline.deploying.c_test import test_text, vectors_of, vectors_text
+from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from pipeline.deploying.folder import cmake_text, readme_text
+from pipeline.runs.ensemble import Settings
 from recorders.atomic import whole_folder
 from recorders.errors import BadInput
 from replay.engine.replaying.estimator import Recursive, bind, configure
+from replay.foreign.filters import description_of_library
+from replay.foreign.naming import shorthand
 from replay.foreign.native.library import HEADER
 from replay.inference.kalman.methods import FILTERS
 from replay.inference.run.filtering import Filter
 from replay.inference.whole_steps import EXTENDED, SAMPLED, whole_steps
-from replay.tracing.c_text import DOUBLE, SINGLE
+from replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
 KINDS = {"ekf": EXTENDED, "ukf": SAMPLED}
 
@@ -52,28 +58,25 @@ def deploy(
     >>> write("run.mcap", record("landmarks", seed=7, duration_s=2.0))
     >>> folder = deploy("run.mcap", "ekf", "robot_ekf", model="robot")
     >>> sorted(each.name for each in folder.iterdir())[:3]
-    ['CMakeLists.txt', 'README.md', 'fuselog_filter.h']
+    ['CMakeLists.txt', 'README.md', 'certificate.json']
     """
     [(label, settings)] = settings_of(estimator).items()
     place = Path(out)
     _check_empty(place)
-    run = open_source(log)
-    bound, filtering, kind = _bound(label, {**settings, **parameters}, run)
-    made = CFilter(
-        identifier(place.resolve().name),
-        filtering,
-        whole_steps(filtering, kind),
-        SINGLE if single else DOUBLE,
-        f"{filtering.stage.model.summary}: {filtering.method.summary}.",
-    )
-    vectors = vectors_of(run, bound, filtering)
+    run, name = open_source(log), identifier(place.resolve().name)
+    precision = SINGLE if single else DOUBLE
+    bound, made = _made(name, label, {**settings, **parameters}, run, precision)
+    vectors = vectors_of(run, bound, made.filtering)
+    own_header, own_source = header(made), source(made)
+    certificate = certificate_of(made, own_source, own_header)
     files = {
-        f"{made.name}.h": header(made),
-        f"{made.name}.c": source(made),
+        f"{made.name}.h": own_header,
+        f"{made.name}.c": own_source,
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
         "CMakeLists.txt": cmake_text(made),
-        "README.md": readme_text(made, Path(log).name),
+        "README.md": readme_text(made, Path(log).name, certificate),
+        CERTIFICATE: certificate_text(made, certificate),
     }
     if not why_no_replay(made):
         files[f"{made.name}_replay.c"] = replay_text(made)
@@ -82,6 +85,50 @@ def deploy(
         for name, text in files.items():
             (folder / name).write_text(text, encoding="utf-8")
     return place
+
+
+def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
+    """Put a program in the place of a golden's estimator, for `pipeline.checking.checking.check`.
+
+    Args:
+        name: the program, as `lib:./robot_ekf.so`.
+        runs: what the golden is of.
+        golden: as `pipeline.checking.stored.read` has it.
+
+    Returns the program's settings by the golden's label. Raises BadInput where `name` is no program,
+    where the golden has not one estimator, and where the program was deployed from another filter.
+    """
+    _, program = shorthand(name)
+    if not program:
+        raise BadInput(
+            f"-e {name}: a golden states its estimators; give a program to check in place of one, as "
+            "lib:PATH, or add --update"
+        )
+    stored = golden["settings"]["estimators"]
+    if len(stored) != 1:
+        raise BadInput(
+            f"-e {name}: the golden has {len(stored)} estimators; give one of the filter alone, as "
+            "--update -e ekf writes it"
+        )
+    [(label, settings)] = stored.items()
+    found = description_of_library(label, program).digest if program["kind"] == "lib" else ""
+    for run in runs.values() if found else ():
+        _, made = _made("filter", label, settings, run, DOUBLE)
+        if made.digest != found:
+            raise BadInput(
+                f"{program['path']}: was deployed from another filter ({found}) than the golden's "
+                f"{label} is in {run.name} ({made.digest}); deploy that one, with the same settings"
+            )
+    return {label: program}
+
+
+def _made(
+    name: str, label: str, settings: Mapping[str, Any], run: Any, precision: Precision
+) -> tuple[Recursive, CFilter]:
+    """Bind a filter to a log, and trace its steps."""
+    bound, filtering, kind = _bound(label, dict(settings), run)
+    origin = f"{filtering.stage.model.summary}: {filtering.method.summary}."
+    return bound, CFilter(name, filtering, whole_steps(filtering, kind), precision, origin)
 
 
 def _check_empty(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from pipeline.deploying.c_header import data_of
 from pipeline.deploying.c_names import CFilter
 from pipeline.deploying.c_replay import why_no_replay
+from pipeline.deploying.certificate import OPTIONS, Certificate, Cost
 
 
 def cmake_text(made: CFilter) -> str:
@@ -33,7 +34,34 @@ def cmake_text(made: CFilter) -> str:
     return "\n".join(lines) + "\n"
 
 
-def readme_text(made: CFilter, log: str) -> str:
+def _costs(certificate: Certificate) -> str:
+    """Write what a step costs."""
+    rows: dict[str, Cost] = {f"`{name}`": cost for name, cost in certificate.steps.items()}
+    rows["worst case: `predict` and the costliest update"] = certificate.worst
+    table = "\n".join(f"| {name} | {' | '.join(map(str, cost))} |" for name, cost in rows.items())
+    memory = certificate.memory
+    bytes_said = (
+        "No GCC was there to tell the bytes of code and stack."
+        if memory is None
+        else f"{memory.compiler}, {' '.join(OPTIONS)}: {memory.text} bytes of code and\nconstants, "
+        f"and {memory.stack} bytes of stack in the deepest chain of calls, without those of libm's own."
+    )
+    saved = (
+        f" Of the products F P F', P H' and\nH P H', {certificate.sparse} flops are left of "
+        f"{certificate.dense}: the others have known zeros and ones."
+        if certificate.dense
+        else ""
+    )
+    return f"""| function | flops | square roots | other calls of libm |
+|---|---|---|---|
+{table}
+
+At most: both sides of every condition count.{saved}
+
+{bytes_said}"""
+
+
+def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
     """Write README.md."""
     name, upper = made.name, made.name.upper()
     control = ", control" if made.is_interpolated else ""
@@ -85,4 +113,8 @@ all with the same libm, in double precision and without fused multiply-adds, whi
 `-ffp-contract=off` forbids.
 
 {back}
+
+## What it costs
+
+{_costs(certificate)}
 """

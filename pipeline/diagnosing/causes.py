@@ -46,6 +46,7 @@ class Cause(NamedTuple):
         ends: of the 95 % interval of that.
         gain: in log-likelihood, after all causes before it.
         others: causes that explain the log as well, or nearly: it does not tell which of them it is.
+        of_halves: what either half of the measurements gains, where all other causes are undone.
     """
 
     hypothesis: Hypothesis
@@ -53,6 +54,7 @@ class Cause(NamedTuple):
     ends: tuple[Number, Number]
     gain: float
     others: tuple["Cause", ...] = ()
+    of_halves: tuple[float, float] = (np.inf, np.inf)
 
     @property
     def said(self) -> str:
@@ -77,7 +79,11 @@ class Cause(NamedTuple):
             else f"; or else, which this log does not tell from it, {each.said}"
             for each in self.others
         )
-        return f"{self.said}{or_else}; without this the log-likelihood gains {number(self.gain, 4)}"
+        first, second = self.of_halves
+        half, worst = ("first", first) if first < second else ("second", second)
+        but = f"; but over the {half} half of the log it loses {number(-worst, 4)}: there it is not so"
+        gained = f"; without this the log-likelihood gains {number(self.gain, 4)}"
+        return f"{self.said}{or_else}{gained}{but if worst < -DROP_95 else ''}"
 
 
 class Tried(NamedTuple):
@@ -306,6 +312,23 @@ def _intervals(gains_of: GainsOf, at: Peak, of: Hypothesis) -> tuple[Number, Num
     return tuple(map(float, values - spread)), tuple(map(float, values + spread))
 
 
+def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -> list[Cause]:
+    """The causes with what either half of the log gains: what is wrong with a log is so in both."""
+    trials = [base] * (len(causes) + 1)
+    for place, cause in enumerate(causes):
+        trials = [
+            each if own == place else cause.hypothesis.without(each, cause.value)
+            for own, each in enumerate(trials)
+        ]
+    *lacking, mended = likelihood(trials)
+    *lacking_first, mended_first = likelihood([each._replace(share=0.5) for each in trials])
+    found = []
+    for cause, of_all, of_first in zip(causes, lacking, lacking_first, strict=True):
+        first = mended_first - of_first
+        found.append(cause._replace(of_halves=(first, mended - of_all - first)))
+    return found
+
+
 class Sought(NamedTuple):
     """What was found.
 
@@ -340,4 +363,4 @@ def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: in
     causes, tried = find_causes(
         likelihood, base, hypotheses(bound, base, seen, likelihood.readings), most
     )
-    return Sought(causes, tried, before)
+    return Sought(_over_halves(likelihood, base, causes), tried, before)

@@ -44,11 +44,13 @@ class Trial(NamedTuple):
 
     `stretched` is by topic the logarithm of how many times larger the volumes are in which a message's
     measurement lies, compared with the log's: a density of numbers in other units is another one.
+    `share` is of the measurements: these first ones alone count.
     """
 
     source: MemorySource
     settings: Mapping[str, Any]
     stretched: Mapping[str, float] = {}
+    share: float = 1.0
 
 
 class Scored(NamedTuple):
@@ -60,6 +62,7 @@ class Scored(NamedTuple):
         left: by estimate, what the broad model says of the others.
         beyond: by estimate, how many these are.
         stretch: by estimate, what is added since measurements are in other units than the log's.
+        share: of its measurements, that counts.
     """
 
     source: MemorySource
@@ -67,6 +70,7 @@ class Scored(NamedTuple):
     left: Mapping[str, float]
     beyond: Mapping[str, int]
     stretch: Mapping[str, float]
+    share: float
 
 
 @dataclass
@@ -184,7 +188,7 @@ class Likelihood:
         if self.later_ns:
             streams = {topic: _later(stream, self.later_ns) for topic, stream in streams.items()}
         source = replace(trial.source, streams=streams)
-        return Scored(source, min(begins) + self.later_ns, left, count, stretch)
+        return Scored(source, min(begins) + self.later_ns, left, count, stretch, trial.share)
 
     def _innovations(
         self, trials: Sequence[Trial], scored: Sequence[Scored]
@@ -229,6 +233,7 @@ class Likelihood:
             lacking = all_ - scored.beyond.get(name, 0) - len(stream)
             if len(stream) < LEAST_SCORED * all_ or (lacking and name not in self.readings):
                 return {}
+            stream = stream.take(slice(round(scored.share * len(stream))))
             is_in = stream["accepted"] != 0
             total = float(np.sum(stream["log_likelihood"][is_in]))
             if not is_in.all():
@@ -239,8 +244,9 @@ class Likelihood:
                     total += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
             if name in self.readings:
                 own = [self.broad[each] for each in self.readings[name].kinds if each in self.broad]
-                total += lacking * float(np.mean(own)) if lacking else 0.0
-                total += scored.left.get(name, 0.0) + scored.stretch.get(name, 0.0)
+                more = lacking * float(np.mean(own)) if lacking else 0.0
+                more += scored.left.get(name, 0.0) + scored.stretch.get(name, 0.0)
+                total += scored.share * more
             found[name] = total
         return found
 

@@ -16,11 +16,12 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 PER_DECADE = 8
 _BLOCK = 1 << 16
-_FULL = 1 << 17  # samples, from which on degrees of freedom are those of a grid of 1000 a window
+_FULL = 1 << 17  # samples, from which on every so many differences are looked at
+_A_WINDOW = 1000  # differences a window then, which are as good as all
 
 
 class Curve(NamedTuple):
-    """An Allan deviation: times (n,), deviations (n,), and how many differences (n,) each is of."""
+    """An Allan deviation: times (n,), deviations (n,), and how many differences (n,) there are."""
 
     taus_s: Floats
     deviations: Floats
@@ -34,10 +35,15 @@ def multiples_of(count: int) -> Integers:
     return np.unique(np.floor(spread + 1e-9).astype(np.int64))
 
 
+def _stride(multiple: int, count: int) -> int:
+    """Every how many differences are looked at: neighbours of long windows are nearly the same."""
+    return max(1, multiple // _A_WINDOW) if count > _FULL else 1
+
+
 def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve:
     """The overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
 
-    Only pairs of whole windows count.
+    Only pairs of whole windows count. Of many samples a thousand differences a window do.
 
     Args:
         values: the samples, in any unit, on a grid without gaps.
@@ -51,14 +57,15 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
     lost = None if is_there.all() else np.concatenate([[0], np.cumsum(~is_there)])
     squares, pairs = np.zeros(len(multiples)), np.zeros(len(multiples), np.int64)
     for place, m in enumerate(multiples.tolist()):
-        for begin in range(0, len(values) - 2 * m + 1, _BLOCK):
-            end = min(begin + _BLOCK, len(values) - 2 * m + 1)
-            outer = phases[begin + 2 * m : end + 2 * m] + phases[begin:end]
-            found = outer - 2 * phases[begin + m : end + m]
+        stride = _stride(m, len(values))
+        for begin in range(0, len(values) - 2 * m + 1, _BLOCK * stride):
+            end = min(begin + _BLOCK * stride, len(values) - 2 * m + 1)
+            here, later, last = (slice(begin + k * m, end + k * m, stride) for k in range(3))
+            found = phases[last] + phases[here] - 2 * phases[later]
             if lost is not None:
-                found = found[lost[begin + 2 * m : end + 2 * m] == lost[begin:end]]
-            squares[place] += np.square(found).sum()
-            pairs[place] += len(found)
+                found = found[lost[last] == lost[here]]
+            squares[place] += stride * (found @ found)
+            pairs[place] += stride * len(found)
     with np.errstate(divide="ignore", invalid="ignore"):
         deviations = np.sqrt(squares / (2.0 * multiples**2 * pairs))
     return Curve(np.asarray(multiples * step_s, float), deviations, pairs)
@@ -66,7 +73,7 @@ def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve
 
 def degrees_of_freedom(terms: Terms, step_s: float, multiple: int, pairs: int) -> float:
     """Return the degrees of freedom of an Allan variance of `pairs` differences, by its terms."""
-    coarser = max(1, multiple // 1000) if pairs + 2 * multiple > _FULL else 1
+    coarser = _stride(multiple, pairs + 2 * multiple)
     multiple, pairs, step_s = multiple // coarser, max(1, pairs // coarser), step_s * coarser
     g = terms.autocovariance(multiple, step_s, pairs)
     weights = 2.0 * (pairs - np.arange(len(g)))

@@ -23,6 +23,8 @@ from recorders.log import Stream
 Floats = NDArray[np.float64]
 _DOUBTFUL = 0.999  # the interval that a fitted curve is to lie in, at each of thirty times
 _FEWEST_DEGREES = 3.0
+_CLOCKS = "publish_time_ns", "log_time_ns", "position"
+_BLOCK = 1 << 18  # messages that are read at once
 
 
 def noise(
@@ -50,9 +52,10 @@ def noise(
     wanted = [topics] if isinstance(topics, str) else list(topics)
     found: list[ColumnNoise] = []
     for topic, fields in _chosen(source, wanted).items():
-        stream = source.read([topic])[topic]
+        fields = fields or _numbers(source.empty(topic))
+        stream = _read(source, topic, fields)
         grid = preparing.grid_of(stream)
-        for name in fields or _numbers(stream):
+        for name in fields:
             values = np.asarray(stream[name], float).reshape(len(stream), -1)
             for place, column in enumerate(values.T):
                 if np.isfinite(column).any():
@@ -102,6 +105,18 @@ def _numbers(stream: Stream) -> list[str]:
         for name, column in stream.columns.items()
         if column.dtype.kind == "f" and "covariance" not in name
     ]
+
+
+def _read(source: Any, topic: str, fields: Sequence[str]) -> Stream:
+    """A topic with these fields alone; of a log that fills memory no column is there twice but one."""
+    empty = source.empty(topic)
+    parts = [block[topic] for block in source.blocks([topic], "publish_time", _BLOCK) if topic in block]
+    kept: dict[str, list[NDArray[Any]]] = {name: [part[name] for part in parts] for name in fields}
+    clocks = [[getattr(part, name) for part in parts] for name in _CLOCKS]
+    del parts
+    joined = {name: np.concatenate(kept.pop(name) or [empty[name]]) for name in fields}
+    times = [np.concatenate(clocks.pop(0) or [getattr(empty, name)]) for name in _CLOCKS]
+    return replace(empty, columns=joined, **dict(zip(_CLOCKS, times, strict=True)))
 
 
 def _analysed(

@@ -4,12 +4,14 @@ White noise N, random walk K, Gauss-Markov noise of standard deviation s and tim
 With u the unit of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+_DECAYED = 1e-7  # of the variance: what is left of an autocovariance counts by its square
 
 
 class Terms(NamedTuple):
@@ -33,18 +35,16 @@ class Terms(NamedTuple):
         what the Allan variance is the mean square of. Beyond twice that distance only the Gauss-Markov
         term is left; it ends where it has decayed.
         """
-        memory = int(40 * self.markov_time_s / step_s) if self.markov else 0
-        lags = np.arange(min(count, 2 * multiple + 2 + memory), dtype=float)
-        near = lags[: 2 * multiple + 2]
-        found = np.zeros(len(lags))
-        found[: len(near)] = self._second_differences(multiple, step_s, near)
-        beyond = lags[len(near) :]
-        if len(beyond):
-            a, power = self._decay(step_s)
-            # all four differences of an exponential, without their cancellation
-            whole = np.expm1(multiple * np.log(a)) ** 4
-            found[len(near) :] = -power * whole * a ** (beyond - 2 * multiple)
-        return found
+        near = np.arange(min(count, 2 * multiple + 2), dtype=float)
+        found = self._second_differences(multiple, step_s, near)
+        if not self.markov:
+            return found
+        a, power = self._decay(step_s)
+        # all four differences of an exponential, without their cancellation
+        tail = -power * np.expm1(multiple * np.log(a)) ** 4
+        lasts = math.log(max(abs(tail) / (_DECAYED * found[0]), 1.0)) * self.markov_time_s / step_s
+        beyond = np.arange(len(near), min(count, len(near) + int(lasts)), dtype=float)
+        return np.concatenate([found, tail * a ** (beyond - 2 * multiple)])
 
     def _second_differences(
         self, multiple: Floats | int, step_s: float, lags: Floats | float = 0.0

@@ -1,6 +1,6 @@
-"""The commands `fuselog tune` and `calibrate`: they print what was found, and write its folder."""
+"""The command `fuselog tune`, and what `calibrate` shares with it: what is printed and written."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -11,9 +11,8 @@ from pipeline.output.outputs import check_folder
 from pipeline.output.results import plain
 from pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
 from pipeline.runs.settings import settings_of_estimators, split_texts
-from pipeline.tuning.calibrating import calibrate
 from pipeline.tuning.objective import Best, By
-from pipeline.tuning.outcome import SETTINGS
+from pipeline.tuning.outcome import SETTINGS, Tuning
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput
 from recorders.log import open_log
@@ -25,7 +24,7 @@ def tune_logs(
     *,
     label: str,
     free: Sequence[str] = (),
-    fixed: Sequence[str] | None = None,
+    search: Callable[..., Tuning] | None = None,
     by: By = "likelihood",
     bounds: Sequence[str],
     grid: int = 1,
@@ -43,7 +42,7 @@ def tune_logs(
 ) -> None:
     """Say what is tuned on and what is held out, tune, write the result folder, print what was found.
 
-    With what is `fixed` a model's calibration is searched for, in place of what is `free`.
+    A `search` of one's own knows what is free and what is best, in place of `free`, `by` and `grid`.
     """
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
@@ -60,12 +59,8 @@ def tune_logs(
             )
             show(f"{best.evaluations} evaluations; best so far: {values}")
 
-        search = (
-            partial(tune, free=free, by=by, grid=grid)
-            if fixed is None
-            else partial(calibrate, fixed=fixed)
-        )
-        found = search(
+        find = search or partial(tune, free=free, by=by, grid=grid)
+        found = find(
             [LogSource(open_log(path, recover=recover)) for path in logs],
             chosen,
             set=alterations,

@@ -49,6 +49,7 @@ class Tuning:
         held_out_costs: (2,) the same of the logs held out, if any.
         folds: a row per fold: the values by all other logs, and what its own logs cost with them.
         gate: the probability of the gate that was open in the search.
+        advice: sentences on what to record next.
     """
 
     label: str
@@ -61,6 +62,7 @@ class Tuning:
     held_out_costs: Floats | None
     folds: pd.DataFrame
     gate: float
+    advice: Sequence[str] = ()
 
     def __repr__(self) -> str:
         title = f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}"
@@ -184,6 +186,7 @@ class Tuning:
             *self._notes_of_innovations(),
             *self._notes_of_truth(),
             *self._notes_of_others(),
+            *self.advice,
         ]
 
     @property

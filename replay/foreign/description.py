@@ -104,6 +104,7 @@ class Description(_Part):
         truth: the topic of the truth.
         output: what its topic of estimates ends with.
         failures: sentences; a function that returns n means the n-th.
+        digest: of a filter that `fuselog deploy` wrote, that of its graphs and numbers.
     """
 
     summary: str
@@ -115,6 +116,7 @@ class Description(_Part):
     truth: str = ""
     output: str = Field("state", pattern=r"^\w+$")
     failures: tuple[str, ...] = ()
+    digest: str = ""
 
     @cached_property
     def tangent(self) -> int:

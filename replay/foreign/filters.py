@@ -281,6 +281,12 @@ def bind_apart(found: FoundFilter, follow_runs: FollowRuns, window_ns: int = IN_
 # --- libraries --------------------------------------------------------------------------------------
 
 
+def description_of_library(label: str, settings: Mapping[str, Any]) -> Description:
+    """Read what the library that settings name says of itself; raises BadInput where it may not run."""
+    file = _file(Path(what_runs(label, "lib", settings)).absolute())
+    return _description(file, in_process=False)
+
+
 @dataclass(frozen=True)
 class _OfLibraries(Estimator[Any]):
     """Makes an estimator of the library that settings name."""

@@ -19,9 +19,9 @@ from replay.engine.streams.blocks import gather
 from replay.estimators.tracking.gaussian_mixture_phd import (
     PhdParameters,
     filter_scans,
+    no_components,
     scans_of,
     settings_of,
-    start,
 )
 from replay.judging.errors.truths import Truths
 from replay.judging.sets.distances import gospa
@@ -77,10 +77,15 @@ def filter_seconds(sources: list) -> float:
     """Wall time per scan of our filter, over all runs, one after another."""
     names = ("/sensor/scan", "/sensor/detection")
     scans = scans_of(*(gather([each.streams[name] for each in sources]) for name in names))
-    priors = [name for name in sources[0].streams if name.endswith("/prior")]
-    whole = {name: gather([each.streams[name] for each in sources]) for name in priors}
     settings = settings_of(PARAMETERS, sources[0].topics[names[0]])
-    mixture = start(whole, most=PARAMETERS.most_components)
+    mixture = no_components(len(sources), PARAMETERS.most_components)
+    for run, each in enumerate(sources):
+        priors = [rows for name, rows in each.streams.items() if name.endswith("/prior")]
+        mixture.used[run] = len(priors)
+        for component, prior in enumerate(priors):
+            mixture.time_ns[run], mixture.weight[run, component] = prior.publish_time_ns[0], 1.0
+            mixture.mean[run, component] = prior["mean"][0]
+            mixture.covariance[run, component] = prior["covariance"][0].reshape(4, 4)
     filter_scans(mixture, scans, settings)
     times = []
     for _ in range(REPEATS):

@@ -19,6 +19,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 WORKED_THROUGH = {each if isinstance(each, str) else each.values[0] for each in WORKED}
 BY_OTHERS = {"python", "your-estimator", "your-model"}  # tests/pipeline
 HERE = {"compare", "many-runs"}
+pytestmark = pytest.mark.usefixtures("blank_figures")
 
 
 def python_of(name: str) -> list[str]:

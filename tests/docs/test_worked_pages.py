@@ -45,6 +45,7 @@ PEERS = (
     "filterpy",
     "stonesoup",
 )  # of the extra `bench`; without one its code is not run
+pytestmark = pytest.mark.usefixtures("blank_figures")
 _BLOCK = re.compile(r"^```(\w*)(?: title=\"(.*?)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

@@ -71,7 +71,9 @@ def holders() -> dict[str, set[str]]:
                 found[node.name] |= {
                     inner.attr
                     for inner in ast.walk(node)
-                    if isinstance(inner, ast.Attribute) and ast.unparse(inner.value) == "self"
+                    if isinstance(inner, ast.Attribute)
+                    and isinstance(inner.value, ast.Name)
+                    and inner.value.id == "self"
                 }
                 bases[node.name] |= {ast.unparse(base).partition("[")[0] for base in node.bases}
     fields = found["a variable"] = set[str]()

@@ -6,7 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from mcap.writer import Writer
 from pipeline.command_line import main
 from recorders.log import Field, Schema, Stream, make_stream, open_log, read_streams, schemas, write_log
 from recorders.recording import record_run
+from tests.conftest import without_drawing
 
 SHORT = ["--set", "duration_s=2"]
 
@@ -50,17 +51,6 @@ def fuselog() -> Callable[..., Said]:
     return run_here
 
 
-@pytest.fixture(scope="module")
-def blank_figures() -> Iterator[None]:
-    """Figures are written without being drawn, which takes most of a short run's time.
-
-    For modules that look at none; those of studies, experiments, sweeps and the report draw theirs.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("matplotlib.figure.Figure.draw", lambda *_: None)
-        yield
-
-
 @pytest.fixture(scope="session")
 def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
     """Start a command as a process of its own."""
@@ -83,7 +73,7 @@ def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of good and of broken input; tests read it and write nothing there."""
     folder = tmp_path_factory.mktemp("world")
-    with chdir(folder):
+    with chdir(folder), without_drawing():
         for command in (
             ["record", "landmarks", *SHORT, "-o", "log.mcap"],
             ["record", "landmarks", *SHORT, "--seed", "1", "-o", "other.mcap"],

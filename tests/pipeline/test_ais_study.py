@@ -14,6 +14,8 @@ from pipeline.output.claims import decide
 from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 HEADER = "Time,MMSI,Latitude_degrees,Longitude_degrees,COG_degrees,SOG_knots"
 
 

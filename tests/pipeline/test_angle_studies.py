@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.runs.experiment import load_experiment, run_experiment
 
-pytestmark = pytest.mark.paper
+pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 
 def run(name: str, folder: Path, settings: dict, runs: int) -> dict:

@@ -15,6 +15,8 @@ from recorders.errors import BadInput
 from recorders.parameters import build
 from tests.claims.pages import FOLDER
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 STORED = json.loads((FOLDER / "autoferry.json").read_text(encoding="utf-8"))
 LATE = ("jipda-radar-lidar", "jipda-all")
 

@@ -7,6 +7,8 @@ from pipeline.runs.experiment import load_experiment, run_experiment
 from pipeline.studies.biometrics.sequential import Drawn, Options, wald_tests, watched
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 USERS = 400
 SHIFT = 2.5  # of the person's scores, which are normal: the ratio of x is SHIFT x - SHIFT^2 / 2
 OPTIONS = Options(rates=[(0.01, 0.01)], watched=20, watched_probes=3000, label_ratio=4.0)

@@ -1,14 +1,29 @@
 """Calibration: car C of the sheet of sensors, section 2, and what its motion does not determine."""
 
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.diagnosing.battery.car import Floats
+from pipeline.calibrating.car import (
+    NAMES,
+    OURS,
+    TRUTH,
+    Floats,
+    Motion,
+    circle,
+    circles,
+    drive,
+    recorded,
+    rich,
+    slalom,
+    straight,
+)
+from pipeline.calibrating.manoeuvres import advice, gain
 from pipeline.tuning.information import information
-from tests.pipeline.car_c import NAMES, TRUTH, drive, recorded, rich
+from pipeline.tuning.objective import in_memory
+from replay.engine.replaying.estimator import bind
 
 A_V, A_W, B_W = TRUTH[:3]
 # the sheet's noise is that of the motion, ours that of the readings, which are its times the scales
@@ -17,21 +32,10 @@ OPEN = {
     "forward_noise_density": 0.05 * A_V,
     "turn_noise_density": 0.01 * A_W,
 }
-# our scales and bias are of the motion by the reading; the sheet's of the reading by the motion
-OURS = np.array([1.0 / A_V, 1.0 / A_W, -B_W / A_W, *TRUTH[3:]])
+BY_SHEET = np.eye(7)  # derivatives of our parameters by the sheet's
+BY_SHEET[0, 0], BY_SHEET[1, 1] = -1.0 / A_V**2, -1.0 / A_W**2
+BY_SHEET[2, 1:3] = B_W / A_W**2, -1.0 / A_W
 USEFUL = np.array([0.01, 0.01, 0.01, 0.2, 0.2, 0.05, 0.02])
-
-
-def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    return 8.0 + 0.0 * time_s, 0.0 * time_s
-
-
-def circle(time_s: Floats) -> tuple[Floats, Floats]:
-    return 8.0 + 0.0 * time_s, 0.4 + 0.0 * time_s
-
-
-def slalom(time_s: Floats) -> tuple[Floats, Floats]:
-    return 8.0 + 0.0 * time_s, 0.4 * np.sin(0.8 * time_s)
 
 
 def test_the_car_of_the_sheet() -> None:
@@ -61,7 +65,7 @@ def test_the_car_of_the_sheet() -> None:
     ],
 )
 def test_what_the_motion_does_not_determine_is_named_and_held(
-    motion: Callable[[Floats], tuple[Floats, Floats]], eigenvalues: list[float], held: list[str]
+    motion: Motion, eigenvalues: list[float], held: list[str]
 ) -> None:
     log = recorded(drive(None, motion), (1000.0, 1000.0, 1.0))
     found = fl.calibrate(log, "ekf", set=OPEN)
@@ -76,10 +80,7 @@ def test_what_the_motion_does_not_determine_is_named_and_held(
     order = [names.index(name) for name in NAMES]
     values, useful = np.empty(7), np.empty(7)
     values[order], useful[order] = OURS, USEFUL
-    by_sheet = np.eye(7)
-    by_sheet[0, 0], by_sheet[1, 1] = -1.0 / A_V**2, -1.0 / A_W**2
-    by_sheet[2, 1:3] = B_W / A_W**2, -1.0 / A_W
-    turned = by_sheet * USEFUL / USEFUL[:, None]
+    turned = BY_SHEET * USEFUL / USEFUL[:, None]
     told = turned.T @ information(found.objective, values, useful, order) @ turned
     known = len(eigenvalues)
     computed = np.linalg.eigvalsh(told)
@@ -95,3 +96,37 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         fl.calibrate(log, "ekf", fixed=["lever_z_m"])
     with pytest.raises(fl.BadInput, match="calibrate: by is for tune"):
         fl.calibrate(log, "ekf", by="rmse")
+    without = replace(
+        log, streams={name: log.streams[name] for name in log.streams if "fix" not in name}
+    )
+    with pytest.raises(fl.BadInput, match="--next: run 0 of car C has no odometry with fixes"):
+        advice(replace(fl.calibrate(log, "ekf"), logs=[without]))
+
+
+def test_the_next_manoeuvre_is_the_sheets() -> None:
+    """The prior is the sheet's, in useful units; each manoeuvre has a start of its own."""
+    wide = (1000.0, 1000.0, 1.0)
+    found = fl.calibrate(recorded(drive(None, straight, 60.0), wide), "ekf", set=OPEN, next_motion=True)
+    names = [each.name for each in found.found.coordinates.free]
+    order = [names.index(name) for name in NAMES]
+    values, useful = np.empty(7), np.empty(7)
+    values[order], useful[order] = OURS, USEFUL
+    turned = BY_SHEET * USEFUL / USEFUL[:, None]
+
+    def told(motion: Motion, duration_s: float) -> Floats:
+        run = in_memory(log := recorded(drive(None, motion, duration_s), wide), bind("ekf", [log], OPEN))
+        objective = replace(found.objective, runs=[run])
+        objective.begin(values)
+        return turned.T @ information(objective, values, useful, order) @ turned
+
+    prior = np.diag(np.square(USEFUL / [0.1, 0.1, 0.02, 2.0, 2.0, 0.5, 0.2]))
+    known = prior + told(straight, 60.0)
+    both, varied = (gain(known, told(motion, 20.0)) for motion in (circles, rich))
+    assert (both.nats, both.widest) == pytest.approx((11.102931, 5.030), rel=0.02)
+    assert (varied.nats, varied.widest) == pytest.approx((10.777415, 1.454), rel=0.02)
+    assert varied.sigmas * USEFUL == pytest.approx(
+        [0.000883, 0.012926, 0.00118, 0.29077, 0.11701, 0.02947, 0.00118], rel=0.02
+    )
+    said = [each for each in found.notes if "record turns at changing speed: of 6 manoeuvres" in each]
+    assert said
+    assert any("by the determinant" in each for each in found.notes)

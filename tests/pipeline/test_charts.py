@@ -34,15 +34,20 @@ def held(chart: Chart) -> dict[str, dict[str, Any]]:
 
 
 def same(found: Mapping[str, Any], wanted: Mapping[str, Mapping[str, Any]]) -> None:
-    """All panels and series of both, and their numbers to seven digits."""
+    """All panels and series of both, their names, and their numbers to seven digits."""
     assert {name: set(own) for name, own in found.items()} == {
         name: set(own) for name, own in wanted.items()
     }
     for name, own in wanted.items():
         for label, columns in own.items():
-            np.testing.assert_allclose(
-                found[name][label], columns, rtol=1e-6, err_msg=f"{name}: {label}"
-            )
+            for drawn, column in zip(found[name][label], columns, strict=True):
+                values = np.array(drawn)
+                if values.dtype.kind == "U":
+                    assert values.tolist() == list(column), f"{name}: {label}"
+                else:
+                    np.testing.assert_allclose(
+                        values.astype(float), column, rtol=1e-6, err_msg=f"{name}: {label}"
+                    )
 
 
 def errors(estimator: str, *components: str, is_bound: bool = False) -> Errors:

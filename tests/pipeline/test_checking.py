@@ -206,7 +206,10 @@ def test_bad_input(golden: Path, log: Path, fuselog: Fuselog, tmp_path: Path) ->
         ),
         ((other, "--against", golden), "the recorded or imported data have changed"),
         ((tmp_path / "empty", "--against", golden), "has no logs to replay"),
-        ((log, "--against", golden, "-e", "ukf"), "to change that, add --update"),
+        (
+            (log, "--against", golden, "-e", "ukf"),
+            "to check in place of one, as lib:PATH, or add --update",
+        ),
         ((log, "--against", golden, "--update", "--tolerance", "mean"), "expected PATTERN=RELATIVE"),
         ((log, "--against", golden, "--junit", note), "give a name that ends in .xml"),
     ):

@@ -6,10 +6,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.optimize import minimize_scalar
 from scipy.stats import norm, t
 
 from pipeline.output.expressions import Values, evaluate, formatted
 from pipeline.output.numbers import exactly
+from pipeline.output.results import Outcome
+from pipeline.studies.biometrics.sequential import Drawn, Options, probes_of
+from pipeline.studies.navigation import imu_grades
+from pipeline.studies.networks.networks import network_table, traces_of_equation_17
+from pipeline.studies.optical.moving import _measure
 from pipeline.studies.toolkit.repetitions import (
     by_repetition,
     mean_interval,
@@ -19,7 +25,11 @@ from pipeline.studies.toolkit.repetitions import (
     share_holds,
     worst_deviation,
 )
+from pipeline.studies.vehicles import scaling
+from pipeline.studies.vehicles.cases import score_set
 from pipeline.studies.vehicles.scaling import growth_of
+from recorders.log import RunMetadata
+from replay.engine.streams.sources import MemorySource
 
 # Two runs of two steps, one of which failed; errors of 5, 13 and 17 m.
 MADE: Any = SimpleNamespace(
@@ -68,6 +78,118 @@ def test_a_share_holds_within_two_standard_errors() -> None:
     least = 0.95 - 2.0 * np.sqrt(0.95 * 0.05 / 100)
     assert share_holds(least + 1e-9, 100)
     assert not share_holds(least - 1e-9, 100)
+
+
+def test_traces_of_two_independent_errors() -> None:
+    """At the weight of least trace, by search; the print leaves out the factors P on both sides."""
+    first, second = np.diag([1.0, 0.25]), np.linalg.inv([[3.0, 1.0], [1.0, 1.0]])  # of information
+
+    def fused(weight: float) -> np.ndarray:
+        return np.linalg.inv(weight * first + (1.0 - weight) * second)
+
+    weight = minimize_scalar(lambda of: np.trace(fused(of)), bounds=(0, 1), method="bounded").x
+    inner = weight**2 * first + (1.0 - weight) ** 2 * second
+    spread = fused(weight) @ inner @ fused(weight)
+    wanted = {"printed": np.trace(np.linalg.inv(inner)), "fused": np.trace(spread)}
+    wanted = {f"equation-17.{name}_trace": value for name, value in wanted.items()}
+    assert traces_of_equation_17() == pytest.approx(wanted, rel=1e-3)
+
+
+def test_networks_are_beside_one_filter_with_all_sensors() -> None:
+    """Nodes that err by 5 and 10 m, where the one filter errs by 2.5 m; the velocity does not count."""
+
+    def node(estimator: str, length_m: float, nees: float) -> Any:
+        error = length_m * np.array([[0.6, 0.8, 9.0], [-0.8, 0.6, 9.0]])
+        values = {"error": error, "position": [0, 1], "nees": np.array([nees, nees + 1.0])}
+        return SimpleNamespace(estimator=estimator, **values)
+
+    errors = [node("ci", 5.0, 1.0), node("ci", 10.0, 3.0), node("centralised", 2.5, 2.0)]
+    table = network_table(errors).set_index("estimator")
+    assert table.loc["ci"].tolist() == pytest.approx([5.0, 3.0, 2.5])
+    assert table.loc["centralised"].tolist() == pytest.approx([2.5, 1.0, 2.5])
+
+
+def test_a_vehicle_has_its_share_of_the_total_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four vehicles that are all 3 m off make 6 m together; two runs of five steps took 20 ms."""
+    topics = [*(f"/vehicle{number}/prior" for number in (1, 2, 3, 4)), "/map/truth"]
+    source: Any = SimpleNamespace(streams={**dict.fromkeys(topics), "/network/scan": range(5)})
+    scores = SimpleNamespace(assigned=np.array([6.0, np.nan]), failed=1)
+    times = iter([1.0, 1.02])
+    for name, made in (
+        ("time", SimpleNamespace(process_time=lambda: next(times))),
+        ("replay_in_memory", lambda *_: {}),
+        ("judge", lambda *_: SimpleNamespace(sets=[])),
+        ("scores_of", lambda *_: {"kf": scores}),
+    ):
+        monkeypatch.setattr(scaling, name, made)
+    assert scaling._timed([source, source], "kf", {"kf": {}}) == (pytest.approx(2.0), 3.0, 1)
+
+
+def test_of_a_set_each_vehicle_takes_an_element_of_its_own_where_there_are_enough() -> None:
+    """Three vehicles: one element, which is of all; two, of which one is of two; none; four."""
+    vehicles = np.array([[0.0, 1.0], [0.0, 2.0], [4.0, 0.0]])
+    elements = [[0, 0], [0, 0], [4, 0], [0, 0], [0, 3], [4, 1], [0, 1]]
+    mean = np.insert(np.array(elements, float), 1, 9.0, axis=1)  # x, vx, y
+    outputs: Any = {
+        "/estimates/phd/vehicles/set": SimpleNamespace(
+            of_run=lambda _: {"elements": np.array([1, 2, 0, 4], np.uint32)}
+        ),
+        "/estimates/phd/vehicles/element": SimpleNamespace(of_run=lambda _: {"mean": mean}),
+    }
+    found: Any = SimpleNamespace(estimator="phd", case="vehicles", gospa=np.zeros(4))
+    scores = score_set(outputs, found, np.broadcast_to(vehicles, (1, 4, 3, 2)))
+    assert scores.assigned_by_step.tolist() == [pytest.approx([21.0, 5.0, np.nan, 2.0], nan_ok=True)]
+
+
+def test_an_impostor_keeps_the_identity_that_is_claimed() -> None:
+    """Each probe is of some other user: ratios say whose row and column they are."""
+    users = np.arange(50)
+    drawn, options = Drawn(100.0 * users[:, None] + users, users), Options(sequences=20)
+    person, impostor = probes_of("one-identity", drawn, options, np.random.default_rng(0))
+    going = np.arange(20)
+    probe, claimed = np.divmod([impostor(going) for _ in range(5)], 100)
+    assert (claimed == claimed[0]).all()
+    assert (probe != claimed).all()
+    assert len(np.unique(probe[:, 0])) > 1
+    probe, claimed = np.divmod(person(going), 100)
+    assert (probe == claimed).all()
+
+
+def test_least_eigenvalues_are_averaged_in_the_logarithm() -> None:
+    outcome, none = Outcome(), pd.DataFrame({"estimator": [], "second": []})
+    _measure("fast", none, pd.DataFrame({"least_eigenvalue": [1e-2, 1e-4]}), {}, outcome)
+    assert outcome.metrics["observability.least_eigenvalue.fast"] == pytest.approx(1e-3)
+    assert outcome.metrics["observability.log10_least_eigenvalue.fast"] == pytest.approx(-3.0)
+
+
+def test_grades_are_told_by_the_largest_error_of_their_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the outage from 50 s on, each grade by itself: at 10 and 20 s, after 20.5 s no more."""
+
+    def drives(scale: float) -> Any:
+        after_s = np.tile([9.0, 10.0, 20.0, 20.5], 2)
+        place = scale * np.stack([after_s, np.zeros(8), np.repeat([0.0, 1.0], 4)], axis=1)
+        columns = {"elapsed_s": 50.0 + after_s, "run": np.repeat([0, 1], 4), "error": place}
+        return SimpleNamespace(estimator="ekf", components=("x_m", "z_m", "y_m"), **columns)
+
+    outages = {"gnss": {"outages_s": [[50.0, 70.4]]}}
+    source = MemorySource({}, RunMetadata("navigation", epoch_ns=0, parameters=outages), "drive")
+
+    def cases(grades: dict[str, Any]) -> Any:
+        for scale, grade in enumerate(grades, 1):
+            yield grade, SimpleNamespace(sources=[source], errors=[drives(scale)])
+
+    monkeypatch.setattr(imu_grades, "Runner", lambda *_: SimpleNamespace(cases=cases))
+    setting: Any = SimpleNamespace(options=SimpleNamespace(grades={"phone": "a", "tactical": "b"}))
+    experiment: Any = None
+    metrics = imu_grades.study(experiment, setting).metrics
+    lengths_m = {"10s": np.hypot(10.0, 1.0), "20s": np.hypot(20.0, 1.0)}
+    assert metrics == pytest.approx(
+        {
+            f"ekf.horizontal_95_m.{grade}-{after}": scale * length_m
+            for scale, grade in ((1, "phone"), (2, "tactical"))
+            for after, length_m in lengths_m.items()
+        }
+    )
 
 
 @pytest.mark.parametrize(

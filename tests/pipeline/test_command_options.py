@@ -58,6 +58,10 @@ MOVES = [
     ),
     Moves(f"replay run.mcap -e ekf --arrival-order {OUT}", {"--late": "--late drop"}),
     Moves(
+        "deploy run.mcap -e ekf --model robot -o robot_ekf",
+        {"--json": "--json", "--set": "--set ekf.sigma_range_m=0.3", "--single": "--single"},
+    ),
+    Moves(
         f"replay run.mcap -e ekf --start 1 --start-from truth {OUT}",
         {"--start": "--start 2", "--start-sigma": "--start-sigma x_m=3"},
     ),
@@ -197,8 +201,6 @@ UNMOVED = {
     "compare --case": "no test moves it yet",
     "compare --stress": "no test moves it yet",
     "constrain --unit": "no test moves it yet",
-    "deploy --set": "no test moves it yet",
-    "deploy --single": "no test moves it yet",
     "diagnose --gap-limit": "no test moves it yet",
     "evaluate --format": "it is found from the content, and another than that is refused",
     "evaluate --max-difference": "no test moves it yet",

@@ -1,5 +1,6 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
+import json
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
+from tests.pipeline.conftest import run_here
 
 COMPILER = shutil.which("gcc") or shutil.which("clang")
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
@@ -71,6 +74,59 @@ def test_estimates_are_equal_to_the_last_bit(
             if name in own[topic].columns:
                 both = own[topic][name], foreign[topic][name]
                 np.testing.assert_array_equal(*both, err_msg=f"{topic} {name}")
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+def test_check_says_whether_the_c_is_as_the_golden(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=2.0)
+    monkeypatch.chdir(tmp_path)
+    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", sigma_range_m=0.2)
+    library = compiled(folder, "-shared", "-fPIC")
+    for name, sigma_m in (("same", 0.2), ("other", 0.3)):
+        kept = f"--update -e ekf --set ekf.model=robot --set ekf.sigma_range_m={sigma_m}"
+        assert run_here("check", log, "--against", f"{name}.golden.xz", *kept.split()).code == 0
+    checked = ("check", log, "--against", "same.golden.xz", "-e", f"lib:{library}")
+    said = run_here(*checked)
+    assert said.code == 0, said.out
+    assert said.out.startswith("all ")
+    said = run_here("check", log, "--against", "other.golden.xz", "-e", f"lib:{library}")
+    assert said.code == 2
+    assert "was deployed from another filter" in said.err
+    source = folder / "robot_ekf.c"
+    text = source.read_text()
+    source.write_text(text.replace("+= C[row][i] * v[i];", "+= 1.0001 * C[row][i] * v[i];"))
+    compiled(folder, "-shared", "-fPIC")
+    said = run_here(*checked)
+    assert said.code == 1
+    assert "/estimates/ekf/robot1/" in said.out
+
+
+def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=2.0)
+    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot")
+    found = json.loads((folder / "certificate.json").read_text())
+    # sin and cos of the mean heading, sin of sinc, cos of its slope;
+    # roots of the range and of two pivots, atan2 of the bearing, fmod of its wrapping
+    costs = [(each["roots"], each["calls"]) for each in found["steps"].values()]
+    assert costs == [(0, 4), (3, 2)]
+    assert found["worst"]["flops"] == sum(each["flops"] for each in found["steps"].values())
+    # F P F' of 3 states, lower half of the second product, and P H', H P H' of 2 components
+    assert found["products"]["dense_flops"] == 9 * 5 + 6 * 5 + 6 * 5 + 3 * 5
+
+
+def test_stack_is_that_of_the_deepest_chain() -> None:
+    node = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:5\\n{1} bytes (static)" }}\n'
+    edge = 'edge: {{ sourcename: "{0}" targetname: "{1}" label: "x.c:2:3" }}\n'
+    calls = "".join(
+        [
+            *(node.format(*each) for each in (("wide", 100), ("top", 40), ("middle", 50), ("low", 16))),
+            *(edge.format(*each) for each in (("top", "middle"), ("middle", "low"), ("wide", "sin"))),
+        ]
+    )
+    assert deepest_stack(calls) == 40 + 50 + 16
 
 
 def test_refusals_write_nothing(tmp_path: Path) -> None:

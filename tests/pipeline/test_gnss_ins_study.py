@@ -27,6 +27,8 @@ from recorders.log import make_stream, schemas
 from recorders.log.run import RunMetadata
 from replay.engine.streams.sources import MemorySource
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 
 def accelerated() -> Rows:
     """A path along x with 2 m/s2 for 100 s, of which the fix at 60 s is none to judge by."""

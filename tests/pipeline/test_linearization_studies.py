@@ -7,7 +7,7 @@ from pipeline.output.results import Result
 from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
-pytestmark = pytest.mark.paper
+pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 # Fig. 7 of Steinbring and Hanebeck, JAIF 2014, by an independent implementation (the sheet):
 # RMSE of mean and covariance, one data seed of 1000 runs

@@ -20,6 +20,8 @@ from pipeline.studies.sampling.lrkf_dimension import (
 from recorders.errors import BadInput
 from replay.sampling import Samples
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 
 def test_moments_of_waves_are_those_of_a_fine_quadrature():
     """Gauss-Hermite points in the plane, of which 40 x 40 are exact to rounding."""

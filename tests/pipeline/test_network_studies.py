@@ -5,7 +5,7 @@ import pytest
 from pipeline.runs.experiment import load_experiment, run_experiment
 from recorders.errors import BadInput
 
-pytestmark = pytest.mark.paper
+pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 
 def verdicts(result):

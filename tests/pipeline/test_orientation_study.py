@@ -10,6 +10,8 @@ from pipeline.studies.navigation.orientation import error_angles
 from recorders.errors import BadInput
 from tests.replay.timeline.test_timeline import read
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 TRIAL = "07_undisturbed_fast_rotation_B"
 
 

@@ -27,6 +27,8 @@ from replay.engine.streams.sources import memory_source
 from replay.estimators.navigation.navigation import INERTIAL
 from tests.replay.inference.replays import outputs
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SECOND = 10**9
 
 

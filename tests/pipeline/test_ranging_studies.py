@@ -13,6 +13,8 @@ from recorders.errors import BadInput
 from recorders.recording import import_run
 from replay.engine.streams.sources import memory_source
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 CASES = {
     "Trajectory_A/Case_1": ((51.625, 191.375), {"LS": (1.0384, 1.5735), "ESKF": (1.1158, None)}),
     "Trajectory_B/Case_3": ((56.875, 149.625), {"LS": (0.5217, 0.7938), "ESKF": (0.6003, None)}),

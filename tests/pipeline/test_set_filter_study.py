@@ -8,6 +8,8 @@ from pipeline.runs.recorded import record_ensemble
 from pipeline.studies.sets.error_bounds import BoundOptions, state_bounds
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SHORT = {"duration_s": 12.0, "runs": 1, "robots": 2, "landmarks": 5}
 
 

@@ -17,6 +17,8 @@ from pipeline.studies.networks.cooperative_stress import (
 )
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 
 @pytest.fixture(scope="module")
 def robots():

@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -215,3 +216,33 @@ def test_a_scratch_folder_of_a_killed_process_is_cleared(tmp_path, monkeypatch):
         assert list(tmp_path.iterdir()) == [folder.parent]
         assert folder.stat().st_mode & 0o777 == 0o700
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_working_folder_that_goes_while_it_is_looked_at_is_none(tmp_path, monkeypatch, caplog):
+    """Its maker, who works beside, removes it before every line of the look in turn."""
+    monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
+    gone = list[bool]()
+    for moment in range(100):
+        left = tmp_path / ".work.other.part"
+        (left / "new").mkdir(parents=True)
+        (left / "fuselog.lock").touch()
+        lines = iter(range(moment, -1, -1))
+
+        def trace(frame, event, _, lines=lines, left=left):
+            if frame.f_code.co_filename == atomic.__file__:
+                if event == "line" and next(lines, None) == 0:
+                    gone.append(left.exists())
+                    shutil.rmtree(left, ignore_errors=True)
+                return trace
+            return None
+
+        before = sys.gettrace()
+        sys.settrace(trace)
+        try:
+            with caplog.at_level(logging.WARNING), scratch_folder("work") as folder:
+                (folder / "mine").touch()
+        finally:
+            sys.settrace(before)
+        assert list(tmp_path.iterdir()) == []
+    assert True in gone
+    assert caplog.messages == []

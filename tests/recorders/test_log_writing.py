@@ -9,9 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from google.protobuf.timestamp_pb2 import Timestamp
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.records import Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from recorders.errors import BadInput
 from recorders.log import (
+    Companion,
     Field,
     LogWriter,
     RunMetadata,
@@ -244,6 +250,30 @@ def test_a_topic_gets_its_width_from_its_first_message(tmp_path):
             log.write([stream])
     found = read_streams(open_log(tmp_path / "run.mcap"), ["/v"])["/v"]
     assert_same(found, concatenate([full, full]))
+
+
+@given(stamps=st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=12))
+def test_companions_stand_in_the_order_of_log_time_and_ties_as_given(tmp_path_factory, stamps):
+    """In chunks of about two messages, whose spans are those of their messages."""
+    path = tmp_path_factory.mktemp("companions") / "run.mcap"
+    given = [
+        Companion("/viewer", "/scan", Timestamp(seconds=number), *clocks)
+        for number, clocks in enumerate(stamps)
+    ]
+    with LogWriter(path, chunk_bytes=80) as log:
+        assert log.write_companions(given) == len(given)
+    written = []
+    with path.open("rb") as file:
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                own = [each for each in breakup_chunk(record) if isinstance(each, Message)]
+                logged = [each.log_time for each in own]
+                assert (record.message_start_time, record.message_end_time) == (min(logged), max(logged))
+                written += own
+    numbers = [Timestamp.FromString(each.data).seconds for each in written]
+    assert numbers == sorted(range(len(stamps)), key=lambda number: stamps[number][0])
+    assert [(each.log_time, each.publish_time) for each in written] == [stamps[each] for each in numbers]
+    assert [each.sequence for each in written] == numbers
 
 
 def test_two_schemas_of_one_name_keep_their_own_fields(tmp_path):

@@ -136,6 +136,15 @@ def test_numbers_that_cannot_be_are_told(small: Path, name: str, row: str, words
     assert name in str(caught.value)
 
 
+def test_a_set_begins_with_the_first_truth_of_any_robot(small: Path):
+    """So that no robot has messages from before the landmarks are known."""
+    for name in ("Groundtruth", "Odometry", "Measurement"):
+        text = SMALL[f"Robot1_{name}.dat"]
+        (small / f"Robot2_{name}.dat").write_text(text.replace("1248444175", "1248444174"))
+    recording, streams = imported(small)
+    assert recording.epoch_ns == 1248444174_103_000_000 == streams["/landmarks"].publish_time_ns[0]
+
+
 # Real data: set 6.
 
 

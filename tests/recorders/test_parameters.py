@@ -252,3 +252,17 @@ def test_a_number_that_is_declared_float_is_float() -> None:
     assert [type(number) for number in (Own().sigma_m, *Own().limits_m, Own(sigma_m=2).sigma_m)] == [
         float
     ] * 4
+
+
+def test_a_type_that_cannot_be_checked_is_named_where_it_is_used() -> None:
+    class Foreign(Parameters):
+        """Of somebody's plug-in.
+
+        Attributes:
+            course: no type of pydantic's.
+        """
+
+        course: re.Match[str] | None = None
+
+    with pytest.raises(BadInput, match="estimator 'mine': its parameters, Foreign, cannot be checked: "):
+        build(Foreign, {}, "estimator 'mine'")

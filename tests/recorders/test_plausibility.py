@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.diagnosing.battery import battery
 from pipeline.diagnosing.battery.car import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose
@@ -37,17 +38,6 @@ FOUND = {  # of car D with its compass: cause, topic and setting that are named 
     "gyro density / 5": None,
     "compass + 4.5 deg": ("mounting", "/car/heading", ""),
     "compass clockwise from north": ("sign", "/car/heading", ""),
-}
-OF_UNIT = {
-    "nothing": None,
-    "accelerometer in g": ("gravity", 1 / 9.80665),
-    "gravity's sign": ("gravity", -1.0),
-    "turn rate's sign": ("sign", -1.0),
-    "degrees": ("unit", 180.0 / np.pi),
-    "mounted 90 deg": ("mounting", np.pi / 2),
-    "mounted 180 deg": ("mounting", np.pi),
-    "unit late .3 s": ("delay", 0.3),
-    "E, N exchanged": ("sign", -1.0),
 }
 # The sheet's ratio, turn slope, variance at rest and lag.
 CLEAN = (0.9956, 0.9852, 1.105, -0.04)
@@ -105,13 +95,15 @@ def test_each_fault_of_car_d_is_named_first_or_none(name: str) -> None:
         assert found == ([] if wanted is None else [wanted])
 
 
+@pytest.mark.parametrize("seed", [8000, 2100])
 @pytest.mark.parametrize("name", UNIT_FAULTS)
-def test_each_fault_of_the_inertial_unit_is_named_first_or_none(name: str) -> None:
-    found = findings(recorded_unit(UNIT_FAULTS[name](ride(8000))).streams)
-    wanted = OF_UNIT[name]
-    assert [each.cause for each in found] == ([wanted[0]] if wanted else [])
+def test_each_fault_of_the_inertial_unit_is_all_that_is_named(name: str, seed: int) -> None:
+    found = battery.unit_tried(name, seed)
+    wanted = battery.UNIT_RIGHT[name]
+    assert found["is_first"], found["first"]
+    assert found["findings"] == (1 if wanted else 0)
     if wanted:
-        assert abs(found[0].value) == pytest.approx(abs(wanted[1]), rel=0.03, abs=0.03)
+        assert found["value"] == pytest.approx(abs(wanted[2]), rel=0.03, abs=0.03)
 
 
 @pytest.mark.parametrize("scenario", ["landmarks", "navigation", "orientation", "vehicles"])
@@ -181,6 +173,19 @@ def test_repeated_messages_and_a_gaining_clock_are_found() -> None:
     assert found.words.startswith("/car/odometry: 2 of its 1002 messages are there twice")
     [found] = findings({wheels.topic: slow, **rest})
     assert (found.cause, found.topic) == ("clock", "/car/odometry")
+
+
+def test_of_equal_stamps_the_first_is_taken() -> None:
+    """Nothing is divided by no time: a log with each message twice says what it says with one."""
+    for streams in (recorded(faulty(2000, "nothing")).streams, recorded_unit(ride(8000)).streams):
+        twice = {
+            topic: stream.take(np.repeat(np.arange(len(stream)), 2)) for topic, stream in streams.items()
+        }
+        [body], [doubled] = bodies(streams), bodies(twice)
+        for role, again in zip(body.roles, doubled.roles, strict=True):
+            for one, two in zip(role, again, strict=True):
+                assert np.array_equal(one.times_s, two.times_s)
+                assert np.array_equal(one.values, two.values)
 
 
 def test_errors_that_are_not_white_say_nothing_of_their_variance() -> None:

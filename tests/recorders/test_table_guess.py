@@ -111,3 +111,52 @@ def test_zones_have_names(tmp_path: Path, entry: str, cell: str) -> None:
 def test_an_unknown_zone_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="no time zone 'Europe/Berln'; give one such as Europe/Berlin"):
         read(tmp_path, f"{DATE}, zone = 'Europe/Berln' }}\n{VALUES}", ["2026-07-05 14:00:00"])
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "lat;lon;alt",
+        "acc_x;acc_y;acc_z;gyro_x;gyro_y;gyro_z",
+        "mag_x;mag_y;mag_z",
+        "linear_x;linear_y;linear_z;angular_x;angular_y;angular_z",
+        "vel_x;vel_y;vel_z",
+        "speed;yaw_rate",
+        "landmark_id;range;bearing",
+        "x;y;z;qw;qx;qy;qz",
+        "east;north;up",
+    ],
+)
+def test_without_any_one_column_the_others_are_taken_once_and_in_their_order(
+    tmp_path: Path, head: str
+) -> None:
+    """What is guessed of columns of which one is missing can be imported, and loses none of them."""
+    names = head.split(";")
+    near = {"acc": 5.0, "mag": 25.0, "lat": 48.0}  # sizes that tell m/s^2, uT and deg
+    cells = {
+        name: near.get(name[:3], 0.0) + np.linspace(0.1, 0.15, 9) + 0.1 * place
+        for place, name in enumerate(names)
+    }
+    cells |= dict.fromkeys(("qw", "qx", "qy", "qz"), np.full(9, 0.5)) | {"landmark_id": np.arange(9)}
+    for without in [None, *names]:
+        kept = [name for name in names if name != without]
+        rows = [
+            f"{1_700_000_000 + row};" + ";".join(str(cells[name][row]) for name in kept)
+            for row in range(9)
+        ]
+        log = guessed(tmp_path, "\n".join([";".join(["t", *kept]), *rows]))
+        taken = [
+            column
+            for stream in log.streams.values()
+            for field in stream.schema
+            for column in np.atleast_2d(np.asarray(stream[field.name]).T)
+            if field.kind != "time_ns" and not np.isnan(column).any()
+        ]
+        places = [
+            [place for place, column in enumerate(taken) if np.allclose(column, cells[name], atol=1e-9)]
+            for name in kept
+            if name[0] != "q"
+        ]
+        assert all(len(each) == 1 for each in places), without
+        if len(log.streams) == 1:
+            assert places == sorted(places), without

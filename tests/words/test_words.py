@@ -10,7 +10,7 @@ from tests.words.texts import differences, path_of
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
+def found(tmp_path_factory: pytest.TempPathFactory, blank_figures: None) -> Mapping[str, str]:
     """The text of every command, as it is now."""
     return everything(tmp_path_factory.mktemp("words"))
 

@@ -1,4 +1,7 @@
-"""The battery: cars with one fault planted, and how often it is the first that a diagnosis names."""
+"""The battery: cars with one fault planted, and how often it is the first that a diagnosis names.
+
+The inertial unit's faults are told without a filter.
+"""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -7,13 +10,24 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.diagnosing.battery.car import FAULTS, faulty, recorded
+from pipeline.diagnosing.battery.car import (
+    FAULTS,
+    UNIT_FAULTS,
+    faulty,
+    recorded,
+    recorded_unit,
+    ride,
+)
 from pipeline.diagnosing.causes import Cause, seek
 from pipeline.diagnosing.findings import FIRST, without_filter
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.runs.ensemble import Progress
+from recorders.plausibility.checks import findings
+from recorders.plausibility.finding import Cause as Told
 
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
+UNIT, VELOCITY = "/car/inertial", "/car/velocity"
+UNIT_RUNS = 5  # of each fault of the unit, for one of each cell: they cost a tenth
 
 
 class Right(NamedTuple):
@@ -52,6 +66,38 @@ RIGHT: dict[str, Sequence[Right]] = {
     "compass clockwise from north": (Right("convention", HEADING, "heading_rad"),),
 }
 
+# The sheet's standard deviations over runs of the numbers that are found, with a compass and without;
+# of noise those of the logarithm of a sigma, half of that of a variance.
+SPREADS: dict[str, tuple[float, float]] = {
+    "fixes .3 s late": (0.00685, 0.0113),
+    "turn rate's sign": (0.0056, 0.00616),
+    "speed x 3.6": (0.00394, 0.00438),
+    "speed / 3.6": (0.000301, 0.000335),
+    "speed x .3048": (0.000335, 0.000381),
+    "lever (2, .6) m": (0.0592, 0.133),
+    "fix variance x 4": (0.0359, 0.0363),
+    "fix variance / 16": (0.0359, 0.0363),
+    "sd written as variance": (0.0359, 0.0363),
+    "degrees as radians": (0.321, 0.353),
+    "gyro bias .02": (0.000998, 0.00112),
+    "gyro bias .0004 t": (3.41e-5, 4.49e-5),
+    "odometry clock 6 % fast": (0.000133, 0.000175),
+    "fixes 18 s late": (0.00741, 0.028),
+    "gyro density / 5": (0.1885, 0.2255),
+    "compass + 4.5 deg": (0.00165, np.nan),
+}
+# Of the unit's faults: what is told, of which topic, and the number.
+UNIT_RIGHT: dict[str, tuple[Told, str, float] | None] = {
+    "nothing": None,
+    "accelerometer in g": ("gravity", UNIT, 1.0 / 9.80665),
+    "gravity's sign": ("gravity", UNIT, -1.0),
+    "turn rate's sign": ("sign", UNIT, -1.0),
+    "degrees": ("unit", UNIT, 180.0 / np.pi),
+    "mounted 90 deg": ("mounting", UNIT, np.pi / 2.0),
+    "mounted 180 deg": ("mounting", UNIT, np.pi),
+    "unit late .3 s": ("delay", UNIT, 0.3),
+    "E, N exchanged": ("sign", VELOCITY, -1.0),
+}
 
 # Two at once, each of which hides how large the other is.
 PAIRS = (
@@ -103,6 +149,10 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
         values = [one.value for one in _named(cause) if one[:3] in right]
         value = values[0] if values and values[0] is not None else np.nan
         gain = cause.gain
+    planted, within = RIGHT[cell.fault], np.nan
+    if planted and planted[0].value is not None:
+        spread = SPREADS[cell.fault][0 if cell.has_compass else 1]
+        within = float(abs(value - planted[0].value) < 4.0 * spread)
     return {
         **cell._asdict(),
         "cell": cell.name,
@@ -111,7 +161,23 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
         "is_in_first_two": any(places[:2]) if right else not named,
         "first": " ".join(filter(None, named[0][0][:3])) if named else "",
         "value": value,
+        "is_within": within,
         "gain": gain,
+    }
+
+
+def unit_tried(fault: str, seed: int) -> dict[str, Any]:
+    """Plant a fault into the unit's log, and see whether it is what is told without a filter."""
+    told = findings(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
+    right = UNIT_RIGHT[fault]
+    named = [(each.cause, each.topic) for each in told]
+    return {
+        "fault": fault,
+        "seed": seed,
+        "findings": len(named),
+        "is_first": named[:1] == [right[:2]] if right else not named,
+        "first": " ".join(named[0]) if named else "",
+        "value": abs(told[0].value) if told else np.nan,  # of half a turn the sign says nothing
     }
 
 
@@ -139,7 +205,10 @@ def _named(cause: Cause) -> Iterator[Right]:
 def results(
     seeds: Sequence[int], progress: Progress
 ) -> tuple[dict[str, pd.DataFrame], dict[str, float]]:
-    """Try all cells, with and without a prior, and all pairs, with these seeds: tables and metrics."""
+    """Try all cells, with and without a prior, all pairs, and the unit: with these seeds, it with more.
+
+    Returns tables and metrics.
+    """
     rows = []
     for cell in [*cells(), *cells(has_prior=True)]:
         rows += [tried(cell, seed) for seed in progress(seeds, cell.name, len(seeds))]
@@ -147,10 +216,20 @@ def results(
     for pair in PAIRS:
         for seed in progress(seeds, " + ".join(pair), len(seeds)):
             together.append(tried_together(pair, seed, has_prior=True))
-    planted, pairs = pd.DataFrame(rows), pd.DataFrame(together)
-    tables = {"battery": summary(planted), "battery_runs": planted, "battery_pairs": pairs}
+    of_unit, unit_seeds = [], range(seeds[0], seeds[0] + UNIT_RUNS * len(seeds))
+    for fault in UNIT_FAULTS:
+        title = f"inertial unit, {fault}"
+        of_unit += [unit_tried(fault, seed) for seed in progress(unit_seeds, title, len(unit_seeds))]
+    planted, pairs, unit = pd.DataFrame(rows), pd.DataFrame(together), pd.DataFrame(of_unit)
+    tables = {
+        "battery": summary(planted),
+        "battery_runs": planted,
+        "battery_pairs": pairs,
+        "battery_unit": unit,
+    }
     share = float(pairs["are_named"].mean())
-    return tables, {**metrics_of(planted), "diagnosis.battery_pairs_share": share}
+    metrics = {**metrics_of(planted), "diagnosis.battery_pairs_share": share}
+    return tables, metrics | unit_metrics(unit)
 
 
 def summary(rows: pd.DataFrame) -> pd.DataFrame:
@@ -159,6 +238,7 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
     return by.agg(
         runs=("seed", "size"),
         first=("is_first", "sum"),
+        within=("is_within", lambda each: each.sum(min_count=1)),
         gain=("gain", "median"),
         value=("value", "mean"),
         spread=("value", "std"),
@@ -166,10 +246,12 @@ def summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
-    """The shares of runs whose fault is named first: of each cell, and of all."""
+    """The runs whose fault is named first, and with its number within 4 standard deviations, by cell."""
     found = {
-        f"diagnosis.battery_first.{_case(row['cell'])}": float(row["first"])
+        f"diagnosis.battery_{quantity}.{_case(row['cell'])}": float(row[quantity])
         for row in summary(rows).to_dict("records")
+        for quantity in ("first", "within")
+        if np.isfinite(row[quantity])
     }
     clean = rows["fault"] == "nothing"
     return {
@@ -177,7 +259,19 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
         "diagnosis.battery_runs": float(rows.groupby("cell")["seed"].size().max()),
         "diagnosis.battery_first_share": float(rows[~clean]["is_first"].mean()),
         "diagnosis.battery_nothing_share": float(rows[clean]["is_first"].mean()),
+        "diagnosis.battery_within_share": float(rows["is_within"].mean()),
     }
+
+
+def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
+    """The runs of the unit whose fault is told first, and the spread of the number, by fault."""
+    found = {"diagnosis.unit_runs": float(rows.groupby("fault")["seed"].size().max())}
+    for fault, own in rows.groupby("fault", sort=False):
+        found[f"diagnosis.unit_first.{_case(str(fault))}"] = float(own["is_first"].sum())
+        if own["value"].notna().any():
+            found[f"diagnosis.unit_value.{_case(str(fault))}"] = float(own["value"].mean())
+            found[f"diagnosis.unit_spread.{_case(str(fault))}"] = float(own["value"].std())
+    return found
 
 
 def _case(cell: str) -> str:

@@ -10,6 +10,7 @@ from recorders.log.run import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import memory_source
+from replay.engine.vectors.covariances import is_positive_definite, normalized_error_squared
 from replay.engine.vectors.tangent import (
     are_kinds,
     between,
@@ -137,3 +138,10 @@ def test_nees_and_total_error_are_those_of_the_rotation():
 def test_half_a_quaternion_is_bad_input():
     with pytest.raises(BadInput, match="a quaternion four"):
         judged(["quaternion", "quaternion", "quaternion", "linear"])
+
+
+def test_of_no_component_at_all_nothing_is_said():
+    """Neither an NEES, which would be zero, nor that a covariance is one."""
+    none = np.empty((3, 0, 0))
+    assert np.isnan(normalized_error_squared(np.empty((3, 0)), none)).all()
+    assert not is_positive_definite(none).any()

@@ -18,12 +18,12 @@ AHRS = {
 }
 
 
-def swung() -> MemorySource:
+def swung(begin_ns: int = SIMULATION_EPOCH_NS) -> MemorySource:
     time_s = np.arange(COUNT)[:, None] * STEP_NS * 1e-9
     samples = make_stream(
         "/hand/inertial",
         schemas.INERTIAL_SAMPLE,
-        SIMULATION_EPOCH_NS + STEP_NS * np.arange(COUNT),
+        begin_ns + STEP_NS * np.arange(COUNT),
         specific_force_mps2=np.sin(9.0 * time_s + np.arange(3)) + np.array([1.0, -2.0, 9.0]),
         turn_rate_radps=np.cos(7.0 * time_s + [0.0, 1.0, 2.0]),
         magnetic_field_ut=3.0 * np.cos(5.0 * time_s + np.arange(2, -1, -1))
@@ -44,6 +44,19 @@ def test_it_gives_what_the_package_ahrs_gives(label):
     found = replayed(label)["mean"]
     assert len(found) == COUNT
     np.testing.assert_allclose(found[-1], AHRS[label], rtol=0, atol=1e-12)
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("label", AHRS)
+def test_runs_that_begin_at_other_times_are_what_each_is_alone(label):
+    sources = [swung(), swung(SIMULATION_EPOCH_NS + 7 * 10**9)]
+    [together] = [
+        ragged
+        for topic, ragged in collect(replay(sources, bind(label, sources, {}))).items()
+        if topic.endswith("/state")
+    ]
+    for run in range(2):
+        np.testing.assert_array_equal(together.of_run(run)["mean"], replayed(label)["mean"])
 
 
 def test_vqf_gives_what_its_package_gives():

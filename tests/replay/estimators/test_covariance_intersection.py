@@ -196,6 +196,19 @@ def test_bad_covariances_are_refused(covariances, said):
         fuse("ci-trace", np.zeros((2, 2)), covariances)
 
 
+def test_an_independent_part_is_at_most_its_covariance_in_every_direction():
+    fuse("split-ci", np.zeros((2, 2)), PAIR, PAIR)
+    excess = PAIR + np.array([np.zeros((2, 2)), np.diag([-0.5, 0.01])])
+    with pytest.raises(BadInput, match="an independent part exceeds its covariance"):
+        fuse("split-ci", np.zeros((2, 2)), PAIR, excess)
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_what_cannot_be_inverted_is_refused_by_every_rule(name):
+    with pytest.raises(BadInput, match="singular to working precision"):
+        fuse(name, np.zeros((2, 2)), 1e-310 * PAIR)
+
+
 def test_an_unknown_rule_is_refused_with_those_there_are():
     with pytest.raises(BadInput, match="ci-trace"):
         fuse("best", np.zeros((2, 2)), PAIR)

@@ -90,6 +90,16 @@ def test_a_start_does_not_hang_on_rounding_nor_lie_at_infinity() -> None:
     assert np.linalg.norm(found(of).mean) < 1e7
 
 
+@pytest.mark.parametrize("size", [0.01, 100.0])
+def test_a_start_grows_with_the_array(size: float) -> None:
+    """Places, their uncertainty and the differences' errors have no other unit than the array's size."""
+    place = np.array([-60.0, 10.0, 20.0])
+    start = found(streams(ARRAY, place, np.full(6, 1e-5)), start_sigma_m=1e6)
+    grown = found(streams(size * ARRAY, size * place, np.full(6, size * 1e-5)), start_sigma_m=size * 1e6)
+    assert_allclose(grown.mean[:3], size * start.mean[:3], rtol=1e-6)
+    assert_allclose(grown.covariance[:3, :3], size**2 * start.covariance[:3, :3], rtol=1e-6)
+
+
 def test_microphones_in_a_plane_have_their_source_there() -> None:
     flat = ARRAY * [1.0, 1.0, 0.0] + [0.0, 0.0, 2.0]
     of = streams(flat[:4], np.array([12.0, 40.0, 2.0]), np.full(4, 1e-5))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,10 @@ from scipy.optimize import linear_sum_assignment
 
 from recorders.errors import BadInput
 from replay.inference.association.association import existence_after, marginals
+from replay.inference.association.births import ending
 from replay.inference.association.clusters import MOST_ENUMERATED
+from replay.inference.association.shared_bias import pool_errors, pool_of
+from replay.inference.association.tracks import no_tracks
 
 PLACES = np.array([[0.0, 0.0], [4.0, 1.0], [9.0, -1.0]])
 COVARIANCES = np.array([[[1, 0], [0, 2]], [[2, 0.5], [0.5, 1]], [[1.5, 0], [0, 1.5]]]) + np.array(
@@ -195,3 +199,60 @@ def test_larger_clusters_are_approximated():
 def test_bad_input_is_named(arguments, said):
     with pytest.raises(BadInput, match=said):
         marginals(*arguments)
+
+
+def test_shared_errors_add_up_as_information_and_every_track_gets_them():
+    """The module's formula with any matrices; tracks that are not confirmed or updated say nothing."""
+    rng = np.random.default_rng(3)
+
+    def spread(size: int) -> np.ndarray:
+        root = rng.normal(size=(size, size))
+        return root @ root.T + np.eye(size)
+
+    tracks = no_tracks(1, 4, (1, 5, 5), 1, 100.0 * spread(2))
+    tracks.used[:], tracks.shared_mean[:] = 4, rng.normal(size=2)
+    tracks.is_confirmed[:] = [[True, False, True, True]]
+    tracks.mean[0, :, 0] = rng.normal(size=(4, 5))
+    tracks.covariance[0, :, 0] = [spread(5) for _ in range(4)]
+    pool = pool_of(2, 5, 4)
+    pool.is_updated[:] = [True, True, False, True]
+    mean, before = tracks.shared_mean[0].copy(), np.linalg.inv(tracks.shared_covariance[0])
+    old, joint = tracks.mean[0, :, 0].copy(), tracks.covariance[0, :, 0].copy()
+    information, vector = before.copy(), before @ mean
+    for each in (0, 3):
+        own = np.linalg.inv(joint[each, 2:4, 2:4])
+        information += own - before
+        vector += own @ old[each, 2:4] - before @ mean
+    pool_errors(0, 2, tracks, pool)
+    shared = np.linalg.inv(information)
+    assert tracks.shared_mean[0] == pytest.approx(shared @ vector)
+    assert tracks.shared_covariance[0] == pytest.approx(shared)
+    for place in range(4):
+        gain = joint[place][:, 2:4] @ np.linalg.inv(joint[place, 2:4, 2:4])
+        told = old[place] + gain @ (shared @ vector - old[place, 2:4])
+        assert tracks.mean[0, place, 0] == pytest.approx(told)
+        rest = joint[place] + gain @ (shared - joint[place, 2:4, 2:4]) @ gain.T
+        assert tracks.covariance[0, place, 0] == pytest.approx(rest)
+
+
+@pytest.mark.parametrize("first_is_confirmed", [True, False])
+@pytest.mark.parametrize("component", range(4))
+def test_a_second_track_of_a_target_ends(first_is_confirmed: bool, component: int):
+    """Where an older confirmed one is nearer in place and in velocity; at the limit none is."""
+    limits = [10.0, 2.0, 10.0, 2.0]  # x_m, vx_mps, y_m, vy_mps
+    model = SimpleNamespace(state=("x_m", "vx_mps", "y_m", "vy_mps"))
+    tracker = SimpleNamespace(stage=SimpleNamespace(model=model), management="existence")
+    p = SimpleNamespace(
+        same_within_m=10.0, same_within_mps=2.0, ending_existence=0.1, silence_s=1, tentative_silence_s=1
+    )
+    end_tracks = ending(tracker)
+    for sign in (1.0, -1.0):
+        for share, is_left in ((0.999, not first_is_confirmed), (1.0, True)):
+            tracks = no_tracks(1, 3, (1, 4, 4), 1, np.empty((0, 0)))
+            tracks.used[:], tracks.existence[:] = 2, 1.0
+            tracks.is_confirmed[0, :2] = first_is_confirmed, True
+            tracks.mean[0, 0, 0] = 3.0, 7.0, 70.0, -7.0
+            tracks.mean[0, 1] = tracks.mean[0, 0]
+            tracks.mean[0, 1, 0, component] += sign * share * limits[component]
+            end_tracks(0, tracks, p)
+            assert tracks.used[0] == 1 + is_left

@@ -234,6 +234,19 @@ def test_parts_blocks_and_orders_of_an_ensemble_give_the_same_bound() -> None:
     assert_allclose(bounds_of(blocks, sources).covariances(), whole, rtol=1e-12)
 
 
+@pytest.mark.usefixtures("uncompiled")
+def test_runs_of_other_lengths_have_no_bound_together() -> None:
+    """Their steps are of the same stamps as far as both go; later the mean would be of one alone."""
+    sources = [target(0), target(1)]
+    fixes = sources[1].streams["/fix"]
+    streams = {**sources[1].streams, "/fix": fixes.take(slice(0, 30))}
+    short = Recording(list(streams.values()))
+    sources[1] = memory_source(short, sources[1].run)
+    bounds = bounds_of(outputs(CV, "bound", sources), sources)
+    assert bounds.complaint
+    assert bounds.covariances() is None
+
+
 # What is judged
 
 

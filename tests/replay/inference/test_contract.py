@@ -1,5 +1,6 @@
 """What is asked of a model, and the one sentence where it, the log or the settings do not meet it."""
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -17,8 +18,10 @@ from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.inference import estimators
 from replay.inference.all_methods import METHODS
+from replay.inference.model.binding import _common
 from replay.inference.model.model import Control, Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
+from replay.inference.model.settings import reading_settings
 from replay.inference.model.stage import Stage, stage_of
 from tests.replay.inference import vehicle_a
 from tests.replay.inference.replays import bound, outputs
@@ -291,3 +294,17 @@ def test_models_are_traced_once_for_all_that_have_the_same_sensors(
     recording, run = record_run("landmarks", {"duration_s": 0.1, "robots": 3}, 0)
     filters = bind("ekf", [memory_source(recording, run)], {"kind": "ekf"})
     assert (len(filters), len(traced)) == (3, 1)
+
+
+@pytest.mark.parametrize(
+    "spaces", [["/a/b", "/a/c"], ["/a/x/c", "/a/y/c"], ["/a"], ["/a/b/c", "/a/b"], ["/a", "/b"]]
+)
+def test_what_namespaces_share_is_how_all_of_them_begin(spaces: list[str]) -> None:
+    assert _common(spaces) == os.path.commonpath(spaces).rstrip("/")
+
+
+def test_a_row_of_settings_is_read_by_its_names() -> None:
+    rows = np.arange(6.0).reshape(2, 3)
+    for row in range(2):
+        found = reading_settings(("gate", "bias", "age_s"))(rows, row)
+        assert (found.gate, found.bias, found.age_s) == tuple(rows[row])

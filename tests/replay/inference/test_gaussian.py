@@ -27,6 +27,7 @@ from replay.inference.kalman.steps import (
 )
 from replay.inference.kalman.update import kalman_update
 from replay.inference.linear_algebra.gaussian import cholesky
+from replay.inference.linear_algebra.manifold import boxminus, boxplus, recentring
 from replay.inference.linear_algebra.sparse import pattern_of, propagating_covariance
 from replay.inference.model.model import Control, Map, Model, Motion, Sensor
 from replay.inference.model.parameters import ModelParameters
@@ -283,3 +284,25 @@ def test_sampling_says_where_the_covariance_is_none():
     measurement = Measurement(np.ones(4), noise, np.full(3, np.inf), 0)
     told = update(0, belief, measurement, work, empty_record(2))
     assert told == NOT_POSITIVE_DEFINITE
+
+
+@given(seeds)
+def test_tangent_vectors_from_a_shifted_centre_lead_to_the_same_states(seed: int):
+    """By less than half a turn, or half of that of an axis, however far they were."""
+    generator = np.random.default_rng(seed)
+    kinds = ("linear", "angle", "axis", "axis", *4 * ("quaternion",))
+    values, shift = generator.uniform(-3.0, 3.0, (5, 6)), generator.uniform(-0.9, 0.9, 6)
+    centre = np.array([2.0, 3.0, 0.6, 0.8, 1.0, 0.0, 0.0, 0.0])
+    away, shifted = values.copy(), centre.copy()
+    again = recentring(kinds)(away, shift)
+    add, differ, apart = boxplus(kinds), boxminus(kinds), np.empty((5, 6))
+    add(shifted, shift)
+    for row, (old, new) in enumerate(zip(values, away, strict=True)):
+        one, other = centre.copy(), shifted.copy()
+        add(one, old)
+        add(other, new)
+        differ(tuple(one), tuple(other), apart, row)
+    assert_allclose(apart, 0.0, atol=1e-7)
+    assert again  # of a rotation that is not settled
+    assert np.all(np.abs(away[:, 1]) <= np.pi)
+    assert np.all(np.abs(away[:, 2]) <= 0.5 * np.pi)

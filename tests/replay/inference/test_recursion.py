@@ -5,6 +5,7 @@ about the recursion and not the compiler runs uncompiled.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from recorders.log import LogWriter, Stream, make_stream, open_log, schemas
 from recorders.recording import Recording
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import LogSource, MemorySource, memory_source
 from replay.inference.run.recursion import no_results
 from replay.inference.run.timing import add_output_times, output_times
 from tests.replay.inference import vehicle_a, wheel
 from tests.replay.inference.replays import outputs
+from tests.replay.inference.scalar import SCALAR, VALUE
+from tests.replay.inference.scalar import source as scalar_source
 from tests.replay.inference.vehicle_a import VEHICLE_A
 from tests.replay.inference.wheel import ANGLE, COVARIANCE, RATE, make_wheel
 
@@ -122,6 +126,7 @@ def plain_filter(
     return list(found), np.array(means), np.array(covariances), likelihood
 
 
+CONTROL_S = np.arange(-1, 15) * 0.1
 CONTROLS = {
     "one at the prior's stamp, and an end before that of the sensors": np.arange(-1, 20) * 0.07,
     "none at the prior's stamp": np.arange(-1, 15) * 0.1 + 0.04,
@@ -331,3 +336,35 @@ def test_results_are_one_piece_of_memory_and_columns_of_their_own():
 def _whole(column: Any) -> Any:
     """The memory that a column is a part of."""
     return column if column.base is None else _whole(column.base)
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("method", ["ekf", "iekf", "ukf", "particles", "smoother"])
+def test_a_measurement_that_leaves_no_covariance_ends_the_run(method: str) -> None:
+    """A variance of the innovation below zero, of the second message: a number of the model is wrong."""
+    wrong = replace(VALUE, noise=lambda parameters: (parameters.sigma_measured,))
+    model = replace(SCALAR, sensors=(wrong,))
+    found = outputs(model, method, [scalar_source([0.1, 0.2])], sigma_measured=-1.07, sigma_moved=0.5)
+    assert sentences_of(found["failure"].stream) == ["the covariance is no longer positive definite"]
+
+
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.parametrize("method", ["ekf", "iekf", "ukf", "smoother", "particles"])
+def test_what_memory_holds_before_it_is_written_changes_nothing(
+    method: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sensors of one and of two components, noise that is not additive, an interpolated control."""
+    found = []
+    for garbage in (np.nan, 7e77):
+
+        def holding(shape: Any, dtype: Any = float, value: float = garbage, **options: Any) -> Any:
+            made = np.zeros(shape, dtype, **options)
+            made[...] = value if made.dtype.kind == "f" else 0
+            return made
+
+        with monkeypatch.context() as changed:
+            changed.setattr(np, "empty", holding)
+            found.append(outputs(make_wheel(), method, [wheel.source(wheel.simulate(1, CONTROL_S))]))
+    for topic, ragged in found[0].items():
+        for name, column in ragged.stream.columns.items():
+            assert_array_equal(column, found[1][topic][name], err_msg=f"{topic} {name}")

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 
 import fuselog as fl
+from replay.inference.all_methods import METHODS
+from replay.inference.model.stage import title_of
 from replay.inference.run import filtering
+from tests.replay.inference.vehicle_a import VEHICLE_A
 
 
 @pytest.mark.skipif(os.environ.get("FUSELOG_UNCOMPILED") == "1", reason="nothing is compiled")
@@ -27,3 +30,11 @@ def test_a_long_first_use_is_told_with_method_and_model(
     assert said[0] == "compiling the extended Kalman filter of robot, once"
     assert re.fullmatch(r"compiled the extended Kalman filter of robot in \d+\.\d s", said[1])
     assert len(said) == 2
+
+
+def test_a_method_is_named_without_what_its_variants_are() -> None:
+    """The first part of its summary, of a model that is registered by the model's name."""
+    titles = {label: title_of(VEHICLE_A, method.summary) for label, method in METHODS.items()}
+    assert all(title.endswith(f" of {VEHICLE_A.summary}") for title in titles.values())
+    assert [label for label, title in titles.items() if ";" in title] == []
+    assert any(";" in method.summary for method in METHODS.values())

@@ -224,6 +224,54 @@ def test_of_an_ensemble_only_what_all_truths_have_is_judged():
     errors = errors_of(gather([stream, stream]), [*map(Truths, [source(whole), source(partial)])])
     assert errors is not None
     assert_array_equal(errors.error, [[2, 9], [1, 2]])
+    other = make_stream("/else", schemas.TRUTH_STATE, [SECOND], metadata=POSE, state=[[0, 0, 0]])
+    both = [source(whole), source(other)]
+    assert errors_of(gather([stream, stream]), [*map(Truths, both)]) is None
+
+
+def test_a_step_has_the_means_of_every_quantity_over_the_runs():
+    """Of a body's place, orientation and range, against sums written out; all errors differ."""
+    kinds = {"x_m": "linear", "y_m": "linear"} | {f"orientation_{each}": "quaternion" for each in "wxyz"}
+    kinds["range_m"] = "linear"
+    stated = {"components": ",".join(kinds), "kinds": ",".join(kinds.values())}
+    truth_of_it = truth([0, 1, 2], [[0, 0, 1, 0, 0, 0, 0]] * 3, **stated)
+    half = 0.5 * np.array([[0.1, 0.3], [0.2, 0.5]])
+    off = np.array([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [[7.0, 8.0, 9.0], [10.0, 11.0, 12.0]]])
+    parts = [
+        estimates(
+            [1, 2],
+            [
+                [
+                    *off[run, step, :2],
+                    np.cos(half[run, step]),
+                    np.sin(half[run, step]),
+                    0,
+                    0,
+                    off[run, step, 2],
+                ]
+                for step in range(2)
+            ],
+            np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+            **stated,
+        )
+        for run in range(2)
+    ]
+    judge = Judge([source(truth_of_it)] * 2, gap_limit_s=10.0)
+    judge.add({parts[0].topic: gather(parts)})
+    [table] = judge.steps.values()
+    square = np.mean(off**2, axis=0)
+    angle = np.mean((2.0 * half) ** 2, axis=0)
+    wanted = {
+        "position_rmse_m": square[:, 0] + square[:, 1],
+        "rmse_x_m": square[:, 0],
+        "rmse_y_m": square[:, 1],
+        "rmse_range_m": square[:, 2],
+        "orientation_rmse_deg": np.degrees(np.degrees(angle)),
+        "nees": square @ [1.0, 0.5, 1.0 / 6.0] + angle / 3.0,
+    }
+    for column, value in wanted.items():
+        found = table[column] if column == "nees" else table[column] ** 2
+        assert_allclose(found, value, err_msg=column)
 
 
 def test_an_orientation_is_judged_whole_or_not_at_all():

@@ -1,6 +1,7 @@
 """The judge: the same numbers whatever the blocks and parts that it gets, and truths read along."""
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -9,12 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from recorders.log import Clock, Stream, make_stream, schemas
+from recorders.log import Clock, Schema, Stream, make_stream, schemas
 from recorders.recording import record_run
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import Report, collect, replay
 from replay.engine.streams.blocks import Ragged, gather
+from replay.engine.streams.failures import reason_stream
 from replay.engine.streams.sources import MemorySource, memory_source
+from replay.judging.diagnostics import Diagnostics
+from replay.judging.errors.constant import _inverse
 from replay.judging.errors.evaluation import chi_square_interval, rmse_interval
 from replay.judging.errors.truths import Truths
 from replay.judging.judge import Judge
@@ -242,3 +246,58 @@ def test_binned_sums_are_the_same_in_any_cut(
     for (number, at_bin), n in zip(cells.tolist(), count.tolist(), strict=True):
         assert n == np.sum((group == number) & (position // whole.width == at_bin))
     assert_array_equal(np.unique(cells[:, 0]), np.unique(group))
+
+
+def test_what_a_replay_says_of_itself_adds_up_over_its_parts(sources: list[MemorySource]) -> None:
+    """Failures, what was skipped, how runs began and what was covered: of two parts as of the whole."""
+    epoch_ns = sources[0].epoch_ns
+
+    def told(schema: Schema, reasons: list[list[int]]) -> Ragged:
+        texts = ["one", "two", "three"]
+        topic = f"/estimates/x/{schema.name.lower()}"
+        return gather(
+            [
+                reason_stream(
+                    topic, schema, np.full(len(each), epoch_ns + 10**9), np.array(each, int), texts
+                )
+                for each in reasons
+            ]
+        )
+
+    given = {
+        "/estimates/x/failure": told(schemas.FAILURE, [[], [0], [1]]),
+        "/estimates/x/skipped": told(schemas.SKIPPED, [[0, 0], [1], [0]]),
+        "/estimates/x/started": told(schemas.STARTED, [[2], [2, 1], [2]]),
+    }
+
+    def of(runs: range) -> Diagnostics:
+        part = Diagnostics(runs.start)
+        for topic, ragged in given.items():
+            part.add(topic, gather([ragged.of_run(run) for run in runs]), [sources[run] for run in runs])
+        return part
+
+    whole, parts = of(range(3)), of(range(1))
+    parts.merge(of(range(1, 3)))
+    names = {run: f"run {run}" for run in range(3)}
+    assert parts.failures(names) == whole.failures(names)
+    assert len(whole.failures(names)) == 2
+    assert parts.notes() == whole.notes()
+    assert whole.notes() == [
+        "x: three (in 3 runs)",
+        "x: two",
+        "x: 3 not used: one",
+        "x: 1 not used: two",
+    ]
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_an_infinite_variance_weighs_nothing(axes: int) -> None:
+    """Of two axes whatever stands beside it; the rest is the inverse of what is finite."""
+    covariance = np.array([[2.0, 0.5, 0.1], [0.5, 3.0, 0.2], [0.1, 0.2, 4.0]])[:axes, :axes]
+    for axis, beside in product(range(axes), (0.0, np.inf, np.nan)[: 3 if axes == 2 else 1]):
+        given, wanted = covariance.copy(), np.zeros((axes, axes))
+        given[axis], given[:, axis] = beside, beside
+        given[axis, axis] = np.inf
+        rest = np.ix_(*2 * [np.arange(axes) != axis])
+        wanted[rest] = np.linalg.inv(covariance[rest])
+        assert_allclose(_inverse(given[..., None])[..., 0], wanted, atol=1e-12)

@@ -5,6 +5,7 @@ import math
 import random
 import re
 import time
+from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -268,3 +269,15 @@ def test_functions_of_one_name_are_two_in_a_kernel():
     out = np.zeros((1, 3, 1))
     compile_over_runs(over_points(functions, 1), allocates=False)(1, np.array([[0.5]]), out)
     assert out.ravel().tolist() == [0.5, 1.5, 2.5]
+
+
+def test_parameters_are_unpacked_in_the_order_in_which_they_stand():
+    """As those of the NamedTuple are that a function gets where it is not traced."""
+
+    def scaled(given: Any, parameters: Any) -> Any:
+        offset, gain = parameters
+        return (gain * given[0] + offset,)
+
+    values = namedtuple("values", ["offset", "gain"])(7.0, 3.0)
+    function = traced(scaled, 1, ("offset", "gain"))
+    assert function((2.0,), values) == scaled((2.0,), values) == (13.0,)

@@ -109,6 +109,9 @@ def order() -> Iterator[str]:
             yield from (
                 f"  {place}. {each.words} [{each.setting}]" for place, each in enumerate(said, 1)
             )
+    yield "in one half alone:"
+    for of_halves in ((-11.6, 250.0), (250.0, -1.93), (250.0, -1.91)):
+        yield f"  {Cause(hypothesis, 1.0, (0.5, 1.5), 238.0, (), of_halves).words}"
     yield "advised already:"
     found = ranked([], [unit, other], TRYING, None)
     yield from (f"  {each.words}" for each in found)

@@ -1,5 +1,6 @@
 """A kernel's key is all that it is made of, and nothing else; what is kept serves every process."""
 
+import gc
 import os
 import pickle
 import re
@@ -225,3 +226,14 @@ def test_workers_run_kernels_and_get_them_by_name():
         assert list(pool.map(result_of, [doubled, tripled])) == [3.0, 4.5]
         assert list(pool.map(in_a_worker, [1.0, 2.0, 3.0])) == [2.0, 4.0, 6.0]
     assert pickle.loads(pickle.dumps(in_a_worker))(2.0) == 4.0
+
+
+@pytest.mark.parametrize("is_collecting", [True, False])
+def test_garbage_is_collected_after_a_compilation_as_before(is_collecting: bool):
+    (gc.enable if is_collecting else gc.disable)()
+    try:
+        with native._without_garbage():
+            assert not gc.isenabled()
+        assert gc.isenabled() == is_collecting
+    finally:
+        gc.enable()

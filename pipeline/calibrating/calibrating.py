@@ -4,10 +4,12 @@ A model says which of its parameters these are, see `replay.inference.model.mode
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
+from pipeline.calibrating.manoeuvres import advice
 from pipeline.tuning.outcome import Tuning
 from pipeline.tuning.tuning import tune
 from recorders.errors import BadInput
@@ -24,6 +26,7 @@ def calibrate(
     *,
     set: Mapping[str, Any] | None = None,  # noqa: A002
     fixed: Sequence[str] = (),
+    next_motion: bool = False,
     **options: Any,
 ) -> Tuning:
     """Search the parameters that say how sensors are mounted, scaled, biased and delayed.
@@ -37,9 +40,11 @@ def calibrate(
         estimator: a registered name, or a label of your own with what it stands for; see `replay`.
         set: other parameters, and where the search starts; see `tune`.
         fixed: parameters of the calibration that are known, and stay as they are set.
+        next_motion: also say which manoeuvre to record next, of a robot with wheels and fixes.
         options: as for `tune`, but for `free` and `by`.
 
-    Raises BadInput where the model marks none, or nothing in the logs depends on what it marks.
+    Raises BadInput where the model marks none, nothing in the logs depends on what it marks, or a next
+    motion is asked of logs without wheels and fixes.
     """
     for name in OPTIONS:
         if name in options:
@@ -65,4 +70,5 @@ def calibrate(
         if name not in marked:
             raise BadInput(f"--fixed {name}: is not of the calibration; it is {', '.join(marked)}")
     free = [name for name in marked if name not in fixed]
-    return tune(logs, estimator, free, set=set, **options)
+    found = tune(logs, estimator, free, set=set, **options)
+    return replace(found, advice=advice(found)) if next_motion else found

@@ -1,0 +1,169 @@
+"""Which manoeuvre to record next: what each would add to what logs tell of a calibration.
+
+Wheeled manoeuvres are simulated without noise, with the sensors, steps and noise of the log and the
+values that were found, and asked for their information. Which is best depends on what is wanted: the
+determinant counts all parameters together, the widest interval the one that is known worst.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pipeline.calibrating.car import MOTIONS, NAMES, Motion, Steps, drive, recorded
+from pipeline.tuning.information import information
+from pipeline.tuning.objective import Run, in_memory
+from pipeline.tuning.outcome import TUNED, Tuning
+from recorders.errors import BadInput
+from recorders.log import Schema, Stream, schemas
+from replay.engine.replaying.estimator import bind
+from replay.engine.streams.sources import Ensemble, Source
+
+Floats = NDArray[np.float64]
+DURATION_S = 20.0
+PRIOR = 10.0  # how far off a parameter may be before anything is recorded, in useful units
+START = (1000.0, 1000.0, 1.0)  # of a manoeuvre's start, in m and rad
+SIMULATED = {
+    "/car/odometry": schemas.ODOMETRY,
+    "/car/fix": schemas.POSITION_FIX,
+    "/car/heading": schemas.ORIENTATION,
+}
+
+
+class Gain(NamedTuple):
+    """Holds what a manoeuvre adds.
+
+    Attributes:
+        nats: half the logarithm of the ratio of determinants, with it and without.
+        sigmas: (m,) the standard deviations with it, in useful units.
+    """
+
+    nats: float
+    sigmas: Floats
+
+    @property
+    def widest(self) -> float:
+        """The largest standard deviation, in useful units."""
+        return float(self.sigmas.max())
+
+
+def gain(known: Floats, added: Floats) -> Gain:
+    """What an information (m, m), in useful units, adds to what is known (m, m).
+
+    >>> found = gain(np.diag([4.0, 1.0]), np.diag([0.0, 3.0]))
+    >>> round(found.nats, 3), found.sigmas.tolist()
+    (0.693, [0.5, 0.5])
+    """
+    before, after = np.linalg.slogdet(known)[1], np.linalg.slogdet(known + added)[1]
+    return Gain(0.5 * float(after - before), np.sqrt(np.diag(np.linalg.inv(known + added))))
+
+
+def manoeuvres(found: Tuning) -> pd.DataFrame:
+    """A row per manoeuvre of 20 s, the one first after which the widest interval is narrowest.
+
+    Columns: manoeuvre, nats that it gains, and per parameter the standard deviation with it, in its own
+    unit; the row "none" is what the logs tell already.
+
+    Raises BadInput where the logs are not of a robot with wheels.
+    """
+    free = [each for each in found.found.coordinates.free if each.name in NAMES]
+    objective, values = found.objective, found.found.optimum
+    places = [objective.names.index(each.name) for each in free]
+    useful = np.zeros(len(values))
+    useful[places] = [each.useful for each in free]
+    scale = useful[places]
+    log = found.logs[0]
+    known = information(objective, values, useful, places) + np.eye(len(places)) / PRIOR**2
+    gains = {"none": gain(known, 0.0 * known)}
+    for name, motion in MOTIONS.items():
+        run = _simulated(found, log, motion)
+        simulated = replace(objective, settings=found.settings[TUNED], runs=[run], pool=None)
+        simulated.begin(values)
+        gains[name] = gain(known, information(simulated, values, useful, places))
+    rows = [(name, each.nats, each.widest, *each.sigmas * scale) for name, each in gains.items()]
+    columns = ["manoeuvre", "nats", "widest", *(each.name for each in free)]
+    return pd.DataFrame(rows, columns=columns).sort_values("widest", ignore_index=True)
+
+
+def advice(found: Tuning) -> list[str]:
+    """Say which manoeuvre shrinks the widest interval most, and which the determinant prefers."""
+    table = manoeuvres(found)
+    names = list(table.columns[3:])
+    before, best = table[table["manoeuvre"] == "none"].iloc[0], table.iloc[0]
+    if best["manoeuvre"] == "none":
+        return ["next: none of the manoeuvres tells more than the logs do"]
+    useful = {each.name: each.useful for each in found.found.coordinates.free}
+    widest = max(names, key=lambda name: before[name] / useful[name])
+    by_determinant = table.iloc[int(table["nats"].argmax())]
+    return [
+        f"next, record {best['manoeuvre']}: of {len(MOTIONS)} manoeuvres of {DURATION_S:g} s it leaves "
+        f"the narrowest widest interval; the standard error of {widest}, now the widest, becomes "
+        f"{best[widest]:.3g} ({before[widest]:.3g} without)",
+        f"by the determinant, which counts all parameters together, it is {by_determinant['manoeuvre']} "
+        f"({by_determinant['nats']:.1f} nats; {best['manoeuvre']} {best['nats']:.1f})",
+    ]
+
+
+def _simulated(found: Tuning, log: Source, motion: Motion) -> Run:
+    """A manoeuvre as a log of the same topics, with the values that were found."""
+    streams = _of_kinds(log)
+    steps = [_step_s(streams.get(topic)) for topic in SIMULATED]
+    usual = dict.fromkeys(NAMES, 0.0) | {"forward_scale": 1.0, "turn_scale": 1.0}
+    held = {name: found.settings[TUNED].get(name) or value for name, value in usual.items()}
+    car = drive(None, motion, DURATION_S, _errors(held), Steps(*steps))
+    source = recorded(car, START)
+    made: dict[str, Stream] = {}
+    for topic, stream in source.streams.items():
+        if topic in streams:
+            made[streams[topic].topic] = _alike(stream, streams[topic])
+        elif topic not in SIMULATED:
+            prior = _first_of(log, stream.schema)
+            name = topic if prior is None else prior.topic
+            made[name] = replace(stream, topic=name)
+    simulated = replace(source, streams=made)
+    bound = bind(found.label, Ensemble([simulated]), found.settings[TUNED])
+    return in_memory(simulated, bound)
+
+
+def _first_of(log: Source, schema: Schema) -> Stream | None:
+    """The first topic of a schema that the run has of its own."""
+    for name, topic in log.topics.items():
+        if topic.schema_name == schema.full_name and not name.startswith("/estimates/"):
+            return log.read([name])[name]
+    return None
+
+
+def _of_kinds(log: Source) -> dict[str, Stream]:
+    """The log's streams that are simulated, by the topic of the simulation."""
+    streams = {topic: _first_of(log, schema) for topic, schema in SIMULATED.items()}
+    found = {topic: stream for topic, stream in streams.items() if stream is not None}
+    if "/car/odometry" not in found or "/car/fix" not in found:
+        raise BadInput(
+            f"--next: {log.name} has no odometry with fixes; manoeuvres are those of a robot with wheels"
+        )
+    return found
+
+
+def _step_s(stream: Stream | None) -> float:
+    """The usual time between messages, in s."""
+    if stream is None or len(stream) < 2:
+        return 1.0
+    return float(np.median(np.diff(stream.publish_time_ns))) * 1e-9
+
+
+def _errors(values: Mapping[str, Any]) -> Floats:
+    """The errors of a car (7,), of the readings by the motion; a model's are of the motion by them."""
+    forward, turn, bias, *others = (float(values[name]) for name in NAMES)
+    return np.array([1.0 / forward, 1.0 / turn, -bias / turn, *others])
+
+
+def _alike(stream: Stream, like: Stream) -> Stream:
+    """A simulated stream under the name, with the metadata and the covariance, of another."""
+    columns = {
+        name: np.repeat(like[name][:1], len(stream), axis=0) if "covariance" in name else column
+        for name, column in stream.columns.items()
+    }
+    return replace(stream, topic=like.topic, metadata=like.metadata, columns=columns)
