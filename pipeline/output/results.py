@@ -76,9 +76,10 @@ class Result(Parameters):
     """Holds what result.json says.
 
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
-    without it. A timeline has none, Rerun numbers its rows by the clock, nor have `TIMINGS`. `bounds`
-    are where a metric lies with 95 % if all is well, `intervals` where the true one lies with 95 %; `alarms` are what makes
-    the metrics doubtful, the worst first; `causes` why estimators are inconsistent, by a diagnosis.
+    without it. What depends on the clock has none: a timeline, whose rows Rerun numbers by it, and
+    `TIMINGS`. `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one
+    lies with 95 %; `alarms` are what makes the metrics doubtful, the worst first; `causes` why
+    estimators are inconsistent, by a diagnosis.
     """
 
     format: int = FORMAT

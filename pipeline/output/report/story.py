@@ -325,11 +325,12 @@ def _foot(found: Findings, each: Evidence, take: str, timings: Timings) -> list[
     """What it cost, also beside the one to take, and how often it failed."""
     foot = []
     own, best = (timings.get(label, {}) for label in (each.estimator, take))
-    seconds, messages = own.get("seconds", 0.0), own.get("messages", 0)
-    if seconds and messages:
+    seconds, messages = own.get("seconds", 0.0), own.get("messages", 0.0)
+    if seconds > 0.0 and messages > 0.0:
         one_s = seconds / messages
-        times = seconds / best["seconds"] if best.get("seconds") and best is not own else 1.0
-        beside = f", {number(times, 2)} times the time of {take}" if best and best is not own else ""
+        beside = ""
+        if each.estimator != take and best.get("seconds", 0.0) > 0.0:
+            beside = f"; in all {number(seconds / best['seconds'], 2)} times the time of {take}"
         foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} a message{beside}")
     if each.failed is not None:
         foot.append(f"{each.failed:,} of {count(found.runs, 'run')} failed")
