@@ -276,7 +276,7 @@ class Replay:
         settings |= {name: value for name, value in stated.items() if value is not None}
         with result_folder(place) as part:
             outcome = summarise(self.judge, self.done.coverage, self.done.parameters)
-            outcome.input_sha256 = self.input_sha256
+            outcome.input_sha256, outcome.timings = self.input_sha256, self.done.timings
             return ResultFolder(place, write_outcome(part, "replay", settings, outcome))
 
     @property

@@ -38,6 +38,8 @@ FORMAT = 1
 ERRORS = Path("tables", "errors")
 # The table of runs, in a result's folder.
 RUNS = Path("tables", "runs.parquet")
+# What estimators cost, which no two runs have alike: beside result.json, and without a hash in it.
+TIMINGS = "timings.json"
 Bounds = tuple[float, float]
 MetricValue = float | list[float] | list[float | None] | None
 
@@ -50,7 +52,7 @@ class Outcome:
     95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
     a hash of the data that went in, `parameters` are those of all estimators, defaults included,
     `alarms` what makes the metrics doubtful, `causes` why an estimator is inconsistent, where it was
-    diagnosed.
+    diagnosed, `timings` the seconds and messages of each estimator.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -63,6 +65,7 @@ class Outcome:
     intervals: dict[str, Bounds] = field(default_factory=dict)
     alarms: list[Alarm] = field(default_factory=list)
     causes: list[Cause] = field(default_factory=list)
+    timings: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
         """Keep a metric with its 95 % interval."""
@@ -73,9 +76,10 @@ class Result(Parameters):
     """Holds what result.json says.
 
     `files` are what was written to the folder, each with its SHA-256; that of result.json is of its text
-    without it. A timeline has none: Rerun numbers its rows by the clock. `bounds` are where a metric
-    lies with 95 % if all is well, `intervals` where the true one lies with 95 %; `alarms` are what makes
-    the metrics doubtful, the worst first; `causes` why estimators are inconsistent, by a diagnosis.
+    without it. What depends on the clock has none: a timeline, whose rows Rerun numbers by it, and
+    `TIMINGS`. `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one
+    lies with 95 %; `alarms` are what makes the metrics doubtful, the worst first; `causes` why
+    estimators are inconsistent, by a diagnosis.
     """
 
     format: int = FORMAT
@@ -244,6 +248,10 @@ def _text(result: Result) -> str:
     return json.dumps(result.model_dump(mode="json"), indent=2, allow_nan=False) + "\n"
 
 
+def _is_by_clock(path: Path) -> bool:
+    return path.suffix == ".rrd" or path.name == TIMINGS
+
+
 def hash_of(path: Path) -> str:
     """The SHA-256 of a file."""
     with path.open("rb") as file:
@@ -327,6 +335,8 @@ def write_outcome(
         with mpl.rc_context({"svg.hashsalt": "fuselog"}):
             show_names_as_they_are(figure)
             figure.savefig(path, metadata={"Date": None})
+    if outcome.timings:
+        (folder / TIMINGS).write_text(json.dumps(outcome.timings, indent=2) + "\n", encoding="utf-8")
     written = sorted(path for path in folder.rglob("*") if path.is_file())
     result = _sealed(
         Result(
@@ -343,7 +353,7 @@ def write_outcome(
             alarms=outcome.alarms,
             causes=outcome.causes,
             files={
-                path.relative_to(folder).as_posix(): None if path.suffix == ".rrd" else hash_of(path)
+                path.relative_to(folder).as_posix(): None if _is_by_clock(path) else hash_of(path)
                 for path in written
             },
         )

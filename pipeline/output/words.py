@@ -176,6 +176,8 @@ def scale(unit: str, *values: float | None) -> Scale:
         ):
             if least >= floor:
                 return Scale(factor, sign)
+    if unit == "s" and least < 0.0005:
+        return Scale(1e6, "µs")
     if unit == "s" and least < 0.5:
         return Scale(1000.0, "ms")
     if unit in ("rad", "radps"):

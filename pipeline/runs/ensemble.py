@@ -5,6 +5,7 @@ Recording runs on any `concurrent.futures.Executor`; the replay itself uses all 
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
@@ -110,6 +111,17 @@ class Pass:
     def coverage(self) -> list[Row]:
         """Return what became of every topic."""
         return rows_of(self.usages, self.untaken, self.judge.doubts)
+
+    @property
+    def timings(self) -> dict[str, dict[str, float]]:
+        """Return what each estimator cost: seconds, and the messages that it was given."""
+        messages: Counter[str] = Counter()
+        for name, usage in self.usages.items():
+            messages[name.partition("/")[0]] += usage.given.total()
+        return {
+            label: {"seconds": seconds, "messages": messages[label]}
+            for label, seconds in self.seconds.items()
+        }
 
     def merge(self, other: "Pass") -> None:
         """Take in what a pass over later runs left."""

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.output.results import TIMINGS
 from pipeline.runs.checkpoints import Checkpoints, checkpoints_of
 from pipeline.runs.executors import InlineExecutor, WorkerPool
 from pipeline.runs.experiment import load_experiment, run_experiment
@@ -35,7 +36,7 @@ def contents(place: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(place)): path.read_bytes()
         for path in place.rglob("*")
-        if path.is_file() and path.suffix != ".rrd"
+        if path.is_file() and path.suffix != ".rrd" and path.name != TIMINGS
     }
 
 

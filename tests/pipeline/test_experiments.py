@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 
 from pipeline.output.charts import Chart
 from pipeline.output.claims import Claim
-from pipeline.output.results import Outcome, result_folder, write_outcome
+from pipeline.output.results import TIMINGS, Outcome, result_folder, write_outcome
 from pipeline.output.summary import summarise
 from pipeline.output.words import number
 from pipeline.runs.estimates import hash_files, hash_streams
@@ -57,7 +57,8 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return {
         str(path.relative_to(folder)): path.read_bytes()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.suffix != ".rrd"  # Rerun cuts its chunks by the clock
+        # by the clock: Rerun's chunks, and what estimators cost
+        if path.is_file() and path.suffix != ".rrd" and path.name != TIMINGS
     }
 
 
@@ -73,6 +74,16 @@ def test_a_result_folder_holds_what_it_promises(result: Path) -> None:
     pd.testing.assert_frame_equal(
         pd.read_csv(result / "tables/steps.csv"), pd.read_parquet(result / "tables/steps.parquet")
     )
+
+
+def test_what_estimators_cost_is_kept_beside_the_result(result: Path) -> None:
+    """Each was given the messages of its topics; the file has no hash, for it is by the clock."""
+    kept = json.loads((result / TIMINGS).read_text())
+    coverage = pd.read_parquet(result / "tables/coverage.parquet").groupby("estimator")["messages"].sum()
+    assert list(kept) == ["dead-reckoning", "ekf", "ukf"]
+    assert kept["ekf"]["messages"] >= coverage["ekf"] > kept["dead-reckoning"]["messages"] > 0
+    assert all(0.0 < each["seconds"] < 60.0 for each in kept.values())
+    assert json.loads((result / "result.json").read_text())["files"][TIMINGS] is None
 
 
 def test_every_error_is_kept_where_that_is_asked_for(tmp_path: Path, fuselog: Fuselog) -> None:
@@ -103,7 +114,7 @@ def test_result_json_has_its_shape_and_no_nan(result: Path) -> None:
         *["format", "experiment", "fuselog", "settings", "input_sha256", "metrics", "claims", "files"],
         *["bounds", "intervals", "alarms", "causes"],
     ]
-    assert set(values["files"]) == {*_contents(result), "timeline.rrd"}
+    assert set(values["files"]) == {*_contents(result), "timeline.rrd", TIMINGS}
     assert values["experiment"] == "landmarks"
     assert values["settings"]["seed"] == 5
     assert values["settings"]["record"]["parameters"] == {"duration_s": 2}
@@ -494,6 +505,7 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
     fuselog("report", out, "-o", tmp_path / "five.html")
     expected = f"NEES {number(mean)}, 95 % {number(low)} to {number(high)}; 3 is right"
     assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
-    assert printed.splitlines()[-1] == f"{out}: figures, tables, timeline.rrd, result.json"
-    assert {path.name for path in out.iterdir()} == {"figures", "tables", "timeline.rrd", "result.json"}
+    assert printed.splitlines()[-1] == f"{out}: figures, tables, timeline.rrd, {TIMINGS}, result.json"
+    names = {"figures", "tables", "timeline.rrd", TIMINGS, "result.json"}
+    assert {path.name for path in out.iterdir()} == names
     assert "nees_mean_over_runs" not in fuselog(*run, "--runs", "4").out

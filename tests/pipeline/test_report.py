@@ -216,7 +216,9 @@ def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) ->
 
 
 def _told(
-    runs: dict[str, dict[str, list[float]]], bounds: dict[str, tuple[float, float]] | None = None
+    runs: dict[str, dict[str, list[float]]],
+    bounds: dict[str, tuple[float, float]] | None = None,
+    timings: dict[str, dict[str, float]] | None = None,
 ) -> Story:
     """The story of estimators whose quantities in every run are given."""
     rows = pd.concat(
@@ -237,7 +239,7 @@ def _told(
         claims=[],
         bounds=bounds or {},
     )
-    return story(findings(result, {"runs": rows}))
+    return story(findings(result, {"runs": rows}), timings=timings)
 
 
 NOISE = np.random.default_rng(3).normal(0.0, 0.1, (3, 20))
@@ -265,6 +267,21 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
     assert told.cards[0].numbers.endswith("; 3 is right")
     [difference] = told.differences
     assert re.match(r"c errs 0\.98\d m more than [ab] \(95 % 0\.9\d+ to 1\.0\d m\)\.", difference)
+
+
+def test_a_card_says_what_a_message_cost() -> None:
+    """Beside the one to take; nothing of who was given no message."""
+    told = _told(
+        {label: {"position_rmse_m": list(size + NOISE[0])} for size, label in enumerate("abc", start=1)},
+        timings={
+            "a": {"seconds": 0.02, "messages": 5000},
+            "b": {"seconds": 0.026, "messages": 5000},
+            "c": {"seconds": 0.0, "messages": 0},
+        },
+    )
+    feet = {card.estimator: card.foot for card in told.cards}
+    beside = "5.2 µs a message; in all 1.3 times the time of a"
+    assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
 
 
 def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure() -> None:

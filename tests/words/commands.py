@@ -127,6 +127,8 @@ def _masked(text: str) -> str:
         lambda found: "estimator: TIME\n" + re.sub(r" {2,}[-+\d.e]+ *$", ": TIME", found[1], flags=re.M),
         text,
     )
+    text = re.sub(r"\d[\d.,]* [mµ]?s a message", "TIME a message", text)
+    text = re.sub(r"; in all \d[\d.,]* times the time", "; in all RATIO times the time", text)
     text = re.sub(r"(fuselog \S+, input )[0-9a-f]+", r"\1SHA-256", text)
     return text.replace(str(ROOT), "ROOT").replace(f"fuselog {version('fuselog')}", "fuselog VERSION")
 

@@ -24,23 +24,28 @@ from markupsafe import Markup, escape
 from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
 from pipeline.output.report.colours import text_colours
+from pipeline.output.report.evidence import Timings
 from pipeline.output.report.first_run import first_run, picture_of_timeline
 from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
 from pipeline.output.report.naming import distinct_names, title_of
 from pipeline.output.report.scene import lens, nis_chart, plan
 from pipeline.output.report.sheet import Sheet, sheets
-from pipeline.output.results import Result, read_result, read_table, split_metric
+from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
-from recorders.parameters import build
+from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
+
+
+class _Timings(Parameters):
+    of: dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
@@ -176,7 +181,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         raise BadInput(
             f"{folder}: a table or figure is damaged ({error}); run the experiment again"
         ) from error
-    begun = opening(result, tables)
+    begun = opening(result, tables, _timings(folder, result))
     labels = [*(result.settings.get("estimators") or {}), *begun.found.labels, *begun.found.bounds]
     labels = list(dict.fromkeys(map(str, labels)))
     looks = [_chart("", begun.chart)] if begun.chart else []
@@ -211,6 +216,17 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         figures,
         glossary(keys, draws=bool(begun.story.draws)),
     )
+
+
+def _timings(folder: Path, result: Result) -> Timings:
+    """What estimators cost; nothing where the result does not keep it."""
+    path = folder / TIMINGS
+    if TIMINGS not in result.files or not path.is_file():
+        return {}
+    try:
+        return dict(build(_Timings, {"of": parse_json(path.read_text(encoding="utf-8"))}, str(path)).of)
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path}: cannot be read ({error}); run the experiment again") from None
 
 
 def _rank(shown: Shown) -> tuple[bool, bool, int]:

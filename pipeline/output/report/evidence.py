@@ -26,6 +26,7 @@ from replay.judging.errors.differences import (
 )
 
 Floats = NDArray[np.float64]
+Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and the messages it was given
 # By what estimators are compared, where they have it; else by the first error that there is.
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
 # A mean of squares may be off by this share: nobody would act on less, however many runs show it.

@@ -15,8 +15,16 @@ import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, Series, curve
 from pipeline.output.claims import NO_VERDICT
-from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, runs_of
-from pipeline.output.report.story import Card, Story, gauge, story
+from pipeline.output.report.evidence import (
+    Consistency,
+    Findings,
+    Spread,
+    Timings,
+    findings,
+    runs_of,
+)
+from pipeline.output.report.gauge import gauge
+from pipeline.output.report.story import Card, Story, story
 from pipeline.output.results import Measured, MetricTable, Result, read_table
 from pipeline.output.words import count, is_error, listed, number, quantity, scale, stated
 from replay.judging.errors.evaluation import chi_square_interval
@@ -50,14 +58,14 @@ class Opening:
     chart: Chart | None = None
 
 
-def opening(result: Result, tables: Tables, times_s: Mapping[str, float] | None = None) -> Opening:
-    """The beginning of a result's page."""
+def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
+    """The beginning of a result's page; `timings` are what its estimators cost, where that was kept."""
     if "sides" in result.settings:
         return _of_comparison(result, tables)
     if "sweep" in result.settings:
         return _of_sweep(result, tables)
     found = findings(result, tables)
-    told = story(found, result.causes, dict(times_s or {}))
+    told = story(found, result.causes, timings)
     notes = [str(each) for each in result.settings.get("notes", [])]
     tried = what_was_tried(result, found, tables)
     if result.experiment == "diagnose":

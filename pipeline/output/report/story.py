@@ -6,39 +6,19 @@ It is data: sentences and numbers. The template only sets it.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from pipeline.output.alarms import Cause
-from pipeline.output.report.evidence import MARGIN, Consistency, Evidence, Findings, Spread
+from pipeline.output.report.evidence import MARGIN, Evidence, Findings, Spread, Timings
+from pipeline.output.report.gauge import Gauge, gauge, numbers_of
 from pipeline.output.words import MISSING, Scale, count, interval, listed, number, quantity, scale
 from replay.judging.diagnostics import LEAST_SHARE
 from replay.judging.errors.differences import FEWEST_RUNS
 
 MOST_CARDS = 6
-# The gauge goes from a third of the aim to ten times the aim, evenly in the logarithm.
-GAUGE_ENDS = (1 / 3, 10.0)
 
 Look = Literal["broken", "careful", "best", "fair"]
 Relation = Literal["draw", "unclear", "beyond chance", "untold"]
-
-
-class Gauge(NamedTuple):
-    """Where a mean of squares lies, in percent of a scale from too careful to too sure.
-
-    Attributes:
-        honest: where a consistent estimator lies.
-        aim, value: the right value, and the one that was found.
-        spread: where the latter lies with 95 %; both ends at it where that is not known.
-        is_beyond: whether the value lies beyond the scale's end.
-        words: the same for who cannot see it.
-    """
-
-    honest: tuple[float, float]
-    aim: float
-    value: float
-    spread: tuple[float, float]
-    is_beyond: bool
-    words: str
 
 
 @dataclass(frozen=True)
@@ -78,10 +58,8 @@ class Story:
     left_out: list[str] = field(default_factory=list)
 
 
-def story(
-    found: Findings, causes: Sequence[Cause] = (), times_s: dict[str, float] | None = None
-) -> Story:
-    """The story of estimators that were judged; causes and the time of a run where they are known."""
+def story(found: Findings, causes: Sequence[Cause] = (), timings: Timings | None = None) -> Story:
+    """The story of estimators that were judged; causes, and what each cost, where they are known."""
     known = [each for each in found.of.values() if each.error is not None]
     broken = _broken(found)
     own = scale(quantity(found.main).unit, *(each.error.value for each in known if each.error))
@@ -89,7 +67,7 @@ def story(
     ordered = _in_order(found, broken, take, equal)
     by_label = {each.estimator: each for each in causes}
     cards = [
-        _card(found, found.of[label], take, equal, own, by_label.get(label), (times_s or {}).get(label))
+        _card(found, found.of[label], take, equal, own, by_label.get(label), timings or {})
         for label in ordered[:MOST_CARDS]
     ]
     draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
@@ -202,7 +180,8 @@ def _advice(found: Findings, broken: list[Evidence], take: str, equal: list[str]
     if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
         few = found.runs < FEWEST_RUNS
-        chance = f"; whether by chance, {FEWEST_RUNS} runs or more tell" if few else ""
+        tells = f"{FEWEST_RUNS} runs or more tell" if few else "is not known"
+        chance = f"; whether by chance{',' if few else ''} {tells}"
         return f"Take {take}: it has the least {main} {alone}, {_value(error, own)}{chance}."
     return f"Take {take}: it has the least {main}, {_value(error, own)}."
 
@@ -269,7 +248,7 @@ def _card(
     equal: list[str],
     own: Scale,
     cause: Cause | None,
-    time_s: float | None,
+    timings: Timings,
 ) -> Card:
     look, mark, chip = _chip(found, each, take, equal)
     claim = _claim(each, found.runs)
@@ -284,9 +263,9 @@ def _card(
             card,
             consistency=claim[0].upper() + claim[1:],
             gauge=gauge(each.decisive),
-            numbers=_numbers(each.decisive),
+            numbers=numbers_of(each.decisive),
         )
-    return replace(card, foot=_foot(found, each, time_s))
+    return replace(card, foot=_foot(found, each, take, timings))
 
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
@@ -342,33 +321,17 @@ def _in_how_many(found: Findings, take: str) -> list[str]:
     return [f"Least error in {which} {count(len(every), 'run')}."]
 
 
-def _numbers(by: Consistency) -> str:
-    name = "NIS per component" if by.name == "NIS" else by.name
-    told = f", 95 % {interval(by.found.low, by.found.high, Scale())}" if by.found.is_told else ""
-    return f"{name} {number(by.found.value)}{told}; {number(by.aim)} is right"
-
-
-def gauge(by: Consistency) -> Gauge:
-    """Where a mean of squares lies on its scale."""
-
-    def place(value: float) -> float:
-        low, high = map(math.log, GAUGE_ENDS)
-        share = (math.log(max(value, 1e-12) / by.aim) - low) / (high - low)
-        return round(100.0 * min(max(share, 0.0), 1.0), 2)
-
-    low, high = by.honest
-    found = by.found
-    spread = (found.low, found.high) if found.is_told else (found.value, found.value)
-    words = f"{_numbers(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
-    is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
-    ends = (place(spread[0]), place(spread[1]))
-    return Gauge((place(low), place(high)), place(by.aim), place(found.value), ends, is_beyond, words)
-
-
-def _foot(found: Findings, each: Evidence, time_s: float | None) -> list[str]:
+def _foot(found: Findings, each: Evidence, take: str, timings: Timings) -> list[str]:
+    """What it cost, also beside the one to take, and how often it failed."""
     foot = []
-    if time_s is not None:
-        foot.append(f"{scale('s', time_s).with_unit(time_s, 2)} a run")
+    own, best = (timings.get(label, {}) for label in (each.estimator, take))
+    seconds, messages = own.get("seconds", 0.0), own.get("messages", 0.0)
+    if seconds > 0.0 and messages > 0.0:
+        one_s = seconds / messages
+        beside = ""
+        if each.estimator != take and best.get("seconds", 0.0) > 0.0:
+            beside = f"; in all {number(seconds / best['seconds'], 2)} times the time of {take}"
+        foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} a message{beside}")
     if each.failed is not None:
         foot.append(f"{each.failed:,} of {count(found.runs, 'run')} failed")
     return foot

@@ -15,6 +15,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     done = judge(experiment, setting)
     outcome = summarise(done.judge, done.coverage, done.parameters)
     outcome.input_sha256, outcome.parameters = done.input_sha256, done.parameters
+    outcome.timings = done.timings
     return outcome
 
 
