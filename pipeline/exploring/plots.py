@@ -81,6 +81,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
         toolbar_location=None,
         tools="",
         output_backend="canvas",
+        min_border_right=20,  # where the last number of the axis stands
         **ranges,
         **options,
     )

@@ -168,7 +168,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
         summary = f"{runs} give no interval: whether the differences are chance is open."
     elif differ.empty:
         summary = f"Of {len(rows)} metrics over {runs} none differs beyond chance and the margin"
-        summary += f"; of {unclear} more runs would tell." if unclear else "."
+        summary += f"; for {unclear} of them it takes more runs to tell." if unclear else "."
     else:
         summary = (
             f"Of {len(rows)} metrics over {runs} {len(differ)} differ beyond chance and the margin."
