@@ -222,7 +222,8 @@ NOW = """() => {
 DRAG = 'place => { Bokeh.documents[0].get_model_by_name("sigma_range_m").value = place; }'
 
 
-def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
+def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The newest value wins; the timeline is opened with it, at the instant of the lens."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
@@ -230,6 +231,13 @@ def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
     explorer = fl.explore(log, "ekf", show=False)
     slider = explorer.session.slider("sigma_range_m")
     said: list[str] = []
+    viewed, is_viewed = [], Event()
+
+    def view(rrd: Path, *, at_s: float) -> None:
+        viewed.append((rrd.read_bytes()[:4], f"Lens at {at_s:.1f} s"))
+        is_viewed.set()
+
+    monkeypatch.setattr("replay.timeline.viewer.view", view)  # there is no screen
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 900})
@@ -253,6 +261,10 @@ def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
         page.get_by_text("Reset", exact=True).click()
         page.wait_for_selector("text=Nothing speaks against it.")
         page.wait_for_selector("text=pinned")
+        page.get_by_text("Timeline", exact=True).click()
+        assert is_viewed.wait(30.0)
+        title = "() => Bokeh.documents[0].get_model_by_name('lens').title.text"
+        assert viewed == [(b"RRF2", page.evaluate(title))]
         browser.close()
     explorer._is_ended.wait(20.0)
     assert explorer._is_ended.is_set()  # the page is closed
