@@ -1,8 +1,13 @@
 """A filter is played by its parameters: the session, and the page in a browser."""
 
 import json
+import os
+import re
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import tomllib
 import urllib.error
 import urllib.request
@@ -269,3 +274,23 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
     explorer._is_ended.wait(20.0)
     assert explorer._is_ended.is_set()  # the page is closed
     assert said == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="an interrupt is sent as POSIX has it")
+def test_ctrl_c_ends_everything(log: Path) -> None:
+    pytest.importorskip("bokeh")
+    start = "from pipeline.command_line import main; raise SystemExit(main())"
+    command = [sys.executable, "-c", start, "explore", str(log), "-e", "ekf"]
+    with subprocess.Popen(
+        [*command, "--no-browser"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as running:
+        assert running.stdout is not None
+        said = running.stdout.readline()
+        url = re.search(r"http://\S+/", said)
+        assert url is not None, said
+        with urllib.request.urlopen(url[0]) as answer:
+            assert answer.status == 200
+        running.send_signal(signal.SIGINT)
+        assert running.wait(10.0) == 128 + signal.SIGINT
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(url[0])
