@@ -589,7 +589,7 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     assert said.startswith("Estimates by ekf of log.mcap; what can be done with them: fuselog evaluate ")
     said = fuselog("info", str(result)).out
     assert "a result of landmarks (" in said
-    assert "dead-reckoning, ekf and ukf over 2 simulated runs of landmarks of 2 s" in said
+    assert "dead-reckoning, ekf and ukf over 2 simulated runs of 2 s (scenario landmarks)" in said
     assert fuselog("info", str(result), "--json").json["experiment"] == "landmarks"
     timeline = result / "timeline.rrd"
     assert "a timeline of fuselog-landmarks" in fuselog("info", str(timeline)).out
