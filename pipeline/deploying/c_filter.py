@@ -1,22 +1,24 @@
 """The source of a filter in C99, of the graphs of its steps."""
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from pipeline.deploying.c_algebra import ALGEBRA
 from pipeline.deploying.c_header import predict_signature, update_signature
 from pipeline.deploying.c_names import CFilter, filled, identifier
+from pipeline.deploying.c_products import MEASURE, PROPAGATE, SLOPE, TURN, add_through, columns_text
+from replay.inference.linear_algebra.manifold import manifold_blocks, right_jacobian_factors
 from replay.inference.whole_steps import Step
 from replay.tracing.c_text import Precision, c_lines, helpers_of, truth_text
-from replay.tracing.graph import INPUT, Node, needed
+from replay.tracing.functions import trace
+from replay.tracing.graph import INPUT, Graph, Node, needed
 
 
 def source(made: CFilter) -> str:
     """Write NAME.c."""
     every = [
-        node
-        for step in (made.steps.predict, *made.steps.innovate, made.steps.correct)
-        for node in needed([*step.outputs.values(), *step.conditions])
+        node for step in made.all_steps for node in needed([*step.outputs.values(), *step.conditions])
     ]
     parts = [
         f"/* {made.origin} Made by fuselog deploy; see {made.name}.h.\n"
@@ -24,6 +26,7 @@ def source(made: CFilter) -> str:
         f'#include "{made.name}.h"\n\n#include <math.h>\n',
         _as_tuned(made),
         *helpers_of(every, made.precision),
+        *_products(made),
         _init(made),
         _predict(made),
         _correct(made),
@@ -118,7 +121,7 @@ class _Inputs:
                 name = self.controls[place[0]]
                 declared = f"filter->control[{self.made.name.upper()}_CONTROL_{name.upper()}]"
             else:
-                name = f"{last}[{place[0]}]"
+                name = f"{'slope' if argument == 3 and last == 'step' else last}[{place[0]}]"
             names[node.value] = name
             if declared:
                 lines[name] = f"const {real} {name} = {declared};"
@@ -128,25 +131,98 @@ class _Inputs:
 
 
 def _moved(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
-    """Name what a step writes, and write the assignments."""
+    """Name what a step makes of mean and covariance, and write the assignments."""
     state = [identifier(name) for name in made.filtering.stage.model.state]
     named: dict[str, Node] = {}
     lines: list[str] = []
-    for (argument, place), node in step.outputs.items():
-        if argument == 0:
+    for (array, place), node in step.outputs.items():
+        if array == "mean":
             name = f"next_{state[place[0]]}"
             named[name] = node
             lines.append(f"filter->mean[{made.name.upper()}_{state[place[0]].upper()}] = {name};")
-        else:
+        elif array == "P" and place[0] >= place[1]:
             row, column = place
-            mirrored = step.outputs.get((1, (column, row)))
-            if mirrored is node and column > row:
-                continue
             name = f"next_P{row}_{column}"
             named[name] = node
-            twin = f"P[{column}][{row}] = " if mirrored is node and row != column else ""
+            twin = f"P[{column}][{row}] = " if row != column else ""
             lines.append(f"P[{row}][{column}] = {twin}{name};")
     return named, lines
+
+
+class _Loops(NamedTuple):
+    """Holds what loops over a Jacobian go by: declarations, what the graph gives, and the calls."""
+
+    declared: list[str]
+    named: dict[str, Node]
+    calls: list[str]
+
+
+def _loops(step: Step, jacobian: str, rows: int, multiply: str, into: str, what: str) -> _Loops:
+    """Write what is done with a step's Jacobian, and the noise that is added to the product.
+
+    Args:
+        step: it gives the Jacobian, G and u, N.
+        jacobian: its name, F or H.
+        rows: how many it has.
+        multiply: the call that forms the product.
+        into: the matrix that becomes the product.
+        what: `states` or `components`, for the size of that matrix.
+    """
+    size = "T" if what == "states" else "M"
+    declared = [f"REAL {jacobian}[{size}][T];"]
+    declared.insert(0, columns_text(f"columns_of_{jacobian}", step.columns(jacobian, rows), size))
+    named = _entries(step, jacobian)
+    calls = [multiply]
+    gains = _gains(step)
+    if gains:
+        declared.append(f"REAL G[{size}][GAINS] = {{{{0}}}}, u[GAINS];")
+        named |= _entries(step, "G") | _entries(step, "u")
+        calls.append(f"add_through_{what}({into}, {rows}, G, u, {gains});")
+    for (array, (row, *column)), node in step.outputs.items():
+        if array == "N" and row >= column[0]:
+            name = f"noise_{row}_{column[0]}"
+            named[name] = node
+            calls.append(f"{into}[{row}][{column[0]}] += {name};")
+            if row > column[0]:
+                calls.append(f"{into}[{column[0]}][{row}] = {into}[{row}][{column[0]}];")
+    return _Loops(declared, named, calls)
+
+
+def _entries(step: Step, array: str) -> dict[str, Node]:
+    return {
+        array + "".join(f"[{each}]" for each in place): node
+        for (name, place), node in step.outputs.items()
+        if name == array
+    }
+
+
+def _gains(step: Step) -> int:
+    return sum(name == "u" for name, _ in step.outputs)
+
+
+def _products(made: CFilter) -> list[str]:
+    """Write the loops that the steps use."""
+    steps = made.steps
+    jacobians = [name for step in made.all_steps for name in ("F", "H") if step.has(name)]
+    sizes = {"states": "T"} if _gains(steps.predict) else {}
+    sizes |= {"components": "M"} if any(map(_gains, steps.innovate)) else {}
+    texts = [PROPAGATE] if "F" in jacobians else []
+    texts += [MEASURE] if "H" in jacobians else []
+    texts += add_through(sizes, max(map(_gains, made.all_steps)))
+    texts += [SLOPE] if steps.direction is not None else []
+    if _turns(made):
+        graph = Graph()
+        factors = trace(graph, right_jacobian_factors, (None,)).returned
+        lines = c_lines(dict(zip("fg", factors, strict=True)), {(0, None): "squared"}, made.precision)
+        texts.append(TURN.replace("FACTORS\n", _body(lines)))
+    return [filled(made, text) for text in texts]
+
+
+def _turns(made: CFilter) -> list[int]:
+    """List where the covariance of an orientation begins that is turned with it."""
+    model = made.filtering.stage.model
+    blocks = manifold_blocks(model.kinds) if made.sensors and model.correct is None else ()
+    return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]
 
 
 def _body(lines: Iterable[str]) -> str:
@@ -163,7 +239,9 @@ def _guard(made: CFilter, step: Step, names: Mapping[Any, str]) -> list[str]:
 
 
 def _declares_covariance(made: CFilter, declared: list[str], lines: Sequence[str]) -> list[str]:
-    if any("P[" in each for each in lines) and not any("const P)" in each for each in declared):
+    if any(re.search(r"\bP[\[,]", each) for each in lines) and not any(
+        "const P)" in each for each in declared
+    ):
         upper = made.name.upper()
         declared.append(f"{made.precision.real} (*const P)[{upper}_TANGENT] = filter->covariance;")
     return declared
@@ -191,6 +269,12 @@ def _predict(made: CFilter) -> str:
     step = made.steps.predict
     names, declared = _Inputs(made, "motion").names(step, "control")
     named, assigned = _moved(made, step)
+    if step.has("F"):
+        call = "propagate(filter->covariance, F, columns_of_F); /* P = F P F' */"
+        loops = _loops(step, "F", made.tangent, call, "P", "states")
+        named |= loops.named
+        declared = [*(filled(made, each) for each in loops.declared), *declared]
+        assigned = [*loops.calls, *assigned]
     declared = _declares_covariance(made, declared, assigned)
     real = made.precision.real
     span = "(double)(time_ns - filter->time_ns) * 1e-9"
@@ -219,11 +303,25 @@ def _predict(made: CFilter) -> str:
 def _correct(made: CFilter) -> str:
     if not made.sensors:
         return ""
-    step = made.steps.correct
+    step, direction = made.steps.correct, made.steps.direction
+    lines: list[str] = []
     names, declared = _Inputs(made, "").names(step, "step")
     named, assigned = _moved(made, step)
-    declared = _declares_covariance(made, declared, assigned)
-    lines = c_lines(named, names, made.precision)
+    if direction is not None:
+        own, also = _Inputs(made, "").names(direction, "step")
+        declared = list(dict.fromkeys([*also, *declared]))
+        declared.append("REAL a[T], slope[T];")
+        lines += [*c_lines(_entries(direction, "a"), own, made.precision)]
+        lines.append("find_slope(filter->covariance, a, slope);")
+    if step.has("F"):
+        call = "propagate(filter->covariance, F, columns_of_F);"
+        loops = _loops(step, "F", made.tangent, call, "P", "states")
+        declared = [*loops.declared, *declared]
+        named |= loops.named
+        assigned = [*loops.calls, *assigned]
+    assigned += [f"turn(filter->covariance, step, {at});" for at in _turns(made)]
+    declared = [filled(made, each) for each in declared]
+    lines += c_lines(named, names, made.precision, of="w" if direction is not None else "v")
     head = filled(
         made,
         "/* Moves the state by a step of its tangent space, and the covariance with it. */\n"
@@ -234,21 +332,18 @@ def _correct(made: CFilter) -> str:
 
 def _update(made: CFilter, number: int) -> str:
     (name, sensor), step = made.sensors[number], made.steps.innovate[number]
-    m, t = len(sensor.measured), made.tangent
+    m = len(sensor.measured)
     names, declared = _Inputs(made, name).names(step, "data")
-    named: dict[str, Node] = {}
-    outputs = iter(step.outputs.values())
-    mirrored = []
-    for index in range(m):
-        named[f"v[{index}]"] = next(outputs)
-    for row in range(m):
-        for column in range(row + 1):
-            named[f"S[{row}][{column}]"] = next(outputs)
-            if column < row:
-                mirrored.append(f"S[{column}][{row}] = S[{row}][{column}];")
-    for row in range(t):
-        for column in range(m):
-            named[f"C[{row}][{column}]"] = next(outputs)
+    named, calls = _entries(step, "v"), []
+    if step.has("S"):
+        named |= {f"S[{i}][{j}]": step.outputs["S", (i, j)] for i in range(m) for j in range(i + 1)}
+        named |= _entries(step, "C")
+        calls = [f"S[{j}][{i}] = S[{i}][{j}];" for i in range(m) for j in range(i)]
+    else:
+        call = f"measure(filter->covariance, H, columns_of_H, {m}, C, S); /* C = P H', S = H C */"
+        loops = _loops(step, "H", m, call, "S", "components")
+        declared = [*(filled(made, each) for each in loops.declared), *declared]
+        named, calls = named | loops.named, loops.calls
     places = [made.innovation.index(each) for each in sensor.measured]
     missing = " && ".join(f"isnan(data[{index}])" for index in range(m))
     begin = (
@@ -264,5 +359,5 @@ def _update(made: CFilter, number: int) -> str:
     text = filled(made, begin) + _body(declared)
     text += filled(made, f"    if ({missing})\n        return NAME_NOTHING_MEASURED;\n")
     text += _body(_guard(made, step, names))
-    text += _body([*c_lines(named, names, made.precision), *mirrored])
+    text += _body([*c_lines(named, names, made.precision), *calls])
     return text + filled(made, end)

@@ -14,7 +14,7 @@ from replay.tracing.graph import INPUT, described, needed
 
 _NAMES_OF_C = """auto break case char const continue default do double else enum extern float for goto if
 inline int long register restrict return short signed sizeof static struct switch typedef union unsigned
-void volatile while filter parameters P S C v data time_ns duration_s step innovation"""
+void volatile while filter parameters P S C v F H G u a slope data time_ns duration_s step innovation"""
 
 
 class CFilter(NamedTuple):
@@ -102,11 +102,19 @@ class CFilter(NamedTuple):
         }
 
     @property
+    def all_steps(self) -> list[Step]:
+        """List the steps."""
+        predict, innovate, direction, correct = self.steps
+        return [predict, *innovate, *([] if direction is None else [direction]), correct]
+
+    @property
     def digest(self) -> str:
         """Return what is the same for the same graphs and numbers."""
-        steps = [self.steps.predict, *self.steps.innovate, self.steps.correct]
-        words = [
-            word for step in steps for word in described([*step.outputs.values(), *step.conditions])
+        words = [repr([[*step.outputs] for step in self.all_steps])]
+        words += [
+            word
+            for step in self.all_steps
+            for word in described([*step.outputs.values(), *step.conditions])
         ]
         numbers = [repr(self.values), repr(self.filtering.gates.tolist()), self.precision.real]
         return sha256("\n".join([*words, *numbers]).encode()).hexdigest()[:16]
@@ -136,6 +144,6 @@ def filled(made: CFilter, template: str) -> str:
     text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", template)
     text = re.sub(r"\bNAME(?=_|\b)", made.name, text)
     upper = made.name.upper()
-    text = re.sub(r"\[T\]|< T\b", lambda found: found[0].replace("T", f"{upper}_TANGENT"), text)
-    text = re.sub(r"\[M\]", f"[{upper}_MOST]", text)
+    text = re.sub(r"(?<=\[)T\b|(?<=< )T\b", f"{upper}_TANGENT", text)
+    text = re.sub(r"(?<=\[)M\b", f"{upper}_MOST", text)
     return made.precision.text(text)

@@ -6,7 +6,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Collection, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -14,15 +14,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.deploying.c_names import CFilter
-from replay.inference.kalman.predict import motion_derivative
-from replay.inference.kalman.update import sensor_derivative
-from replay.inference.linear_algebra.gaussian import Innovation, downdate, inflate, kalman_step, whiten
-from replay.inference.linear_algebra.linearization import known_entries
+from replay.inference.linear_algebra.covariances import COVARIANCES
+from replay.inference.linear_algebra.gaussian import (
+    Innovation,
+    add_through,
+    downdate,
+    inflate,
+    kalman_step,
+    whiten,
+)
+from replay.inference.linear_algebra.manifold import by_right_jacobian
 from replay.inference.linear_algebra.sparse import (
     measuring_covariance,
     pattern_of,
     propagating_covariance,
 )
+from replay.inference.model.corrections import sloping
 from replay.inference.whole_steps import Step
 from replay.tracing.functions import Argument, Shape, trace
 from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed
@@ -51,9 +58,8 @@ class Cost(NamedTuple):
     roots: int
     calls: int
 
-    def plus(self, other: "Cost") -> "Cost":
-        """Return the cost of both."""
-        return Cost(*(a + b for a, b in zip(self, other, strict=True)))
+
+NOTHING = Cost(0, 0, 0)
 
 
 class Memory(NamedTuple):
@@ -96,16 +102,18 @@ def certificate_of(made: CFilter, source: str, header: str) -> Certificate:
         source: its C.
         header: its header.
     """
-    predict, correct = map(_cost_of_step, (made.steps.predict, made.steps.correct))
-    steps = {"predict": predict}
+    t, predict, correct = made.tangent, made.steps.predict, _correction(made)
+    products = [_products(predict, "F", t, t)]
+    steps = {"predict": _sum(_cost_of_step(predict), products[0][1], _entering(predict, t))}
     for row, ((name, sensor), step) in enumerate(zip(made.sensors, made.steps.innovate, strict=True)):
-        robust = {**made.robustness(row + 1), "reopens_s": np.nan}
-        is_robust = any(value == value for value in robust.values())
-        algebra = _cost_of_algebra(len(sensor.measured), made.tangent, is_robust)
-        steps[f"update_{name}"] = _cost_of_step(step).plus(algebra).plus(correct)
+        m, robust = len(sensor.measured), {**made.robustness(row + 1), "reopens_s": np.nan}
+        algebra = _algebra(m, t, any(value == value for value in robust.values()))
+        products.append(_products(step, "H", m, t))
+        own = _sum(_cost_of_step(step), products[-1][1], _entering(step, m))
+        steps[f"update_{name}"] = _sum(own, algebra, correct)
     updates = [cost for name, cost in steps.items() if name != "predict"]
-    worst = predict.plus(max(updates, default=Cost(0, 0, 0)))
-    dense, sparse = _products(made)
+    worst = _sum(steps["predict"], max(updates, default=NOTHING))
+    dense, sparse = (sum(each[place].flops for each in products) for place in (0, 1))
     return Certificate(steps, worst, dense, sparse, _memory(made.name, source, header))
 
 
@@ -143,13 +151,17 @@ def _cost(outputs: Collection[Node]) -> Cost:
     return Cost(flops, roots, calls)
 
 
+def _sum(*costs: Cost) -> Cost:
+    return Cost(*(sum(each) for each in zip(*costs, strict=True)))
+
+
 def _traced(function: Any, *arguments: Argument) -> Cost:
     result = trace(Graph(), function, arguments)
     return _cost([*result.returned, *(node for _, _, node in result.written)])
 
 
 @cache
-def _cost_of_algebra(m: int, t: int, is_robust: bool) -> Cost:
+def _algebra(m: int, t: int, is_robust: bool) -> Cost:
     """The cost of the update behind an innovation of m components, for t of the tangent space."""
 
     def update(v: Any, spread: Any, cross: Any, covariance: Any, factor: Any) -> Any:
@@ -164,23 +176,41 @@ def _cost_of_algebra(m: int, t: int, is_robust: bool) -> Cost:
     return _traced(update, Shape((m,)), Shape((m, m)), Shape((t, m)), Shape((t, t)), None)
 
 
-def _products(made: CFilter) -> tuple[int, int]:
-    """Count the flops of covariances' products, with all entries of Jacobians and without known ones."""
-    stage, t = made.filtering.stage, made.tangent
-    is_sampled = made.filtering.method.sampling is not None
-    square, counted = Shape((t, t)), np.zeros(2, int)
-    if stage.motion.linear or not is_sampled:
-        slopes = motion_derivative(stage.model, stage.motion, by_state=True)
-        for place, pattern in enumerate((None, pattern_of(known_entries(slopes, "transition"), t))):
-            counted[place] += _traced(propagating_covariance(pattern), *(square,) * 4).flops
-    for sensor in stage.sensors:
-        if sensor.linear or not is_sampled:
-            m = len(sensor.measured)
-            sizes = square, Shape((m, t)), Shape((t, m)), Shape((m, m))
-            slopes = sensor_derivative(stage.model, sensor)
-            for place, pattern in enumerate((None, pattern_of(known_entries(slopes, "rows"), m))):
-                counted[place] += _traced(measuring_covariance(pattern), *sizes).flops
-    return int(counted[0]), int(counted[1])
+def _products(step: Step, jacobian: str, rows: int, t: int) -> tuple[Cost, Cost]:
+    """The cost of products with a Jacobian: with all its entries, and without those that are known."""
+    if not step.has(jacobian):
+        return NOTHING, NOTHING
+    known = {
+        (place[0], place[1]): node.value if node.is_constant else None
+        for (name, place), node in step.outputs.items()
+        if name == jacobian
+    }
+    patterns = None, pattern_of(known, rows)
+    square = Shape((t, t))
+    if jacobian == "F":
+        first, last = (_traced(propagating_covariance(each), *(square,) * 4) for each in patterns)
+    else:
+        sizes = square, Shape((rows, t)), Shape((t, rows)), Shape((rows, rows))
+        first, last = (_traced(measuring_covariance(each), *sizes) for each in patterns)
+    return first, last
+
+
+def _entering(step: Step, size: int) -> Cost:
+    """The cost of noise that enters through a gain."""
+    gains = sum(name == "u" for name, _ in step.outputs)
+    if not gains:
+        return NOTHING
+    return _traced(add_through, Shape((size, size)), Shape((size, gains)), Shape((gains,)))
+
+
+def _correction(made: CFilter) -> Cost:
+    model, step = made.filtering.stage.model, made.steps.correct
+    kinds, square = model.kinds, Shape((made.tangent, made.tangent))
+    mean, vector = Shape((model.size,)), Shape((made.tangent,))
+    own = _sum(_cost_of_step(step), _products(step, "F", made.tangent, made.tangent)[1])
+    if model.correct is not None:
+        return _sum(own, _traced(sloping(kinds, model.correct), mean, square, vector))
+    return _sum(own, _traced(partial(COVARIANCES.turn, by_right_jacobian(kinds)), vector, square))
 
 
 def _memory(name: str, source: str, header: str) -> Memory | None:

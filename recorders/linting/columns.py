@@ -11,6 +11,7 @@ from recorders.plausibility.stamps import FEWEST, REGULARS
 
 Floats = NDArray[np.float64]
 LONG, TIMES = 10, 10.0  # rows, and times the usual run, that a value may stay
+NEXT = 2.5  # steps of what is rounded, within which a value is the next
 MOVING = 0.5  # of the rows of a span, in which another column changes
 LOOKED_AT = 20_000  # rows by which a resolution is told
 LEVELS, CHANGES = 3, 0.05  # that a rounded column has at least: values, and rows that differ
@@ -24,15 +25,20 @@ _DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # exact zeros o
 
 
 def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """A value that stays for far longer than the column's do, while others of the topic move."""
+    """A value that stays for far longer than the column's do, while others of the topic move.
+
+    What is rounded, and goes on within two steps of where it stood, has rested and was not frozen.
+    """
     entries = list(_entries(stream))
     for field, name, column in entries:
         edges = np.flatnonzero(np.append(True, column[1:] != column[:-1]))
         if len(edges) < 2 or len(column) < FEWEST:
             continue
         runs = np.diff(np.append(edges, len(column)))
-        begin, length = int(edges[np.argmax(runs)]), int(runs.max())
         usual = float(np.quantile(runs, 0.99))  # what is rounded, or slow, stays now and then
+        if runs.max() > max(LONG, TIMES * usual):
+            runs[_rests(column, edges)] = 0
+        begin, length = int(edges[np.argmax(runs)]), int(runs.max())
         is_standing = stream.schema.full_name in _DRIVEN and column[begin] == 0.0
         if length <= max(LONG, TIMES * usual) or is_standing or not np.isfinite(column[begin]):
             continue
@@ -130,6 +136,14 @@ def _entries(stream: Stream) -> Iterator[tuple[str, str, Floats]]:
         for index in range(column.shape[1] if column.ndim == 2 else 0):
             axis = "xyz"[index] if column.shape[1] <= 3 else str(index)
             yield entry.name, f"{entry.name} {axis}", column[:, index]
+
+
+def _rests(column: Floats, edges: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which runs of equal values are of a grid, within whose next steps is what is before and after."""
+    steps = np.abs(np.diff(column[edges]))
+    farther = np.maximum(np.append(0.0, steps), np.append(steps, 0.0))
+    levels = np.unique(column[np.isfinite(column)])
+    return np.less_equal(farther, NEXT * np.diff(levels).min(initial=np.inf))
 
 
 def _changes(values: Floats) -> float:

@@ -69,7 +69,8 @@ def _faults(
         yield "zero", np.greater_equal(zero.sum(axis=1), zero.shape[1] if is_partial else 1)
     if not is_matrix:
         return
-    yield "one number in all its entries", np.less_equal(np.ptp(values, axis=1), 0.0)
+    is_alike = np.less_equal(np.ptp(values, axis=1), 0.0)
+    yield "one number in all its entries", is_alike & np.not_equal(values[:, 0], 0.0)
     matrices = values.reshape(-1, size, size)
     scale = np.abs(values).max(axis=1, initial=0.0)
     apart = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)

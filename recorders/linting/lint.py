@@ -27,6 +27,7 @@ CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] 
     columns.saturated,
     columns.rounded,
     names.frames,
+    names.doubles,
     names.strays,
 )
 

@@ -1,9 +1,9 @@
-"""Checks of names: frames by REP 103 and 105, and topics that no namespace binds to the others."""
+"""Checks of names: frames by REP 103, units there twice by REP 145, topics alone in their namespace."""
 
 import re
 from collections.abc import Iterator, Mapping
 
-from recorders.log import Stream
+from recorders.log import Stream, schemas
 from recorders.plausibility.finding import Finding
 from recorders.plausibility.stamps import REGULARS
 
@@ -30,6 +30,24 @@ def frames(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
                 else "in the mapping exchange north and east, and give down the factor -1",
                 sure="hint",
             )
+
+
+def doubles(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Inertial units that are there raw and, by REP 145, again with an orientation."""
+    raw = streams.get(stream.topic.replace("/data", "/data_raw"))
+    is_unit = stream.schema.full_name == schemas.INERTIAL_SAMPLE.full_name
+    if not is_unit or raw is None or raw is stream or raw.schema is not stream.schema:
+        return
+    yield Finding(
+        "name",
+        stream.topic,
+        "",
+        0.0,
+        f"{stream.topic}: by REP 145 it is {raw.topic} again, beside an orientation that a filter made: "
+        "who uses both counts one unit twice",
+        mapping=f"--set topics.inertial={raw.topic} at the replay takes one alone",
+        sure="hint",
+    )
 
 
 def strays(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:

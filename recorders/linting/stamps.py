@@ -69,7 +69,7 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     )
 
 
-def order(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
+def order(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     """Stamps that go back from message to message, and equal ones of what is measured once at a time."""
     rows = np.argsort(stream.position, kind="stable")
     stamps_ns = stream.publish_time_ns[rows]
@@ -91,7 +91,8 @@ def order(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             sure="hint" if is_late else "fact",
         )
         return
-    same = np.diff(stamps_ns) == 0
+    things = _things(stream, streams)[rows]
+    same = (np.diff(stamps_ns) == 0) & (np.diff(things) == 0)
     if same.any() and stream.schema.full_name in REGULARS:
         first_s = _since_s(stream, int(stamps_ns[int(np.argmax(same))]))
         yield Finding(
@@ -134,6 +135,8 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
     others_s = [_ahead_s(each) for each in streams.values() if each.topic != stream.topic]
     is_alone = any(abs(each - ahead_s) > LEAP_TOLERANCE_S for each in others_s)
     value = float(round(ahead_s))
+    is_zone = "time zone" in name
+    setting = f"utc_offset_h = {round(value / 3600)}" if is_zone else f"leap_seconds = {value:g}"
     yield Finding(
         "delay",
         stream.topic,
@@ -144,7 +147,7 @@ def leaps(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
         f"of the recorder: {name}{'' if is_alone else ', as are those of all topics'}",
         f"{stream.topic}.delay_s",
         digits(value),
-        "time = { leap_seconds = ... } or { utc_offset_h = ... } in the mapping",
+        f"time = {{ column = ..., {setting} }} in the mapping",
         "likely" if is_alone else "hint",
     )
 
@@ -174,6 +177,15 @@ def drift(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
             digits(gain),
             sure="hint",
         )
+
+
+def _things(stream: Stream, streams: Mapping[str, Stream]) -> NDArray[np.uint32]:
+    """Which thing (n,) every message is of, where another topic says so row by row; else zeros."""
+    for each in streams.values():
+        is_named = each.schema.full_name == schemas.IDENTITY.full_name
+        if is_named and np.array_equal(each.publish_time_ns, stream.publish_time_ns):
+            return each["thing_id"]
+    return np.zeros(len(stream), np.uint32)
 
 
 def _stamps(stream: Stream, value: float, words: str, mapping: str) -> Finding:

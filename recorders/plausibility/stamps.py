@@ -71,8 +71,11 @@ def losses(stream: Stream, streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def repeats(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """Measurements that are there twice; events may be alike."""
-    is_measured = any(each.kind in ("real", "vector") for each in stream.schema)
+    """Measurements that are there twice; events may be alike, and what one scan detects."""
+    names = {each.name for each in stream.schema}
+    is_measured = "scan_id" not in names and any(
+        each.kind in ("real", "vector") for each in stream.schema
+    )
     if not is_measured or stream.schema.full_name == schemas.TRUTH_STATE.full_name:
         return
     same = np.diff(stream.publish_time_ns) == 0

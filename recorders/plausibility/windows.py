@@ -5,11 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recorders.plausibility.body import Body, Floats, Series
+from recorders.plausibility.body import Body, Fixes, Floats, Series
 
 SPANS_S = (2.0, 5.0, 10.0)
 FEWEST = 12  # windows, below which nothing is said
 CLEAR = 12.0  # times the noise of a place, which a window has to be long
+WANDERS = 3.0  # standard deviations that places state, within which a body is not seen to move
 MOST = 2000  # windows; of more every second, third, ... is taken
 
 
@@ -63,10 +64,18 @@ def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
     return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
 
 
+def _moves(fixes: Fixes) -> bool:
+    """Whether places leave what they state as their error, by which a receiver at rest wanders too."""
+    stated = fixes.variances_m2[fixes.variances_m2 > 0.0]
+    sigma_m = float(np.sqrt(np.median(stated))) if len(stated) else 0.0
+    away_m = np.linalg.norm(fixes.values - np.median(fixes.values, axis=0), axis=1)
+    return float(away_m.max()) > WANDERS * sigma_m
+
+
 def places_of(body: Body) -> Series | None:
-    """Where the body is: its fixes, else what its velocities add up to."""
+    """Where the body is: its fixes, else what its velocities add up to; None where it is at rest."""
     if body.fixes:
-        return body.fixes[0]
+        return body.fixes[0] if _moves(body.fixes[0]) else None
     if body.velocities and body.speeds:
         of = body.velocities[0]
         return Series(of.topic, of.field, of.times_s, of.integral(of.times_s))
@@ -96,11 +105,12 @@ def clear_moves(places: Series) -> Windows | None:
 
 def courses(body: Body) -> Series | None:
     """The course (n,) in rad where the body moves clearly: of velocities, else of places."""
+    of: Series | None
     if body.velocities:
-        of: Series = body.velocities[0]
+        of = body.velocities[0]
         moves = np.linalg.norm(of.values, axis=1) > CLEAR * noise_of(of.values)
         times_s, values = of.times_s[moves], of.values[moves]
-    elif body.fixes and (moved := clear_moves(of := body.fixes[0])) is not None:
+    elif (of := places_of(body)) is not None and (moved := clear_moves(of)) is not None:
         times_s, values = 0.5 * (moved.begin_s + moved.end_s), moved.values
     else:
         return None

@@ -1,7 +1,8 @@
 """A filter's whole steps as graphs: its prediction, each sensor's innovation, and the correction.
 
-The steps that kernels are compiled from are called with traced numbers, covariances and all. So a graph
-has their operations in their order, and no product with what is known to be zero.
+The functions that kernels are compiled from are called with traced numbers. So a graph has their
+operations in their order, and what is known to be zero stands in none of them. Products of covariances
+with Jacobians are left to loops, which go over the entries that the graphs give.
 """
 
 import operator
@@ -12,16 +13,20 @@ import numpy as np
 
 from recorders.errors import BadInput
 from replay.engine.arrays import Function
-from replay.inference.kalman.predict import linear_motion
+from replay.inference.kalman.predict import motion_derivative
 from replay.inference.kalman.regression import sampled_motion, sampled_sensor
 from replay.inference.kalman.steps import Interval, Measurement
-from replay.inference.kalman.update import linear_sensor, reading
-from replay.inference.model.corrections import correcting, sloping
+from replay.inference.kalman.update import reading, sensor_derivative
+from replay.inference.linear_algebra.gaussian import wrap
+from replay.inference.linear_algebra.manifold import boxplus
+from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
+from replay.inference.model.corrections import stepping
+from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.stage import Stage
 from replay.inference.run.filtering import Filter
 from replay.inference.run.samples import sample_sets
-from replay.tracing.functions import Argument, Result, Shape, trace
+from replay.tracing.functions import Argument, Result, Shape, trace, traced
 from replay.tracing.graph import SELECT, Graph, Node
 
 
@@ -30,31 +35,47 @@ class Step(NamedTuple):
 
     Attributes:
         graph: the graph.
-        outputs: what it gives, by argument and place where it writes, or by its number.
+        outputs: what it gives, by the array's name and place; of F, H, G and N without what is zero.
         conditions: truths that have to hold; it gives nothing where one does not.
     """
 
     graph: Graph
-    outputs: Mapping[Any, Node]
-    conditions: tuple[Node, ...]
+    outputs: Mapping[tuple[str, tuple[int, ...]], Node]
+    conditions: tuple[Node, ...] = ()
+
+    def has(self, name: str) -> bool:
+        """Tell whether it gives an array of this name."""
+        return any(each == name for each, _ in self.outputs)
+
+    def columns(self, name: str, rows: int) -> list[list[int]]:
+        """List the columns of a matrix that are not known to be zero, row by row."""
+        places = sorted(place for each, place in self.outputs if each == name)
+        return [[place[1] for place in places if place[0] == row] for row in range(rows)]
 
 
 class WholeSteps(NamedTuple):
     """Holds the steps of a filter with n components of the state, t of its tangent space.
 
+    All are of (mean, covariance, ...). Those of derivatives give what is entered by loops: the Jacobian
+    F (t, t) or H (m, t), a gain G of noise with the variances u of its columns, and what is added to the
+    product, N (t, t) or (m, m). Those of samples give the covariances themselves.
+
     Attributes:
-        predict: of (mean, covariance, control, duration_s, parameters), it writes the first two.
-        innovate: of (mean, covariance, data, parameters), for every sensor of m components: it gives v
-            (m), the lower triangle of S, and C (t, m), row by row.
-        correct: of (mean, covariance, step), it writes the first two.
+        predict: of (..., control, duration_s, parameters), it gives mean and F, G, u, N, or mean and P.
+        innovate: of (..., data, parameters), for every sensor of m components: v (m) and H, G, u, N, or
+            v, S (m, m) and C (t, m), of S the lower triangle.
+        direction: of the state: `a` (t), along which the correction bends; None where it does not.
+        correct: of (..., step, slope), it gives the mean, and F where covariances go with it by that.
     """
 
     predict: Step
     innovate: tuple[Step, ...]
+    direction: Step | None
     correct: Step
 
 
 EXTENDED, SAMPLED = "extended", "sampled"
+_SPARSE = ("F", "H", "G", "N")
 
 
 def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
@@ -67,38 +88,135 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
     Raises BadInput where a step is no graph, as that of sampled angles.
     """
     stage = filtering.stage
-    model, motion = stage.model, stage.motion
-    n, t, names = model.size, model.tangent, number_fields(model.parameters)
-    is_sampled = kind == SAMPLED
-    if is_sampled and not motion.linear:
-        _check_straight("the prediction", model.kinds)
-    move = sampled_motion(stage, 0) if is_sampled and not motion.linear else linear_motion(stage)
+    model, motion, names = stage.model, stage.motion, number_fields(stage.model.parameters)
+    gaussian: tuple[Argument, ...] = (Shape((model.size,)), Shape((model.tangent, model.tangent)))
     [(_, sets)] = sample_sets(filtering.samplers, (), np.zeros(1, np.int64))
+    is_sampled, samples = kind == SAMPLED, 0
 
     def memory() -> Any:
         return _of_objects(filtering.steps.memory(sets))
 
-    def predict(mean: Any, covariance: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
-        return (move(mean, covariance, Interval(control, duration_s, parameters, 0), memory()),)
-
-    gaussian: tuple[Argument, ...] = (Shape((n,)), Shape((t, t)))
+    move = _linear_motion(model, motion, memory)
+    if is_sampled and not motion.linear:
+        _check_straight("the prediction", model.kinds)
+        move, samples = _sampled_motion(stage, memory), 1
+    given = (*gaussian, Shape((model.controls,)), None, names)
+    predict = _traced("the prediction", move, given)
     innovations = []
-    samples = int(is_sampled and not motion.linear)
     for number, sensor in enumerate(stage.sensors):
         if is_sampled and not sensor.linear:
             _check_straight(f"sensor {sensor.topic}", sensor.measured.values())
-            innovate = sampled_sensor(stage, number, samples)
+            innovate = _sampled_sensor(stage, number, samples, memory)
             samples += 1
         else:
-            innovate = linear_sensor(stage, number)
-        step = _innovating(innovate, number, memory)
-        width = Shape((reading(sensor).width,))
-        innovations.append(_traced(f"sensor {sensor.topic}", step, (*gaussian, width, names)))
-    return WholeSteps(
-        _traced("the prediction", predict, (*gaussian, Shape((model.controls,)), None, names)),
-        tuple(innovations),
-        _traced("the correction", _correcting(stage, memory), (*gaussian, Shape((t,)))),
-    )
+            innovate = _linear_sensor(model, sensor, memory)
+        given = (*gaussian, Shape((reading(sensor).width,)), names)
+        innovations.append(_traced(f"sensor {sensor.topic}", innovate, given))
+    step = Shape((model.tangent,))
+    correct = _traced("the correction", _correcting(model, memory), (*gaussian, step, step))
+    direction = None
+    if model.correct is not None:
+        along, read_state = traced(model.correct.along, model.size), tuple_of(model.size)
+        direction = _traced(
+            "the correction", lambda mean, _: (True, {"a": np.array(along(read_state(mean)))}), gaussian
+        )
+    return WholeSteps(predict, tuple(innovations), direction, correct)
+
+
+# --- what is traced: functions that return whether all is well, and arrays by name ------------------
+
+
+def _linear_motion(model: Model, motion: Motion, memory: Callable[[], Any]) -> Function:
+    linearise = motion_derivative(model, motion, by_state=True)
+    read_state, read_control = tuple_of(model.size), tuple_of(model.controls)
+    t, add = model.tangent, adding_noise(model.tangent, motion.noise_block)
+
+    def predict(mean: Any, _: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+        work, state, noise = memory(), read_state(mean), _zeros(t, t)
+        linearise(state, read_control(control), duration_s, parameters, work)
+        gains, variances = [_zeros(t, 0)], []
+        if motion.control_noise is not None:
+            gains.append(work.gain)
+            variances += motion.control_noise(duration_s, parameters)
+        if motion.noise is not None:
+            found = motion.noise(state, duration_s, parameters)
+            if motion.noises:
+                gains.append(work.noise_gain[:t, : motion.noises])
+                variances += found
+            else:
+                add(noise, found)
+        found = {"mean": work.state, "F": work.transition, "G": np.hstack(gains), "u": variances}
+        return True, {**found, "N": noise}
+
+    return predict
+
+
+def _sampled_motion(stage: Stage, memory: Callable[[], Any]) -> Function:
+    move = sampled_motion(stage, 0)
+
+    def predict(mean: Any, covariance: Any, control: Any, duration_s: Any, parameters: Any) -> Any:
+        well = move(mean, covariance, Interval(control, duration_s, parameters, 0), memory())
+        return well, {"mean": mean, "P": covariance}
+
+    return predict
+
+
+def _linear_sensor(model: Model, sensor: Sensor, memory: Callable[[], Any]) -> Function:
+    linearise, read = sensor_derivative(model, sensor), reading(sensor)
+    m, read_state, add = len(sensor.measured), tuple_of(model.size), adding_noise(len(sensor.measured))
+    angular = [kind == "angle" for kind in sensor.measured.values()]
+
+    def innovate(mean: Any, _: Any, data: Any, parameters: Any) -> Any:
+        work, noise = memory(), _zeros(m, m)
+        linearise(read_state(mean), read.reference(data), parameters, work)
+        gain, variances = _zeros(m, 0), []
+        if sensor.covariance:
+            add(noise, read.noise(data))
+        elif sensor.noise is not None and sensor.noises:
+            gain, variances = work.noise_gain[:m, : sensor.noises], sensor.noise(parameters)
+        elif sensor.noise is not None:
+            add(noise, sensor.noise(parameters))
+        difference = [wrap(data[i] - work.predicted[i], angular[i]) for i in range(m)]
+        return True, {"v": difference, "H": work.rows[:m], "G": gain, "u": variances, "N": noise}
+
+    return innovate
+
+
+def _sampled_sensor(stage: Stage, number: int, samples: int, memory: Callable[[], Any]) -> Function:
+    innovate = sampled_sensor(stage, number, samples)
+
+    def step(mean: Any, covariance: Any, data: Any, parameters: Any) -> Any:
+        work = memory()
+        well = innovate(mean, covariance, Measurement(data, parameters, None, 0), work)  # type: ignore[arg-type]
+        difference, spread, cross = work.innovations[number]
+        if not well:
+            difference, spread, cross = (_zeros(*each.shape) for each in (difference, spread, cross))
+        return well, {"v": difference, "S": spread, "C": cross}
+
+    return step
+
+
+def _correcting(model: Model, memory: Callable[[], Any]) -> Function:
+    if model.correct is not None:
+        step_to = stepping(model.kinds, model.correct.move)
+
+        def step_together(mean: Any, _: Any, step: Any, slope: Any) -> Any:
+            work = memory()._replace(step=step, slope=slope)
+            step_to(mean, work)
+            return True, {"mean": work.state, "F": work.transition}
+
+        return step_together
+    add = boxplus(model.kinds)
+
+    def step_each(mean: Any, _: Any, step: Any, __: Any) -> Any:
+        add(mean, step)
+        return True, {"mean": mean}
+
+    return step_each
+
+
+def _zeros(*sizes: int) -> Any:
+    return np.zeros(sizes).astype(object)
 
 
 def _check_straight(what: str, kinds: Collection[str]) -> None:
@@ -109,37 +227,6 @@ def _check_straight(what: str, kinds: Collection[str]) -> None:
         raise BadInput(
             f"{what} cannot be written as C: samples of {averaged} are averaged in a loop; give -e ekf"
         )
-
-
-def _innovating(innovate: Function, number: int, memory: Callable[[], Any]) -> Function:
-    def step(mean: Any, covariance: Any, data: Any, parameters: Any) -> Any:
-        work = memory()
-        well = innovate(mean, covariance, Measurement(data, parameters, None, 0), work)  # type: ignore[arg-type]
-        difference, spread, cross = work.innovations[number]
-        if not well:
-            return (False, *(0.0 for _ in range(_entries(spread, cross))))
-        lower = (spread[row, column] for row in range(len(spread)) for column in range(row + 1))
-        return (True, *difference, *lower, *cross.ravel())
-
-    return step
-
-
-def _entries(spread: Any, cross: Any) -> int:
-    m = len(spread)
-    return m + m * (m + 1) // 2 + cross.size
-
-
-def _correcting(stage: Stage, memory: Callable[[], Any]) -> Function:
-    kinds, correct = stage.model.kinds, stage.model.correct
-    find_slope, move = sloping(kinds, correct), correcting(kinds, correct)
-
-    def step(mean: Any, covariance: Any, along: Any) -> Any:
-        work = memory()._replace(step=along)
-        find_slope(mean, covariance, work.slope)
-        move(mean, covariance, work)
-        return (True,)
-
-    return step
 
 
 def _of_objects(value: Any) -> Any:
@@ -153,15 +240,24 @@ def _of_objects(value: Any) -> Any:
 
 
 def _traced(what: str, function: Function, arguments: tuple[Argument, ...]) -> Step:
-    graph = Graph()
+    graph, places = Graph(), list[tuple[str, tuple[int, ...]]]()
+
+    def flat(*given: Any) -> Any:
+        well, arrays = function(*given)
+        arrays = {name: np.array(array, object) for name, array in arrays.items()}
+        places[:] = [
+            (name, place) for name, array in arrays.items() for place in np.ndindex(array.shape)
+        ]
+        return well, *(each for array in arrays.values() for each in array.ravel())
+
     try:
-        result = trace(graph, function, arguments)
+        result = trace(graph, flat, arguments)
     except BadInput as error:
         raise BadInput(f"{what} cannot be written as C: {error}") from error
-    return _split(graph, result)
+    return _split(graph, result, places)
 
 
-def _split(graph: Graph, result: Result) -> Step:
+def _split(graph: Graph, result: Result, places: Collection[tuple[str, tuple[int, ...]]]) -> Step:
     """Take apart the conditions and what is given where they hold."""
     (well, *returned), conditions = result.returned, dict[Node, bool]()
     while well.operation is SELECT:
@@ -178,11 +274,14 @@ def _split(graph: Graph, result: Result) -> Step:
             return where_they_hold(yes if conditions[condition] else no)
         return graph.select(condition, where_they_hold(yes), where_they_hold(no))
 
-    outputs: dict[Any, Node] = {index: where_they_hold(node) for index, node in enumerate(returned)}
-    outputs |= {(argument, place): where_they_hold(node) for argument, place, node in result.written}
+    found = {place: where_they_hold(node) for place, node in zip(places, returned, strict=True)}
     return Step(
         graph,
-        outputs,
+        {
+            (name, place): node
+            for (name, place), node in found.items()
+            if name not in _SPARSE or not node.is_number(0.0)
+        },
         tuple(
             condition if holds else graph.apply(operator.not_, condition)
             for condition, holds in conditions.items()

@@ -132,20 +132,23 @@ class _Text(NamedTuple):
         return self.text if self.binds >= binds else f"({self.text})"
 
 
-def c_lines(named: Mapping[str, Node], inputs: Mapping[Any, str], precision: Precision) -> Iterator[str]:
+def c_lines(
+    named: Mapping[str, Node], inputs: Mapping[Any, str], precision: Precision, of: str = "v"
+) -> Iterator[str]:
     """Write every named node as `const double name = ...;`, each behind the lines that it needs.
 
     Args:
         named: the nodes; a name that is no identifier is assigned to, as `P[0][0]`.
         inputs: names of what the graph is given, by place.
         precision: of the numbers.
+        of: the letter that names of lines begin with.
     """
     everything = needed(named.values())
     uses = Counter(argument for node in everything for argument in node.arguments)
     uses.update(named.values())
     squared = {node.arguments[0] for node in everything if node.operation is POWER}
     taken = {*inputs.values(), *named}
-    free = (name for name in map("v{}".format, range(1, len(everything) + 1)) if name not in taken)
+    free = (name for name in map(f"{of}{{}}".format, range(1, len(everything) + 1)) if name not in taken)
     found: dict[Node, _Text] = {}
     for name, output in named.items():
         for node in needed([output]):

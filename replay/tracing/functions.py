@@ -23,7 +23,7 @@ from replay.engine.compiling.kernels.values import Array, Record, entries, load,
 from replay.tracing.derivatives import slopes_of
 from replay.tracing.emission import emit, python_of
 from replay.tracing.graph import INPUT, Graph, Node, described, needed
-from replay.tracing.inlining import Parameters, inlined, trace_of
+from replay.tracing.inlining import Parameters, inlined, trace_of, tracing
 from replay.tracing.reads import Reads, reads_of
 from replay.tracing.traced import (
     MOST_WAYS,
@@ -270,7 +270,7 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
             raise too_many_ways()
         here = Trace(graph, dict(decisions))
         given = [_given(here, index, kind) for index, kind in enumerate(arguments)]
-        with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"), tracing(here):
             found = _result(here, function(*given), given)
         for index in reversed(range(len(here.more))):
             before = dict.fromkeys(here.more[:index], True)

@@ -1,6 +1,7 @@
 """Graphs as parts of others: what a traced function gives when it is called with traced numbers."""
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Node, needed
@@ -22,15 +23,33 @@ class Parameters:
         return (getattr(self, name) for name in self._names)
 
 
+# traces for which a function is being called, by any thread: without one all numbers are known
+_AT_WORK: list[Trace] = []
+
+
+@contextmanager
+def tracing(trace: Trace) -> Iterator[None]:
+    """Functions that are called meanwhile may be given numbers of this trace."""
+    _AT_WORK.append(trace)
+    try:
+        yield
+    finally:
+        _AT_WORK.remove(trace)
+
+
 def trace_of(arguments: Sequence[Any]) -> Trace | None:
     """Return the trace that numbers among these are of; None where all are known."""
+    return _found(arguments) if _AT_WORK else None
+
+
+def _found(arguments: Sequence[Any]) -> Trace | None:
     for each in arguments:
         if isinstance(each, Traced):
             return each.trace
         if isinstance(each, Parameters):
             return each.trace
         if isinstance(each, tuple):
-            found = trace_of(each)
+            found = _found(each)
             if found is not None:
                 return found
     return None

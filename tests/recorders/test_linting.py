@@ -4,6 +4,7 @@
 """
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -11,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fuselog as fl
 from pipeline.command_line import main
 from recorders.linting.lint import lint
 from recorders.log import RunMetadata, Stream, make_stream, schemas, write_log
+from recorders.recording import import_run
 
 IMU, FIX, MAG = "/imu", "/fix", "/mag"
 BEGIN_NS = 1_700_000_000 * 10**9
@@ -127,6 +130,75 @@ def saturating(rate: Any) -> None:
     rate[1000:1400:3, 2] = np.radians(250.0)
 
 
+def driving(streams: Streams) -> Streams:
+    """A drive round a block that climbs: wheels, fixes of two receivers, and places in a plane."""
+    n = 600
+    t = 0.1 * np.arange(n)
+    heading, speed = 0.02 * t, 10.0 + 2.0 * np.sin(0.3 * t)
+    at = np.cumsum(0.1 * speed * np.stack([np.cos(heading), np.sin(heading)]), axis=1)
+    rng = np.random.default_rng(streams[FIX]["latitude_deg"].view(np.uint64))
+    east, north = at + 0.2 * rng.standard_normal((2, n))
+    up = 115.0 + 8.0 * np.sin(0.1 * t) + 0.2 * rng.standard_normal(n)
+    stamps_ns = streams[FIX].publish_time_ns
+    variance = np.tile(0.04 * np.eye(3).ravel(), (n, 1))
+    place = {
+        "latitude_deg": 49.0 + north / 111_200,
+        "longitude_deg": 8.4 + east / (111_200 * np.cos(np.radians(49.0))),
+        "covariance_m2": variance,
+    }
+    twist = np.full(n, 0.02)
+    found = [
+        make_stream("/odometry", schemas.ODOMETRY, stamps_ns, forward_mps=speed, turn_radps=twist),
+        make_stream(FIX, schemas.GEODETIC_FIX, stamps_ns, altitude_m=up, **place),
+        make_stream("/second", schemas.GEODETIC_FIX, stamps_ns, altitude_m=up[:] + 0.3, **place),
+        make_stream(
+            "/place",
+            schemas.POSITION_FIX,
+            stamps_ns,
+            position_m=np.stack([east, north, up - 115.0], axis=1),
+            covariance_m2=variance,
+        ),
+    ]
+    return {each.topic: each for each in found}
+
+
+def exchanged(streams: Streams) -> Streams:
+    """A receiver's longitudes for latitudes, beside wheels."""
+    streams = {topic: each for topic, each in driving(streams).items() if topic in (FIX, "/odometry")}
+    own = streams[FIX].columns
+    columns = {**own, "latitude_deg": own["longitude_deg"], "longitude_deg": own["latitude_deg"]}
+    return {**streams, FIX: replace(streams[FIX], columns=columns)}
+
+
+def drifting(streams: Streams) -> Streams:
+    """Three minutes by a clock that gains 100 us a second."""
+    own = streams[FIX]
+    since_ns = 3 * (own.publish_time_ns - BEGIN_NS)
+    gained_ns = BEGIN_NS + since_ns + since_ns // 10_000
+    return {FIX: replace(own, publish_time_ns=gained_ns, log_time_ns=BEGIN_NS + since_ns)}
+
+
+def renamed(topic: str, other: str, *, keeps: bool = False) -> Callable[[Streams], Streams]:
+    """A topic under another name, or there again under it."""
+
+    def put(streams: Streams) -> Streams:
+        rest = {name: each for name, each in streams.items() if keeps or name != topic}
+        return {**rest, other: replace(streams[topic], topic=other)}
+
+    return put
+
+
+def apart(streams: Streams) -> Streams:
+    """A car, and of its two receivers one in a namespace of its own."""
+    named = {f"/car{topic}": replace(each, topic=f"/car{topic}") for topic, each in streams.items()}
+    return renamed("/car/fix", "/gps/fix", keeps=True)(named)
+
+
+def framed(streams: Streams) -> Streams:
+    """A unit whose frame is FRD by its name."""
+    return {IMU: replace(streams[IMU], metadata={"frame_id": "base_link_frd"})}
+
+
 force = partial(column, IMU, "specific_force_mps2")
 variance = partial(column, FIX, "covariance_m2")
 field = partial(column, MAG, "magnetic_field_ut")
@@ -180,6 +252,28 @@ FAULTS: Mapping[str, tuple[Callable[[Streams], Streams], str, str, str]] = {
     "integers": (column(FIX, "latitude_deg", lambda x: 1e7 * x), FIX, "place", "integers of 1e-7"),
     "frozen": (force(setting(100, 300, 0.1, 0)), IMU, "values", "frozen at 0.1 for 200"),
     "saturated": (column(IMU, "turn_rate_radps", saturating), IMU, "values", "end of a range"),
+    "clock 1e-4 fast": (drifting, FIX, "clock", "gains 100 us a second"),
+    "wheels, latitude 8": (exchanged, FIX, "place", "exchanged: so fixes move 1"),
+    "sea and ellipsoid": (
+        lambda s: column("/second", "altitude_m", lambda h: h - 47.0)(driving(s)),
+        "/second",
+        "place",
+        "46.7 m below",
+    ),
+    "places in NED": (
+        lambda s: column("/place", "position_m", lambda p: p[:, [1, 0, 2]] * [1, 1, -1])(driving(s)),
+        "/place",
+        "sign",
+        "its z points down (NED)",
+    ),
+    "a frame's name": (framed, IMU, "name", "says FRD"),
+    "raw and again": (
+        lambda s: renamed(IMU, "/imu/data", keeps=False)(renamed(IMU, "/imu/data_raw", keeps=True)(s)),
+        "/imu/data",
+        "name",
+        "is /imu/data_raw again",
+    ),
+    "own namespace": (apart, "/gps/fix", "name", "alone in its namespace"),
     "rounded": (force(lambda f: np.round(f / 0.2) * 0.2), IMU, "values", "rounded to 0.2"),
 }
 
@@ -195,6 +289,7 @@ def missed(name: str, seed: int) -> str:
 def test_clean_logs_have_no_finding() -> None:
     for seed in (1, 2, 3):
         assert lint([clean(seed)]) == []
+    assert lint([driving(clean(1))]) == []
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -225,7 +320,49 @@ def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None
         advised += 1
         mended = fl.lint(path, set={told[0].key: told[0].setting})
         assert not [each for each in mended if each.cause == cause and each.topic == topic], name
-    assert advised == 11
+    assert advised == 14
+
+
+def imported(folder: Path, stream: Stream, advice: str) -> Stream:
+    """A topic written as a table and imported by a mapping that does as it was advised, if it can be."""
+    table = pd.DataFrame({"t": stream.publish_time_ns, "logged": stream.log_time_ns})
+    fields = {}
+    for name in list(stream.columns)[1:]:
+        parts = np.reshape(stream[name], (len(stream), -1)).T
+        fields[name] = [f"{name}_{index}" for index in range(len(parts))]
+        table = table.assign(**dict(zip(fields[name], parts, strict=True)))
+    table.to_csv(folder / "log.csv", index=False)
+    fields = {name: columns for name, columns in fields.items() if columns}
+    line = advice.partition(" in the mapping")[0].replace("[SIGMA, ...]", "[0.1, 0.1, 1.0]")
+    if "exchange the sources of" in advice:
+        first, second, *_ = re.findall(r"\w+_deg", advice)
+        fields[first], fields[second], line = fields[second], fields[first], ""
+    time = 'time = { column = "t", unit = "ns" }'
+    if line.startswith("time ="):
+        time, line = re.sub(r"column = \.\.\.", 'column = "t", unit = "ns"', line), ""
+    given = {name: columns for name, columns in fields.items() if f"deviations.{name}" not in line}
+    (folder / "mapping.toml").write_text(
+        f'[[tables]]\nfiles = "log.csv"\n{time}\narrival = {{ column = "logged", unit = "ns" }}\n'
+        f'[[tables.streams]]\ntopic = "{stream.topic}"\nbecomes = "{stream.schema.name}"\n'
+        + "".join(f"fields.{name} = {json.dumps(columns)}\n" for name, columns in given.items())
+        + line
+    )
+    values = {"mapping": str(folder / "mapping.toml")}
+    return import_run("table", folder / "log.csv", values)[0].streams[0]
+
+
+def test_every_line_of_a_mapping_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
+    advised = []
+    for name, (put, topic, cause, words) in FAULTS.items():
+        run = put(clean(1))
+        told = [each for each in lint([run]) if each.cause == cause and words in each.words]
+        advice = told[0].mapping
+        if "in the mapping" not in advice or name == "a frame's name":  # whose bag's mapping it is of
+            continue
+        advised.append(name)
+        mended = lint([{**run, topic: imported(tmp_path, run[topic], advice)}])
+        assert not [each for each in mended if (each.cause, each.topic) == (cause, topic)], name
+    assert len(advised) == 22
 
 
 def test_the_command_says_by_its_exit_code_what_it_found(

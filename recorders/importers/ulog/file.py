@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.ulog.formats import TYPES, Damaged, FormatField, Layout, layout_of, parsed
-from recorders.importers.ulog.loops import BEYOND_BYTES, HEAD_BYTES, walk
-from recorders.log.loops import words_of
+from recorders.importers.ulog.loops import BEYOND_BYTES, HEAD_BYTES, NUMBERS, Known, sort, walk
 
 MAGIC = bytes.fromhex("554c6f67011235")
 _SYNC = bytes.fromhex("080053") + bytes.fromhex("2f731320250cbb12")
@@ -52,13 +51,11 @@ class Text(NamedTuple):
 
 
 class _Subscription(NamedTuple):
-    """What the rows of a number are, from the byte `since` on, before the byte `until`."""
+    """What the rows of a number are."""
 
     topic: str
     instance: int
     layout: Layout
-    since: int
-    until: int = _NEVER
 
 
 class UlogFile:
@@ -88,6 +85,8 @@ class UlogFile:
         self.losses: Counter[str] = Counter()
         self._formats: dict[str, list[FormatField]] = {}
         self._subscriptions: dict[int, _Subscription] = {}
+        bounds = (0, 1 << 16, 0, _NEVER, _NEVER)
+        self._known = Known(*(np.full(NUMBERS, each, np.int64) for each in bounds))
         self._appended: list[int] = []
         try:
             self._size = path.stat().st_size
@@ -167,111 +166,90 @@ class UlogFile:
         self, file: BinaryIO, begin: int, end: int, is_wanted: Callable[[str], bool]
     ) -> Iterator[list[Rows]]:
         """The rows between two bytes of the file; the message that the end cuts is none."""
-        piece, place, is_lost = b"", begin, False
+        held = bytearray(_PIECE_BYTES + BEYOND_BYTES)
+        data, free = np.frombuffer(held, np.uint8), memoryview(held)[:_PIECE_BYTES]
+        size, place, is_lost = 0, begin, False
         file.seek(begin)
         while True:
-            if len(piece) < _PIECE_BYTES:
-                piece += file.read(max(min(_PIECE_BYTES, end - place - len(piece)), 0))
-            is_last = place + len(piece) >= end or len(piece) < _PIECE_BYTES
+            size += file.readinto(free[size : max(end - place, 0)])  # type: ignore[attr-defined]
+            is_last = place + size >= end or size < _PIECE_BYTES
             if is_lost:
-                found = piece.find(_SYNC)
+                found = held.find(_SYNC, 0, size)
                 is_lost = found < 0
-                skipped = max(len(piece) - len(_SYNC), 0) if is_lost else found
-                self.losses[_PASSED_OVER] += skipped
-                piece, place = piece[skipped:], place + skipped
+                done = max(size - len(_SYNC), 0) if is_lost else found
+                self.losses[_PASSED_OVER] += done
                 if is_lost and is_last:
-                    self.losses[_PASSED_OVER] += len(piece)
+                    self.losses[_PASSED_OVER] += size - done
                     return
+            else:
+                done, is_broken, rows = self._walked(data, size, place, is_wanted)
+                if rows:
+                    yield rows
+                is_lost = is_broken or (is_last and held.find(_SYNC, done + 1, size) >= 0)
                 if is_lost:
-                    continue
-            data = np.frombuffer(piece + bytes(BEYOND_BYTES), np.uint8)
-            done, is_broken, rows = self._walked(data, len(piece), place, is_wanted)
-            if rows:
-                yield rows
-            piece, place = piece[done:], place + done
-            if is_broken or (is_last and _SYNC in piece[1:]):
-                self.losses[_PASSED_OVER] += 1
-                piece, place, is_lost = piece[1:], place + 1, True
-            elif is_last:
-                if piece and end == self._size:
-                    self.losses["bytes at the end that are no whole message"] += len(piece)
-                return
+                    self.losses[_PASSED_OVER] += 1
+                    done += 1
+                elif is_last:
+                    if done < size and end == self._size:
+                        self.losses["bytes at the end that are no whole message"] += size - done
+                    return
+            held[: size - done] = held[done:size]
+            size, place = size - done, place + done
 
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]
     ) -> tuple[int, bool, list[Rows]]:
         """Where the last message of a piece at `place` ends, whether one broke there, and the rows."""
         found = walk(data, size)
-        words = words_of(data)
         others = [(each, *_message(data, each)) for each in found.others.tolist()]
         for position, kind, body in others:
             if kind == "A":
                 self._subscribe(body, place + position)
-        at, cut = self._up_to_damage(found.data, words)
-        others = [each for each in others if each[0] < cut]
-        numbers = (words[at] >> np.uint64(24) & np.uint64(0xFFFF)).astype(np.uint16)
-        order = np.argsort(numbers, kind="stable")
-        parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1) if len(order) else []
-        groups = []
-        stamps = np.zeros(len(at), np.int64)
-        for part in parts:
-            subscription = self._subscriptions.get(int(numbers[part[0]]))
-            if subscription is None:
-                self.losses["rows of no topic"] += len(part)
-                continue
-            which = part[self._are_its(subscription, place + at[part])]
-            begin = HEAD_BYTES + _NUMBER_BYTES + subscription.layout.stamp
-            stamps[which] = words[at[which] + begin].astype(np.int64)
-            groups.append((subscription, which))
-        timed = (stamps != 0) & (np.abs(stamps - self.start_us) < _MONTH_US)
-        time_us = self._times(at, stamps, timed)
-        # The latest stamp so far, before every row and at the end.
-        reached_us = np.maximum.accumulate(np.append(self._last_us, np.where(timed, stamps, 0)))
+        times = (self.start_us - _MONTH_US, self.start_us + _MONTH_US, self._last_us)
+        of = sort(data, found.data, place, self._known, times)
+        at, end, is_broken = found.data[: len(of.order)], found.end, found.is_broken
+        if len(at) < len(found.data):
+            self.losses["rows of a length that is not their format's"] += 1
+            end, is_broken = int(found.data[len(at)]), True
+            others = [each for each in others if each[0] < end]
+        time_us = of.stamps if of.is_timed.all() else self._times(at, of.stamps, of.is_timed)
         rows = []
-        for subscription, which in groups:
-            has_stamp = stamps[which] != 0
-            kept = which[timed[which] | ~has_stamp]
-            self.losses["rows whose stamp is a month from the log's begin"] += len(which) - len(kept)
+        ends = np.cumsum(of.counts)
+        for number in np.flatnonzero(of.counts[:NUMBERS]).tolist():
+            subscription = self._subscriptions[number]
+            which = of.order[ends[number] - of.counts[number] : ends[number]]
+            untimed, count = 0, len(which)
+            if not of.is_timed[which].all():
+                has_stamp = of.stamps[which] != 0
+                untimed = int((~has_stamp).sum())
+                which = which[of.is_timed[which] | ~has_stamp]
+                self.losses["rows whose stamp is a month from the log's begin"] += count - len(which)
             key = (subscription.topic, subscription.instance)
-            self.rows[key] += len(kept)
-            if is_wanted(subscription.topic) and len(kept):
-                values = _gathered(
-                    data, at[kept] + HEAD_BYTES + _NUMBER_BYTES, subscription.layout.dtype
-                )
-                rows.append(Rows(*key, values, time_us[kept], int((~has_stamp).sum())))
+            self.rows[key] += len(which)
+            if is_wanted(subscription.topic) and len(which):
+                begins = at[which] + (HEAD_BYTES + _NUMBER_BYTES)
+                values = _gathered(data, begins, subscription.layout.dtype)
+                rows.append(Rows(*key, values, time_us[which], untimed))
+        self._count_strays(of.order[ends[NUMBERS - 1] :], data, at)
         for position, kind, body in others:
-            self._take(kind, body, int(reached_us[np.searchsorted(at, position)]))
-        self._last_us = int(reached_us[-1])
-        return min(found.end, cut), found.is_broken or cut < _NEVER, rows
+            self._take(kind, body, int(of.reached[np.searchsorted(at, position)]))
+        self._last_us = int(of.reached[-1])
+        return end, is_broken, rows
 
-    def _up_to_damage(
-        self, at: NDArray[np.int64], words: NDArray[np.uint64]
-    ) -> tuple[NDArray[np.int64], int]:
-        """The rows before the first of a length that is not its format's, and where that begins."""
-        lengths = (words[at] & np.uint64(0xFFFF)).astype(np.int64) - _NUMBER_BYTES
-        numbers = (words[at] >> np.uint64(24) & np.uint64(0xFFFF)).astype(np.int64)
-        least, most = np.zeros(1 << 16, np.int64), np.full(1 << 16, 1 << 16)
-        for number, subscription in self._subscriptions.items():
-            least[number] = subscription.layout.dtype.itemsize
-            most[number] = subscription.layout.most_bytes
-        wrong = np.flatnonzero((lengths < least[numbers]) | (lengths > most[numbers]))
-        if not len(wrong):
-            return at, _NEVER
-        self.losses["rows of a length that is not their format's"] += 1
-        return at[: wrong[0]], int(at[wrong[0]])
-
-    def _are_its(self, subscription: "_Subscription", position: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which rows (n,) of a number are its topic's; the others are counted."""
-        is_its = (subscription.since <= position) & (position < subscription.until)
-        self.losses["rows of a number that two topics have"] += int((~is_its).sum())
-        return is_its
+    def _count_strays(
+        self, which: NDArray[np.int64], data: NDArray[np.uint8], at: NDArray[np.int64]
+    ) -> None:
+        """Count the rows that are no topic's: of a number that none has, or that two have."""
+        begins = at[which] + HEAD_BYTES
+        numbers = data[begins].astype(np.int64) + (data[begins + 1].astype(np.int64) << 8)
+        is_known = self._known.since[numbers] < _NEVER
+        self.losses["rows of no topic"] += int((~is_known).sum())
+        self.losses["rows of a number that two topics have"] += int(is_known.sum())
 
     def _times(
         self, at: NDArray[np.int64], stamps: NDArray[np.int64], timed: NDArray[np.bool_]
     ) -> NDArray[np.int64]:
         """The stamps (n,) of rows, of those without one between their neighbours' in the file."""
-        if timed.all():
-            return stamps
         last_us = self._last_us
         # Of a topic that stands still the stamp may be of long before.
         recent = np.flatnonzero(timed & (stamps >= last_us - _RECENT_US))
@@ -289,7 +267,7 @@ class UlogFile:
         known = self._subscriptions.get(number)
         if known is not None:
             if (known.topic, known.instance) != (topic, instance):
-                self._subscriptions[number] = known._replace(until=min(known.until, position))
+                self._known.until[number] = min(self._known.until[number], position)
                 self.losses[f"number of {known.topic} that {topic} has too"] += 1
             return
         try:
@@ -297,7 +275,10 @@ class UlogFile:
         except Damaged as why:
             self.losses[str(why)] += 1
             return
-        self._subscriptions[number] = _Subscription(topic, instance, layout, position)
+        self._subscriptions[number] = _Subscription(topic, instance, layout)
+        stated = (layout.dtype.itemsize, layout.most_bytes, layout.stamp, position, _NEVER)
+        for column, value in zip(self._known, stated, strict=True):
+            column[number] = value
 
     def _take(self, kind: str, body: bytes, time_us: int) -> None:
         """Take up a message of the data that is no row."""

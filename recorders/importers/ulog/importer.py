@@ -35,7 +35,7 @@ def _surroundings(path: Path) -> _Surroundings:
     """Read a log up to where its filter says where it is."""
     separation_m = 0.0
     for block in UlogFile(path).blocks(lambda topic: topic in _PLACED):
-        for rows in sorted(block, key=lambda each: each.topic != "vehicle_gps_position"):
+        for rows in sorted(block, key=lambda each: each.topic == "vehicle_local_position"):
             fields = Fields(rows)
             if fields.has("alt_ellipsoid"):
                 separation_m = 1e-3 * float((fields.of("alt_ellipsoid") - fields.of("alt"))[-1])
@@ -110,7 +110,7 @@ class _Import:
             values = [list(file.parameters.values())]
             times = [file.start_us]
             for time_us, name, value in file.changes:
-                if name in file.parameters:
+                if name in file.parameters and value != values[-1][names.index(name)]:
                     values.append(
                         [
                             value if each == name else old

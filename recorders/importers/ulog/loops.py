@@ -1,4 +1,4 @@
-"""The loop over the bytes of a ULog's data: where its messages begin; see `recorders.log.loops`."""
+"""The loops over a ULog's data: where messages begin, and which are whose; see `recorders.log.loops`."""
 
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ from recorders.log.loops import loop_for, words_of
 HEAD_BYTES = 3
 # Beyond the bytes that are walked there have to be so many more, of any value.
 BEYOND_BYTES = 16
+NUMBERS = 1 << 16
 
 
 class Walk(NamedTuple):
@@ -25,10 +26,92 @@ class Walk(NamedTuple):
     is_broken: bool
 
 
+class Known(NamedTuple):
+    """What is known of the topic of every number (NUMBERS,); of a number without one `since` is never.
+
+    A row has `least` to `most` bytes, begins from the byte `since` on and before the byte `until` of the
+    file, and has its stamp at the byte `stamp`.
+    """
+
+    least: NDArray[np.int64]
+    most: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    since: NDArray[np.int64]
+    until: NDArray[np.int64]
+
+
+class Sorted(NamedTuple):
+    """Rows (n,) of a piece, by their number.
+
+    `order` has the rows number by number, each in the file's order, and `counts` (NUMBERS + 1,) how many
+    each has; those that are no topic's come last. `stamps` are in us, 0 of what is no topic's;
+    `is_timed` says which are between two times, and `reached` is the latest of these before every row,
+    and at the end. Rows stop before one of a length that is not its format's.
+    """
+
+    order: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    stamps: NDArray[np.int64]
+    is_timed: NDArray[np.bool_]
+    reached: NDArray[np.int64]
+
+
 def walk(data: NDArray[np.uint8], size: int) -> Walk:
     """Walk the first `size` bytes of `data`, which has BEYOND_BYTES more."""
     found, others, end, is_broken = loop_for(_walk, size)(words_of(data), size)
     return Walk(found, others, int(end), bool(is_broken))
+
+
+def sort(
+    data: NDArray[np.uint8],
+    at: NDArray[np.int64],
+    place: int,
+    known: Known,
+    times: tuple[int, int, int],
+) -> Sorted:
+    """Sort the rows that begin at these bytes of a piece, which is at `place` in the file.
+
+    `times` are those between which, and not at which, a stamp is one, and the latest so far.
+    """
+    words = words_of(data)
+    return Sorted(*loop_for(_sort, 64 * len(at))(words, words.view("<i8"), at, place, known, times))
+
+
+def _sort(words, numbers, at, place, known, times):  # type: ignore[no-untyped-def]
+    least, most, stamp_at, since, until = known
+    low, high, latest = times
+    size = len(at)
+    whose = np.empty(size, np.int64)
+    stamps = np.zeros(size, np.int64)
+    is_timed = np.zeros(size, np.bool_)
+    reached = np.empty(size + 1, np.int64)
+    counts = np.zeros(NUMBERS + 1, np.int64)
+    for row in range(size):
+        position = at[row]
+        head = words[position]
+        number = np.int64(head >> np.uint64(24) & np.uint64(0xFFFF))
+        length = np.int64(head & np.uint64(0xFFFF)) - 2
+        if length < least[number] or length > most[number]:
+            size = row
+            break
+        reached[row] = latest
+        if since[number] <= place + position < until[number]:
+            stamp = numbers[position + 5 + stamp_at[number]]
+            stamps[row] = stamp
+            if stamp != 0 and low < stamp < high:
+                is_timed[row] = True
+                latest = max(latest, stamp)
+        else:
+            number = np.int64(NUMBERS)
+        whose[row] = number
+        counts[number] += 1
+    reached[size] = latest
+    order = np.empty(size, np.int64)
+    places = np.cumsum(counts) - counts
+    for row in range(size):
+        order[places[whose[row]]] = row
+        places[whose[row]] += 1
+    return order, counts, stamps[:size], is_timed[:size], reached[: size + 1]
 
 
 def _walk(words, size):  # type: ignore[no-untyped-def] # numba infers the types

@@ -65,7 +65,7 @@ def correcting(
     `product`. With `back` it is a step of a smoother's backward pass.
     """
     if correct is not None:
-        step_together = _stepping(kinds, correct.back if back else correct.move)
+        step_together = stepping(kinds, correct.back if back else correct.move)
         fill, propagate = filling(len(kinds)), form.propagate
 
         def move_together(mean: Floats, covariance: Floats, work: Any) -> None:
@@ -153,7 +153,7 @@ def relinearising(model: Model) -> tuple[Function, Function]:
                 for column in range(t):
                     rows[i, column] = work.turned[column]
 
-        return _stepping(model.kinds, model.correct.move), chain_together
+        return stepping(model.kinds, model.correct.move), chain_together
     fill, add, flat = filling(model.size), boxplus(model.kinds), is_flat(model.kinds)
     turn = by_right_jacobian(model.kinds)
 
@@ -170,8 +170,11 @@ def relinearising(model: Model) -> tuple[Function, Function]:
     return step_to, chain
 
 
-def _stepping(kinds: Kinds, move: Function) -> Function:
-    """Make `step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative."""
+def stepping(kinds: Kinds, move: Function) -> Function:
+    """Make `step_to(mean, work)`: `work.state` gets the moved mean, `work.transition` its derivative.
+
+    It is moved by `work.step`, and bends along `work.slope`.
+    """
     straight = ("linear",) * tangent_size(kinds)
     inputs = [Input("state", kinds), Input("step", straight, "transition"), Input("slope", straight)]
     arguments = (len(each.kinds) for each in inputs)

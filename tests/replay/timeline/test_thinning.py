@@ -16,22 +16,32 @@ from numpy.typing import NDArray
 from pipeline.runs.ensemble import Part, replay_parts
 from recorders.log import make_stream, open_log, schemas, write_log
 from recorders.recording import record_run
+from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import LogSource
+from replay.judging.errors.evaluation import errors_at
+from replay.judging.judge import Judge
+from replay.timeline import show
+from replay.timeline.drawing import thinning
 from replay.timeline.drawing.canvas import thin_curve
 from replay.timeline.drawing.thinning import thinned_stream
+from replay.timeline.show import Drawing
+from replay.timeline.sinks import open_recording
 from replay.timeline.viewer import listen
+from tests.replay.timeline.making import of_both, record
 from tests.replay.timeline.test_timeline import read
 
 
 @given(
-    st.lists(st.integers(0, 10**6), min_size=1, max_size=200),
+    st.lists(st.integers(0, 10**6), min_size=1, max_size=200)
+    | st.lists(st.integers(0, 99).map(lambda n: 10_000 * n), min_size=1, max_size=200),
     st.lists(st.integers(0, 200), max_size=4),
 )
 @example([*range(0, 10**6, 10**4), *[10**6] * 3, 10**6 + 1, 10**6 + 2], [101])  # cut within a stamp
 def test_what_is_kept_is_the_same_in_any_blocks(stamps: list[int], cuts: list[int]) -> None:
-    """At most so many rows, whole stamps, the last one among them."""
+    """At most so many rows, whole stamps, the last one among them, though peaks lie where blocks end."""
     times = np.sort(stamps)
     value = np.sin(7919.0 * np.arange(len(times)))[:, None]
+    value[[min(cut, len(times)) - 1 for cut in cuts if cut]] = 2.0
     stream = make_stream("/x", schemas.VECTOR_MEASUREMENT, times, value=value)
     whole, parts = thinned_stream("x", 20), thinned_stream("x", 20)
     whole.add(stream)
@@ -82,6 +92,43 @@ def test_a_curve_keeps_its_peaks(seed: int, rows: int) -> None:
     assert np.nanmax(values[kept]) == np.nanmax(values)
 
 
+@pytest.mark.parametrize("parts", [1, 3])
+def test_a_receiver_gets_what_a_file_gets(
+    parts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once the same rows, those of sensors after the last estimate too; in parts the same plots."""
+    source = record("landmarks", duration_s=4.0, robots=1, landmarks=3)
+    made = of_both(source, "robot1", rows=slice(1, -20))
+    judged = Judge([source], {}, gap_limit_s=2.0).add({each.topic: gather([each]) for each in made})
+    log, live, whole = (tmp_path / name for name in ("log.mcap", "live.rrd", "whole.rrd"))
+    write_log(log, source.streams.values(), source.run)
+
+    def into_a_file(*names: str, save: Path | None = None, connect: str | None = None) -> Any:
+        return open_recording(*names, save=save or live)
+
+    monkeypatch.setattr(show, "open_recording", into_a_file)
+    monkeypatch.setattr(show, "LIVE_MESSAGES", 10)
+    monkeypatch.setattr(thinning, "BLOCK_MESSAGES", 10)
+    with Drawing(LogSource(open_log(log)), identity="made", save=whole, connect="a receiver") as drawing:
+        for stamps in np.array_split(made[0].publish_time_ns, parts):
+            errors = [
+                errors_at(each, np.isin(each.time_ns, stamps))
+                for each in judged.errors
+                if each is not None
+            ]
+            drawing.add(
+                {each.topic: each.take(np.isin(each.publish_time_ns, stamps)) for each in made}, errors
+            )
+    found, wanted = read(live), read(whole)
+    if parts == 1:
+        assert found == wanted
+        return
+    assert set(found) == set(wanted)
+    drawn = [name for name in wanted if name.startswith("/plots/") and not name.endswith("bounds")]
+    assert len(drawn) >= 6
+    assert {name: found[name] for name in drawn} == {name: wanted[name] for name in drawn}
+
+
 @pytest.mark.paper
 def test_a_receiver_sees_estimates_before_the_replay_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -102,7 +149,7 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
     def watched(items: Iterable[Any], title: str, total: int | None) -> Iterator[Any]:
         for item in items:
             yield item
-            end = time.monotonic() + 5.0
+            end = time.monotonic() + 30.0
             while len(seen) == 2 and not drawn() and time.monotonic() < end:
                 time.sleep(0.5)  # reading takes long
             seen.append(drawn() if len(seen) in (2, 3) else 0)
@@ -119,7 +166,7 @@ def test_a_receiver_sees_estimates_before_the_replay_has_ended(
         )
         assert len(seen) > 6  # blocks
         assert 0 < seen[2] < 15_000
-        end = time.monotonic() + 10.0
+        end = time.monotonic() + 30.0
         while drawn() < 10_000 and time.monotonic() < end:
             time.sleep(0.5)  # reading takes long
         assert drawn() >= 10_000
