@@ -13,6 +13,7 @@ from pydantic import NonNegativeInt
 
 from pipeline.calibrating.calibrating import calibrate
 from pipeline.calibrating.car import MOTIONS, NAMES, OURS, TRUTH, drive, recorded
+from pipeline.output.charts import coverage
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -45,11 +46,15 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             rows += _calibrated(label, wanted, block, seed)
     found = pd.DataFrame(rows)
     outcome = Outcome(tables={"calibrated": found})
-    for place, name in product(range(len(options.seeds)), NAMES):
+    held: dict[str, dict[str, float]] = {f"seeds from {first}": {} for first in options.seeds}
+    for (place, counts), name in product(enumerate(held.values()), NAMES):
         those = found[(found["block"] == place) & (found["parameter"] == name)]
         spread = float(those["value"].std() / those["sigma"].mean())
-        outcome.metrics[f"{label}.covered.{place}-{name}"] = float(those["is_covered"].sum())
+        outcome.metrics[f"{label}.covered.{place}-{name}"] = counts[name] = float(
+            those["is_covered"].sum()
+        )
         outcome.metrics[f"{label}.spread.{place}-{name}"] = spread
+    outcome.figures["coverage"] = coverage("calibration of a car", held)
     motions = [_left_open(label, wanted, motion) for motion in MOTIONS]
     outcome.tables["motions"] = pd.DataFrame(motions, columns=["motion", *NAMES])
     for name, *are_open in motions:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeInt
 from scipy.signal import lfilter
 
+from pipeline.output.charts import coverage
 from pipeline.output.results import Outcome
 from pipeline.runs.estimates import hash_streams
 from pipeline.runs.experiment import Experiment, Setting, Study
@@ -27,6 +28,7 @@ Floats = NDArray[np.float64]
 TURN = "/wheels.turn_radps"
 TERMS, STEP_S, SIZE = Terms(1e-3, 1e-4), 0.02, 65536
 TAUS_S = (1.0, 10.0, 100.0)
+QUANTITIES = ("white", "walk", *(f"deviation-{tau_s:g}s" for tau_s in TAUS_S))
 
 
 class NoiseOptions(Parameters):
@@ -49,13 +51,15 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
             rows.append({"block": block, "seed": seed, **_looked_at(seed)})
     found = pd.DataFrame(rows)
     outcome = Outcome(tables={"noise": found})
-    for place in range(len(options.seeds)):
+    held: dict[str, dict[str, float]] = {}
+    for place, first in enumerate(options.seeds):
         those = found[found["block"] == place]
-        for quantity in ("white", "walk", *(f"deviation-{tau_s:g}s" for tau_s in TAUS_S)):
-            outcome.metrics[f"noise.covered.{place}-{quantity}"] = float(those[quantity].sum())
+        counts = held[f"seeds from {first}"] = {name: float(those[name].sum()) for name in QUANTITIES}
+        outcome.metrics |= {f"noise.covered.{place}-{name}": each for name, each in counts.items()}
         for quantity in ("found_white", "found_walk"):
             spread = float(np.log(those[quantity]).std())
             outcome.metrics[f"noise.spread.{place}-{quantity.removeprefix('found_')}"] = spread
+    outcome.figures["coverage"] = coverage("noise of a unit at rest", held)
     firsts = [at_rest(unit(first, SIZE, TERMS, STEP_S), STEP_S) for first in options.seeds]
     outcome.input_sha256 = hash_streams(firsts)
     return outcome
