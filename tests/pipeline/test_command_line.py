@@ -20,6 +20,7 @@ import pytest
 import fuselog as fl
 from pipeline.output.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
+from tests.pipeline.conftest import heeding_interrupts
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -505,7 +506,8 @@ def test_a_stop_that_falls_into_a_finalizer_is_not_lost(
     sent = list[int]()
     monkeypatch.setattr("threading.Timer", Timer)
     monkeypatch.setattr("recorders.log.LogWriter.write", finalize)
-    said = fuselog("replay", world / "log.mcap", "-e", "ekf", "--out", "new.mcap")
+    with heeding_interrupts():
+        said = fuselog("replay", world / "log.mcap", "-e", "ekf", "--out", "new.mcap")
     assert (said.code, said.err.strip()) == (128 + number, "fuselog: stopped")
     assert list(here.iterdir()) == []
 

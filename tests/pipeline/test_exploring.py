@@ -7,7 +7,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tomllib
 import urllib.error
 import urllib.request
@@ -277,13 +276,10 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(os.name != "posix", reason="an interrupt is sent as POSIX has it")
-def test_ctrl_c_ends_everything(log: Path) -> None:
+def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subprocess.Popen[str]]) -> None:
     pytest.importorskip("bokeh")
-    start = "from pipeline.command_line import main; raise SystemExit(main())"
-    command = [sys.executable, "-c", start, "explore", str(log), "-e", "ekf"]
-    with subprocess.Popen(
-        [*command, "--no-browser"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as running:
+    command = ["explore", str(log), "-e", "ekf", "--no-browser"]
+    with start_fuselog(*command, stderr=subprocess.STDOUT) as running:
         assert running.stdout is not None
         said = running.stdout.readline()
         url = re.search(r"http://\S+/", said)
