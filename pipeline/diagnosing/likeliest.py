@@ -76,7 +76,7 @@ def _mended(logs: list[Path], label: str, own: dict[str, Any], sentence: Sentenc
         told += [_change(key, row) for row in rows if math.isfinite(row["second_mean"])]
     if not told:
         return ""
-    return f"Mended so, over {count(len(logs), 'run')}: {'; '.join(told)}."
+    return f"With that, over {count(len(logs), 'run')}: {'; '.join(told)}."
 
 
 def _change(key: str, row: Mapping[Any, Any]) -> str:

@@ -65,9 +65,12 @@ class Plot:
                 self.fill(of, what, **{name: [] for name in self.sources[own, what].data})
 
     def fill(self, of: int | str, what: str, **columns: Any) -> None:
-        """Draw other values; nothing where there is no such source."""
-        if (of, what) in self.sources:
-            self.sources[of, what].data = {name: np.asarray(each) for name, each in columns.items()}
+        """Draw other values; nothing where there is no such source, or they are drawn already."""
+        if (of, what) not in self.sources:
+            return
+        source = self.sources[of, what]
+        if not all(np.array_equal(each, source.data[name]) for name, each in columns.items()):
+            source.data = {name: np.asarray(each) for name, each in columns.items()}
 
 
 def blank(name: str, title: str, *, over_time: Range1d | None = None, **options: Any) -> Plot:
@@ -81,6 +84,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
         toolbar_location=None,
         tools="",
         output_backend="canvas",
+        min_border_right=20,  # where the last number of the axis stands
         **ranges,
         **options,
     )

@@ -5,7 +5,7 @@ as JSON, beside the SVG picture that is drawn of it here; the report draws it fo
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -156,6 +156,20 @@ def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
     """Draw one range that others are seen against, from end to end."""
     ends = np.asarray(x)[[0, -1]]
     return band(label, ends, [low, low], [high, high], reference=True)
+
+
+def coverage(title: str, held: Mapping[str, Mapping[str, float]]) -> Chart:
+    """Draw by block and quantity how many of a hundred 95 % intervals hold the truth."""
+    names = list(next(iter(held.values())))
+    places = np.arange(len(names), dtype=float)
+    panel = Panel(
+        x=Axis(ticks=dict(enumerate(names))),
+        y=Axis(label="of 100 intervals hold the truth", limits=(80.0, 100.5)),
+    )
+    panel.bands.append(interval("90 to 99", places, 90.0, 99.0))
+    for block, counts in held.items():
+        panel.series.append(curve(block, places, list(counts.values()), "markers"))
+    return Chart(title=title, panels=[panel])
 
 
 def _places(values: ArrayLike) -> Places:

@@ -9,23 +9,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from replay.engine.compiling.notices import done_once
+
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
     """Return what is exceeded with one minus this probability, by that many degrees of freedom."""
-    from scipy.special import gammaincinv
+    with done_once():
+        from scipy.special import gammaincinv
 
     return 2.0 * gammaincinv(np.divide(degrees, 2.0), probability)
 
 
 def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
     """Return what is exceeded with this probability."""
-    from scipy.special import chdtri
+    with done_once():
+        from scipy.special import chdtri
 
     return chdtri(degrees, probability)
 
 
 def sf(value: ArrayLike, degrees: ArrayLike) -> Any:
     """The probability with which a value, which is not negative, is exceeded."""
-    from scipy.special import chdtrc
+    with done_once():
+        from scipy.special import chdtrc
 
     return chdtrc(degrees, value)

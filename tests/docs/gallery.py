@@ -22,7 +22,7 @@ to the page that says what it shows.
 
 def gallery() -> str:
     """The text of the page."""
-    return HEAD + "\n".join(map(_card, experiments())) + "\n</div>\n"
+    return HEAD + "\n".join([_card(each) for each in experiments()]) + "\n</div>\n"
 
 
 def page_of(experiment: str) -> Path:

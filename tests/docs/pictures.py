@@ -37,7 +37,8 @@ def draw(name: str, places: Mapping[str, Path], rrd: Path) -> None:
 @data_option
 def main(names: tuple[str, ...], data: Path) -> None:
     """Draw the first logs of the experiments NAMES, or of all that have some."""
-    known = [name for name in shipped("experiments") if name == "diagnosis" or RECIPES[name].has_log]
+    drawn = {"diagnosis", *(name for name, recipe in RECIPES.items() if recipe.has_log)}
+    known = [name for name in shipped("experiments") if name in drawn]
     for name in names:
         if name not in known:
             raise click.BadParameter(f"no experiment '{name}' that has logs; {choices(name, known)}")

@@ -129,8 +129,9 @@ BIASES = {"model": "moving-sights", **unknowns(MovingOpticalParameters())}
 MIXTURES = ("hmm", "ergodic", "density-joint", "density-by-modality")
 TORUS = load_experiment("torus-filter", {}, {})[1].options["cases"]
 
-# a diagnosis is a search, which its own tests hold to what is known
-RECIPES = {name: Recipe(name) for name in shipped("experiments") if name != "diagnosis"} | {
+# searches, which their own tests hold to what is known
+SEARCHES = ("calibration", "diagnosis", "sensor-noise")
+RECIPES = {name: Recipe(name) for name in shipped("experiments") if name not in SEARCHES} | {
     "biometrics-bssr1": Recipe(
         "biometrics-bssr1",
         estimators={

@@ -6,8 +6,8 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,6 +45,16 @@ def run_here(*arguments: str | Path) -> Said:
     return Said(code, out.getvalue(), err.getvalue())
 
 
+@contextmanager
+def heeding_interrupts() -> Iterator[None]:
+    """Ctrl-C ends this process and one begun meanwhile, also in a background job or with nohup."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture(scope="session")
 def fuselog() -> Callable[..., Said]:
     """Run a command in this process."""
@@ -57,14 +67,10 @@ def start_fuselog() -> Callable[..., subprocess.Popen[str]]:
 
     def start(*arguments: str, **options: Any) -> subprocess.Popen[str]:
         command = [str(Path(sys.executable).with_name("fuselog")), *arguments]
-        # a child inherits that Ctrl-C is ignored, as of `nohup` or a script's background job
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
+        with heeding_interrupts():
             return subprocess.Popen(
                 command, text=True, **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
             )
-        finally:
-            signal.signal(signal.SIGINT, before)
 
     return start
 

@@ -1,11 +1,14 @@
 """Calibration: car C of the sheet of sensors, section 2, and what its motion does not determine."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fuselog as fl
+from pipeline.calibrating import study
 from pipeline.calibrating.car import (
     NAMES,
     OURS,
@@ -130,3 +133,28 @@ def test_the_next_manoeuvre_is_the_sheets() -> None:
     said = [each for each in found.notes if "record turns at changing speed: of 6 manoeuvres" in each]
     assert said
     assert any("by the determinant" in each for each in found.notes)
+
+
+def test_the_study_counts_what_intervals_hold_and_what_motions_leave_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of three cars, each a tenth further off than the one before; intervals are .15 to either side."""
+    cars = iter(range(100))
+
+    def calibrated(log: object, estimators: dict[str, object]) -> SimpleNamespace:
+        values = OURS + 0.1 * next(cars)
+        columns = {"parameter": NAMES, "value": values, "low": values - 0.15, "high": values + 0.15}
+        held = [] if log.read(["/car/prior"])["/car/prior"]["covariance"][0, 0] == 100.0 else NAMES[3:5]
+        found = SimpleNamespace(held=held)
+        return SimpleNamespace(parameters=pd.DataFrame(columns), found=found)
+
+    monkeypatch.setattr(study, "calibrate", calibrated)
+    experiment = SimpleNamespace(runs=3, estimators={"ekf": {}})
+    setting = SimpleNamespace(
+        options=study.CalibrationOptions(seeds=(1,)), progress=lambda each, *_: each
+    )
+    found = study.study(experiment, setting).metrics
+    assert {found[f"ekf.covered.0-{name}"] for name in NAMES} == {2.0}
+    assert found["ekf.spread.0-lever_x_m"] == pytest.approx(0.1 / (0.3 / 3.919928))
+    is_open = [found[f"ekf.left_open.changing-speed-{name}"] for name in NAMES]
+    assert is_open == [0, 0, 0, 1, 1, 0, 0]

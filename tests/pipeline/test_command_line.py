@@ -20,6 +20,7 @@ import pytest
 import fuselog as fl
 from pipeline.output.results import result_folder
 from recorders.log import RunMetadata, make_stream, open_log, read_streams, schemas, write_log
+from tests.pipeline.conftest import heeding_interrupts
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
@@ -505,7 +506,8 @@ def test_a_stop_that_falls_into_a_finalizer_is_not_lost(
     sent = list[int]()
     monkeypatch.setattr("threading.Timer", Timer)
     monkeypatch.setattr("recorders.log.LogWriter.write", finalize)
-    said = fuselog("replay", world / "log.mcap", "-e", "ekf", "--out", "new.mcap")
+    with heeding_interrupts():
+        said = fuselog("replay", world / "log.mcap", "-e", "ekf", "--out", "new.mcap")
     assert (said.code, said.err.strip()) == (128 + number, "fuselog: stopped")
     assert list(here.iterdir()) == []
 
@@ -589,7 +591,7 @@ def test_info_of_what_fuselog_made(world: Path, fuselog: Fuselog) -> None:
     assert said.startswith("Estimates by ekf of log.mcap; what can be done with them: fuselog evaluate ")
     said = fuselog("info", str(result)).out
     assert "a result of landmarks (" in said
-    assert "dead-reckoning, ekf and ukf over 2 simulated runs of landmarks of 2 s" in said
+    assert "dead-reckoning, ekf and ukf over 2 simulated runs of 2 s (scenario landmarks)" in said
     assert fuselog("info", str(result), "--json").json["experiment"] == "landmarks"
     timeline = result / "timeline.rrd"
     assert "a timeline of fuselog-landmarks" in fuselog("info", str(timeline)).out

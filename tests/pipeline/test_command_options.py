@@ -206,7 +206,6 @@ UNMOVED = {
     "evaluate --max-difference": "no test moves it yet",
     "evaluate --truth-format": "it is found from the content, and another than that is refused",
     "explore --gap-limit": "no test moves it yet",
-    "explore --no-browser": "no test moves it yet",
     "replay --gap-limit": "truth is known at every stamp of the short log",
     "report --viewer": "no test moves it yet",
     "run --parameters": "no test moves it yet",

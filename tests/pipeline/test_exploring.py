@@ -1,8 +1,12 @@
 """A filter is played by its parameters: the session, and the page in a browser."""
 
 import json
+import os
+import re
 import shutil
+import signal
 import socket
+import subprocess
 import tomllib
 import urllib.error
 import urllib.request
@@ -222,7 +226,8 @@ NOW = """() => {
 DRAG = 'place => { Bokeh.documents[0].get_model_by_name("sigma_range_m").value = place; }'
 
 
-def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
+def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The newest value wins; the timeline is opened with it, at the instant of the lens."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
@@ -230,6 +235,13 @@ def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
     explorer = fl.explore(log, "ekf", show=False)
     slider = explorer.session.slider("sigma_range_m")
     said: list[str] = []
+    viewed, is_viewed = [], Event()
+
+    def view(rrd: Path, *, at_s: float) -> None:
+        viewed.append((rrd.read_bytes()[:4], f"Lens at {at_s:.1f} s"))
+        is_viewed.set()
+
+    monkeypatch.setattr("replay.timeline.viewer.view", view)  # there is no screen
     with playwright.sync_playwright() as running:
         browser = running.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1280, "height": 900})
@@ -253,7 +265,28 @@ def test_in_a_browser_curves_follow_the_slider(log: Path) -> None:
         page.get_by_text("Reset", exact=True).click()
         page.wait_for_selector("text=Nothing speaks against it.")
         page.wait_for_selector("text=pinned")
+        page.get_by_text("Timeline", exact=True).click()
+        assert is_viewed.wait(30.0)
+        title = "() => Bokeh.documents[0].get_model_by_name('lens').title.text"
+        assert viewed == [(b"RRF2", page.evaluate(title))]
         browser.close()
     explorer._is_ended.wait(20.0)
     assert explorer._is_ended.is_set()  # the page is closed
     assert said == []
+
+
+@pytest.mark.skipif(os.name != "posix", reason="an interrupt is sent as POSIX has it")
+def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subprocess.Popen[str]]) -> None:
+    pytest.importorskip("bokeh")
+    command = ["explore", str(log), "-e", "ekf", "--no-browser"]
+    with start_fuselog(*command, stderr=subprocess.STDOUT) as running:
+        assert running.stdout is not None
+        said = running.stdout.readline()
+        url = re.search(r"http://\S+/", said)
+        assert url is not None, said
+        with urllib.request.urlopen(url[0]) as answer:
+            assert answer.status == 200
+        running.send_signal(signal.SIGINT)
+        assert running.wait(10.0) == 128 + signal.SIGINT
+    with pytest.raises(urllib.error.URLError):
+        urllib.request.urlopen(url[0])

@@ -4,18 +4,20 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import fuselog as fl
+from pipeline.sensing import study
 from pipeline.sensing.allan import allan_deviation, degrees_of_freedom
 from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
 from pipeline.sensing.likelihood import Samples, likelihood
 from pipeline.sensing.preparing import find_drift, find_vibration, samples_of, white_block
 from pipeline.sensing.terms import Terms
 from pipeline.sensing.units import parse_sheet
+from tests.claims.pages import stored
 from tests.pipeline.conftest import Said
 
 STEP_S = 0.02
@@ -23,16 +25,8 @@ ALL = Terms(1e-3, 1e-4, 4e-4, 20.0, 2e-5)
 
 
 def unit(seed: int, size: int = 65536, terms: Terms = ALL, step_s: float = STEP_S) -> np.ndarray:
-    """The sheet's simulated unit (n,): white noise, walk, Gauss-Markov noise, quantised angle."""
-    rng = np.random.Generator(np.random.Philox(key=seed))
-    white, walk, markov = (rng.standard_normal(size) for _ in range(3))
-    angle = rng.random(size + 1) - 0.5
-    decay = np.exp(-step_s / terms.markov_time_s)
-    driven = terms.markov * np.sqrt(1 - decay**2) * markov
-    driven[0] = terms.markov * markov[0]
-    walked = np.concatenate([[0.0], np.cumsum(terms.walk * np.sqrt(step_s) * walk)[:-1]])
-    quantised = np.diff(terms.quantisation * np.sqrt(12) * angle) / step_s
-    return terms.white / np.sqrt(step_s) * white + walked + lfilter([1], [1, -decay], driven) + quantised
+    """The sheet's simulated unit (n,)."""
+    return study.unit(seed, size, terms, step_s)
 
 
 @pytest.fixture(scope="module")
@@ -232,3 +226,36 @@ def test_bad_input_is_a_sentence() -> None:
     assert "stamps go back" in refused(replace(rest(size), publish_time_ns=stamps))
     assert "a third of its length" in refused(rest(size), taus=[30.0])
     assert "is a unit for m/s^2" in refused(rest(size), sheet={"turn_rate_radps": "1 ug/sqrt(Hz)"})
+
+
+def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of four units; their deviation is the true one, 5 % above it, and twice it."""
+
+    def looked_at(source: object, _: str) -> SimpleNamespace:
+        place = stds.index(float(np.std(source.streams["/wheels"]["turn_radps"])))
+        white = SimpleNamespace(low=1e-3 if place < 3 else 1.1e-3, high=2e-3, value=1e-3 * (1 + place))
+        curve = SimpleNamespace(taus_s=taus_s, deviations=true * np.array([1.0, 1.05, 2.0]))
+        numbers = {"white": white}  # no walk is found
+        column = SimpleNamespace(curve=curve, degrees=np.full(3, 100.0), numbers=numbers)
+        return SimpleNamespace(columns=[column])
+
+    taus_s = np.array(study.TAUS_S)
+    true = np.sqrt(study.TERMS.allan_variance(taus_s, study.STEP_S))
+    monkeypatch.setattr(study, "noise", looked_at)
+    monkeypatch.setattr(study, "SIZE", 100)
+    units = [unit(seed, 100, study.TERMS, study.STEP_S) for seed in (5, 6, 7, 8)]
+    stds = [float(np.std(each)) for each in units]
+    experiment = SimpleNamespace(runs=4)
+    setting = SimpleNamespace(options=study.NoiseOptions(seeds=(5,)), progress=lambda each, *_: each)
+    found = study.study(experiment, setting).metrics
+    assert found["noise.covered.0-white"] == 3.0
+    assert found["noise.covered.0-walk"] == 0.0
+    assert [found[f"noise.covered.0-deviation-{each:g}s"] for each in taus_s] == [4.0, 4.0, 0.0]
+    assert found["noise.spread.0-white"] == pytest.approx(np.std(np.log([1, 2, 3, 4]), ddof=1))
+
+
+@pytest.mark.parametrize("name", ["sensor-noise", "calibration"])
+def test_of_a_hundred_intervals_ninety_to_ninety_nine_hold_the_truth(name: str) -> None:
+    covered = {key: each for key, each in stored()[name].metrics.items() if ".covered." in key}
+    assert len(covered) == {"sensor-noise": 10, "calibration": 14}[name]
+    assert {key: each for key, each in covered.items() if not 90 <= each <= 99} == {}

@@ -258,15 +258,19 @@ def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None
         {f"{label}.nees": HONEST for label in "abc"},
     )
     first, second = told.verdict
-    assert first.endswith("draw in position error: take either.")
-    assert second == "c believes itself 3 times more than it should."
-    assert told.cards[0].estimator == "c"
-    assert [card.look for card in told.cards] == ["broken", "best", "best"]
-    assert told.cards[0].consistency == "Its errors are 3 times what it claims"
-    assert told.cards[0].numbers.startswith("NEES 27")
-    assert told.cards[0].numbers.endswith("; 3 is right")
+    assert first.endswith("tie in position error: take either.")
+    assert second == "c is overconfident: its errors are 3 times what it states."
+    assert told.cards[2].estimator == "c"
+    assert [card.look for card in told.cards] == ["best", "best", "broken"]
+    assert told.cards[2].consistency == "Its errors are 3 times what it states"
+    assert told.cards[2].numbers.startswith("NEES 27")
+    assert told.cards[2].numbers.endswith("; 3 is right")
+    assert not told.is_sound
     [difference] = told.differences
-    assert re.match(r"c errs 0\.98\d m more than [ab] \(95 % 0\.9\d+ to 1\.0\d m\)\.", difference)
+    assert re.match(
+        r"c errs 0\.98\d m more than [ab] in the mean over runs \(95 % 0\.9\d+ to 1\.0\d m\)\.",
+        difference,
+    )
 
 
 def test_a_card_says_what_a_message_cost() -> None:
@@ -298,7 +302,7 @@ def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure
     assert _told(runs, bounds).verdict == [
         "b errs least, 49.7 cm, but mend it before you believe its covariance; of the others a errs "
         "least, 99.4 cm.",
-        "b believes itself 4 times more than it should.",
+        "b is overconfident: its errors are 4 times what it states.",
     ]
 
 
@@ -309,9 +313,9 @@ def test_the_story_of_one_run_leaves_chance_open() -> None:
     assert not told.draws + told.differences
     many = {"a": {"position_rmse_m": [1.0] * 2000, "nees": [3.15] * 2000}}
     nearly = _told(many, {"a.nees": (2.894, 3.108)})
-    assert nearly.verdict == ["a has a position error of 1 m RMS; its errors are what it claims."]
+    assert nearly.verdict == ["a has a position error of 1 m RMS; its errors are as large as it states."]
     without = _told({"a": {"nis_per_component": [1.0]}}, {"a.nis_per_component": (0.9, 1.1)})
-    assert without.verdict == ["a: its innovations are what it claims."]
+    assert without.verdict == ["a: its innovations are as large as it states."]
 
 
 def test_the_opening_says_which_claims_hold() -> None:
@@ -326,7 +330,10 @@ def test_the_opening_says_which_claims_hold() -> None:
         experiment="x", fuselog="1", settings=settings, input_sha256="", metrics={}, claims=claims
     )
     begun = opening(result, {})
-    assert begun.tried == "a and b over 4 simulated runs of s, seed 7, each on the same measurements."
+    assert (
+        begun.tried
+        == "a and b over 4 simulated runs (scenario s), seed 7, each on the same measurements."
+    )
     assert begun.story.verdict == [
         "1 of 4 claims confirmed.",
         "1 refuted: “B is 2”.",
@@ -348,11 +355,13 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     assert fuselog("sweep", "landmarks", *over, "--out", sweep).code == 0
     tried, came = said(read_result(compare), compare)
     assert tried == "ekf and ukf over the same 5 runs, run by run."
-    assert "metrics over 5 runs" in came
+    assert "Over 5 runs" in came
     tried, came = said(read_result(sweep), sweep)
     assert tried.startswith("ekf.sigma_range_m from 0.05 to 0.2: 3 points, 2 runs of landmarks at each")
-    assert "ekf has the least position error" in came
-    assert "dead-reckoning and ukf do not depend on it." in came
+    assert "ekf has its least position error" in came
+    assert re.search(
+        r"dead-reckoning \([\d.]+ [cm]+\) and ukf \([\d.]+ [cm]+\) do not depend on it\.", came
+    )
     write_report([compare, sweep], tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert page.texts["h1"] == ["2 results"]
@@ -371,8 +380,8 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     key, _, value = cause.setting.partition("=")
     assert (cause.estimator, key) == ("ekf", "ekf.sigma_range_m")
     assert float(value) == pytest.approx(0.1, rel=0.15)
-    assert cause.mended.startswith("Mended so, over 2 runs: position error, RMS ")
-    assert f"Likeliest: {cause.short}." in said(read_result(folder), folder)[1]
+    assert cause.mended.startswith("With that, over 2 runs: position error, RMS ")
+    assert f"The likeliest cause: {cause.short}." in said(read_result(folder), folder)[1]
     write_report([folder], tmp_path / "page.html")
     assert f"<code>--set {cause.setting}</code>" in (tmp_path / "page.html").read_text(encoding="utf-8")
     again = fuselog("run", "landmarks", *broken, "--out", folder)  # which is ours still
@@ -513,7 +522,9 @@ def shown(request: pytest.FixtureRequest, browser: Any, page_file: Path) -> Iter
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: said.append(request.url))
     page.goto(page_file.as_uri())
+    page.locator(".looks figure").first.scroll_into_view_if_needed()  # drawn when it comes near
     page.wait_for_selector(".plot .main-svg")
+    page.evaluate("scrollTo(0, 0)")
     yield page
     page.close()
     assert [each for each in said if not each.startswith(("file:", "data:"))] == []

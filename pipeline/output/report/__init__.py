@@ -21,7 +21,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
-from pipeline.output.alarms import Cause
+from pipeline.output.alarms import Alarm, Cause
 from pipeline.output.charts import Chart
 from pipeline.output.report.colours import text_colours
 from pipeline.output.report.evidence import Timings
@@ -33,11 +33,14 @@ from pipeline.output.report.scene import lens, nis_chart, plan
 from pipeline.output.report.sheet import Sheet, sheets
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
+from pipeline.output.words import listed
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
 from recorders.parsing import parse_json
 
+# On pages that have one of these, each has its own colour.
+USUAL = ("dead-reckoning", "ekf", "ukf")
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
 _SIGNATURE = b"<!-- fuselog "
@@ -113,6 +116,7 @@ def write_report(
         "hashes": _hashes,
         "named": _named,
         "hues": _hues,
+        "doubts": _doubts,
     }
     text = environment.get_template("page.html").render(
         text_colours=text_colours(),
@@ -155,6 +159,15 @@ def _as_json(chart: Chart, estimators: Iterable[str]) -> Markup:
 def _hues(labels: Sequence[str]) -> dict[str, str]:
     """The class by which the page colours the name of an estimator."""
     return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
+
+
+def _doubts(alarms: Sequence[Alarm]) -> str:
+    """What is doubtful of whom, in a few words."""
+    of: dict[str, list[str]] = {}
+    for each in alarms:
+        of.setdefault(each.kind, []).append(each.estimator)
+    whose = {kind: listed(list(dict.fromkeys(filter(None, each)))) for kind, each in of.items()}
+    return "; ".join(f"{kind} of {each}" if each else kind for kind, each in whose.items())
 
 
 def _named(text: str, labels: Sequence[str]) -> Markup:
@@ -205,7 +218,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         name,
         title_of(result, labels, begun.found.runs),
         result,
-        labels,
+        list(dict.fromkeys([*USUAL, *labels])) if {*USUAL} & {*labels} else labels,
         begun,
         Markup(_MARKDOWN.render(str(result.settings.get("text") or ""))),  # which lets no HTML through
         looks,

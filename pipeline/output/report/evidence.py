@@ -31,6 +31,7 @@ Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and th
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
 # A mean of squares may be off by this share: nobody would act on less, however many runs show it.
 MATERIAL = 0.1
+FAR = 1.25  # times larger than claimed: errors of that are no matter of a few percent
 MANY_RUNS = 500
 MARGIN = 0.02  # as `fuselog compare` has it
 
@@ -70,6 +71,11 @@ class Consistency:
     def factor(self) -> float:
         """How many times larger errors are than the estimator claims."""
         return math.sqrt(max(self.found.value, 0.0) / self.aim)
+
+    @property
+    def is_far(self) -> bool:
+        """Whether errors are so much larger than claimed that nobody should go by the covariance."""
+        return self.factor > FAR
 
     @property
     def state(self) -> State:

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from pipeline.output.report.evidence import Consistency
+from pipeline.output.report.evidence import MATERIAL, Consistency
 from pipeline.output.words import Scale, interval, number
 
 # It goes from a third of the aim to ten times the aim, evenly in the logarithm.
@@ -14,7 +14,7 @@ class Gauge(NamedTuple):
     """Where a mean of squares lies, in percent of a scale from too careful to too sure.
 
     Attributes:
-        honest: where a consistent estimator lies.
+        honest: what counts as consistent: where 95 % of such estimators lie, and what is off by little.
         aim, value: the right value, and the one that was found.
         spread: where the latter lies with 95 %; both ends at it where that is not known.
         is_beyond: whether the value lies beyond the scale's end.
@@ -50,4 +50,7 @@ def gauge(by: Consistency) -> Gauge:
     words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
     is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
     ends = (place(spread[0]), place(spread[1]))
-    return Gauge((place(low), place(high)), place(by.aim), place(found.value), ends, is_beyond, words)
+    box = min(low, (1.0 - MATERIAL) * by.aim), max(high, (1.0 + MATERIAL) * by.aim)
+    return Gauge(
+        (place(box[0]), place(box[1])), place(by.aim), place(found.value), ends, is_beyond, words
+    )

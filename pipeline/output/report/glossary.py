@@ -37,8 +37,8 @@ _TERMS = {
         "hang together.",
         f"{_WIKI}/Bootstrapping_(statistics)",
     ),
-    "draw": Term(
-        "Draw",
+    "tie": Term(
+        "Tie",
         "Two estimators that cannot be told apart on these runs: chance explains the difference, or it "
         "is less than 2 %. Take the simpler one, or make more runs.",
         f"{_WIKI}/Paired_difference_test",
@@ -77,13 +77,13 @@ _TERMS = {
 
 
 def glossary(keys: set[str], *, draws: bool) -> list[Term]:
-    """The entries that a page with these quantities needs; with `draws` what a draw is."""
+    """The entries that a page with these quantities needs; with `draws` what a tie is."""
     needed = {
         "rmse": any("rmse" in key for key in keys),
         "nees": any("nees" in key for key in keys),
         "nis": any(key.startswith("nis") for key in keys),
         "interval": bool(keys),
-        "draw": draws,
+        "tie": draws,
         "likelihood": "log_likelihood" in keys,
         "gospa": any("gospa" in key for key in keys),
         "hota": "hota" in keys,

@@ -95,11 +95,11 @@ def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
     scenario = settings.get("record", {}).get("scenario")
     source = settings.get("import", {}).get("source")
     what = count(found.runs, "simulated run" if scenario else "log" if settings.get("logs") else "run")
-    of = f" of {scenario or source}" if scenario or source else ""
+    of = f" (scenario {scenario})" if scenario else f" of {source}" if source else ""
     long = _length(tables)
     seed = f", seed {settings['seed']}" if scenario and "seed" in settings else ""
     same = "" if len(estimators) < 2 else ", each on the same measurements"
-    return f"{named or result.experiment} over {what}{of}{long}{seed}{same}."
+    return f"{named or result.experiment} over {what}{long}{of}{seed}{same}."
 
 
 def _length(tables: Tables) -> str:
@@ -162,16 +162,17 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
     told = story(found)
     differ = rows[rows["verdict"].isin(["better", "worse", "higher", "lower"])]
-    unclear = int((rows["verdict"] == "unclear").sum())
+    unclear = [quantity(key).name for key in rows[rows["verdict"] == "unclear"]["quantity"].unique()]
+    margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
     runs = count(found.runs, "run")
     if found.runs and rows["low"].isna().all():
         summary = f"{runs} give no interval: whether the differences are chance is open."
     elif differ.empty:
-        summary = f"Of {len(rows)} metrics over {runs} none differs beyond chance and the margin"
-        summary += f"; of {unclear} more runs would tell." if unclear else "."
+        summary = f"Over {runs} none of {len(rows)} metrics differs by more than chance and {margin}"
+        summary += f"; in {len(unclear)} ({', '.join(unclear)}) they do not decide." if unclear else "."
     else:
         summary = (
-            f"Of {len(rows)} metrics over {runs} {len(differ)} differ beyond chance and the margin."
+            f"Over {runs} {len(differ)} of {len(rows)} metrics differ by more than chance and {margin}."
         )
     also = [_difference_sentence(row) for row in differ.to_dict("records")]
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
@@ -241,7 +242,12 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         ]
         ticks = {float(place): name for place, name in zip(places, names, strict=True)}
         y = Axis(ticks=ticks, limits=(0.4, len(own) + 0.6))
-        x = Axis(label=f"{second} less {first}, in percent of {first} or of the aim; lines: 95 %")
+        least, most = min(*low, -100.0 * margin), max(*high, 100.0 * margin)
+        room = 0.05 * float(most - least)
+        x = Axis(
+            label=f"{second} less {first}, in percent of {first} or of the aim; lines: 95 %",
+            limits=(float(least) - room, float(most) + room),
+        )
         edges = [
             curve(
                 f"margin, {number(100 * margin)} %",
@@ -252,11 +258,12 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
             )
             for side in (-100.0 * margin, 100.0 * margin)
         ]
+        edges.append(curve("no difference", [0.0, 0.0], [0.4, len(own) + 0.6], reference=True))
         spread = Series(label=str(second), x=ends, y=lines)
         panels.append(
             Panel(x=x, y=y, series=[*edges, spread, curve(str(second), middle, places, "markers")])
         )
-    title = "What differs; between the dashed lines it does not matter"
+    title = "Every difference with its interval; between the dashed lines it does not matter"
     return Chart(title=title, panels=panels, legend=False)
 
 
@@ -278,7 +285,8 @@ def _of_sweep(result: Result, tables: Tables) -> Opening:
         if own.empty:
             continue
         if float(own.max() - own.min()) <= 1e-9 * float(own.max()):
-            still.append(label)
+            unit = scale(quantity(main).unit, float(own.max()))
+            still.append(f"{label} ({unit.with_unit(float(own.max()))})")
             continue
         card, sentence = _swept(table, points, label, main, own)
         cards.append(card)
@@ -329,7 +337,7 @@ def _swept(
     unit = scale(quantity(main).unit, float(own.min()))
     where = ", ".join(f"{key} = {_value(each)}" for key, each in points[best].items())
     error = quantity(main).name.removesuffix(", RMS")
-    sentence = f"{label} has the least {error}, {unit.with_unit(float(own.min()))}, at {where}"
+    sentence = f"{label} has its least {error}, {unit.with_unit(float(own.min()))}, at {where}"
     by = _consistency_at(table, label, best)
     notes = [
         f"From {unit.text(float(own.min()))} to {unit.with_unit(float(own.max()))} over all points."
@@ -347,7 +355,14 @@ def _swept(
     elif by is not None:
         nees = f"NEES {number(by.found.value)}, {number(by.aim)} is right"
         sentence += f", and its covariance can be believed there ({nees})"
-        look, mark, claim = "best", "✓", "Its errors are what it claims there"
+        look, mark, claim = "best", "✓", "Its errors are as large as it states there"
+    sure = [
+        ", ".join(_value(each) for each in points[place].values())
+        for place in own.index
+        if (there := _consistency_at(table, label, place)) and there.state == "too sure"
+    ]
+    if sure:
+        notes.append(f"It is overconfident at {', '.join(sure)}.")
     numbers = f"NEES {number(by.found.value)}; {number(by.aim)} is right" if by else ""
     card = Card(
         str(label),

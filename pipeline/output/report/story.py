@@ -46,9 +46,10 @@ class Story:
 
     Attributes:
         verdict: what to do, the most important sentence first.
-        cards: of the estimators, what is wrong first.
+        cards: of the estimators, whom to take first, then who cannot be believed.
         draws: sentences on pairs that cannot be told apart, differences: on those that can.
         left_out: estimators that have no card.
+        is_sound: whether each was judged, and none is inconsistent.
     """
 
     verdict: list[str]
@@ -56,6 +57,7 @@ class Story:
     draws: list[str] = field(default_factory=list)
     differences: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    is_sound: bool = False
 
 
 def story(found: Findings, causes: Sequence[Cause] = (), timings: Timings | None = None) -> Story:
@@ -72,7 +74,8 @@ def story(found: Findings, causes: Sequence[Cause] = (), timings: Timings | None
     ]
     draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
     verdict = _verdict(found, broken, take, equal, own, by_label)
-    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:])
+    is_sound = all(each.state(found.runs) == "honest" for each in found.of.values())
+    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:], bool(cards) and is_sound)
 
 
 def _broken(found: Findings) -> list[Evidence]:
@@ -113,13 +116,13 @@ def relation(found: Findings, first: str, second: str) -> Relation:
 
 
 def _in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
-    """What is wrong first, then whom to take, then the others by their error."""
+    """Whom to take, then who cannot be believed, the worst first, then the others by their error."""
     rest = sorted(
         found.labels,
         key=lambda label: error.value if (error := found.of[label].error) else math.inf,
     )
     first = [each.estimator for each in broken]
-    return list(dict.fromkeys([*first, *filter(None, [take]), *equal, *rest]))
+    return list(dict.fromkeys([*filter(None, [take]), *equal, *first, *rest]))
 
 
 def _verdict(
@@ -175,8 +178,8 @@ def _advice(found: Findings, broken: list[Evidence], take: str, equal: list[str]
         both = listed([take, *equal])
         either = "either" if len(equal) == 1 else "any of them"
         if all(relation(found, take, each) == "draw" for each in equal):
-            return f"{both} draw in {main}: take {either}."
-        return f"A draw so far: {runs} do not tell {both} apart; take {either}."
+            return f"{both} tie in {main}: take {either}."
+        return f"A tie so far: {runs} do not tell {both} apart; take {either}."
     if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
         few = found.runs < FEWEST_RUNS
@@ -217,9 +220,10 @@ def _doubt(each: Evidence, causes: dict[str, Cause]) -> str:
     """Why an estimator is not to be believed, in a sentence."""
     if each.decisive is None or each.decisive.state != "too sure":
         return f"{each.estimator} fails in every run."
-    sure = f"{each.estimator} believes itself {_times(each.decisive.factor)} more than it should"
+    how = "overconfident" if each.decisive.is_far else "slightly overconfident"
+    sure = f"{each.estimator} is {how}: {_claim(each, 0)}"
     cause = causes.get(each.estimator)
-    return f"{sure}. Likeliest: {cause.short}." if cause else f"{sure}."
+    return f"{sure}. The likeliest cause: {cause.short}." if cause else f"{sure}."
 
 
 def _times(factor: float) -> str:
@@ -233,12 +237,12 @@ def _claim(each: Evidence, runs: int) -> str:
         return "its covariance was not judged"
     what = "innovations" if by.name == "NIS" else "errors"
     if by.state == "too sure":
-        return f"its {what} are {_times(by.factor)} what it claims"
+        return f"its {what} are {_times(by.factor)} what it states"
     if by.state == "too careful":
-        return f"its {what} are {number(by.factor, 2)} of what it claims"
+        return f"its {what} are {number(by.factor, 2)} of what it states"
     if runs == 1 and by.name != "NIS" and each.also is None:
         return "one run does not show it to be inconsistent"
-    return f"its {what} are what it claims"
+    return f"its {what} are as large as it states"
 
 
 def _card(
@@ -274,11 +278,12 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
     if state == "failed":
         return "broken", "✕", "Fails in every run"
     if state == "too sure":
-        return "broken", "✕", "Too sure of itself"
+        is_far = each.decisive is None or each.decisive.is_far
+        return ("broken", "✕", "Overconfident") if is_far else ("careful", "✕", "Slightly overconfident")
     if each.estimator == take and len(found.labels) > 1:
-        return "best", "✓", f"Draws with {listed(equal)}" if equal else "Take this one"
+        return "best", "✓", f"As good as {listed(equal)}" if equal else "Take this one"
     if each.estimator in equal:
-        return "best", "✓", f"Draws with {listed([take, *(o for o in equal if o != each.estimator)])}"
+        return "best", "✓", f"As good as {listed([take, *(o for o in equal if o != each.estimator)])}"
     if state == "too careful":
         return "careful", "○", "Too careful"
     honest = "Honest" if state == "honest" else "Not judged"
@@ -293,7 +298,7 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
     best = found.of[take].error if take else None
     if each.estimator == take and len(found.labels) > 1 and not equal:
         notes += _in_how_many(found, take)
-    elif best and each.error and best.value and each.error.value > 1.1 * best.value:
+    elif best and each.error and best.value and each.error.value > 1.05 * best.value:
         notes.append(f"{number(each.error.value / best.value, 2)} times the error of {take}.")
     outside, cases = each.outside
     if cases > 1:
@@ -356,5 +361,6 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
             draws.append(f"In {main}, {runs} do not tell {take} and {label} apart: {ends}.")
         else:
             more = "more" if difference.difference > 0 else "less"
-            differences.append(f"{label} errs {near.with_unit(size)} {more} than {take} ({ends}).")
+            errs = f"{near.with_unit(size)} {more} than {take}"
+            differences.append(f"{label} errs {errs} in the mean over runs ({ends}).")
     return draws, differences

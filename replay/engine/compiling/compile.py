@@ -16,6 +16,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
+from replay.engine.compiling.notices import done_once
 from replay.engine.compiling.scratch import Memory, Scratch
 
 Parameters = ParamSpec("Parameters")
@@ -104,6 +105,8 @@ def compile_over_runs(
         if is_uncompiled():
             plain(runs, *arguments, **memory)
         else:
+            with done_once():
+                loop()  # which imports what it needs
             _share(loop(), runs, *arguments, **memory)
 
     plain = uncompiled_over_runs(run_once)

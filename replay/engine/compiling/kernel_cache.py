@@ -32,7 +32,7 @@ from replay.engine.compiling.cache import (
     say_once,
     write_checked,
 )
-from replay.engine.compiling.notices import compiling
+from replay.engine.compiling.notices import compiling, done_once
 
 # In place of the colours in which numba sets its error messages.
 _COLOURLESS = SimpleNamespace(
@@ -87,7 +87,7 @@ class _CompiledCode:
 
     def compile(self, by_numba: Callable[[Any], Any], signature: Any) -> Any:
         """Load or compile the kernel for these types of arguments; numba asks the methods below."""
-        with global_compiler_lock, self._meanwhile:
+        with done_once(), global_compiler_lock, self._meanwhile:
             return by_numba(signature)
 
     def load_overload(self, signature: Any, target: Any) -> CompileResult | None:

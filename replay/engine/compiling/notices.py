@@ -1,4 +1,4 @@
-"""Reports that a kernel is being compiled, where that takes long."""
+"""Reports that a kernel is being compiled, where that takes long; counts what a process does once."""
 
 import logging
 import sys
@@ -14,9 +14,19 @@ _PATIENCE_S = 1.0  # what compiles in less time is not told of
 _spent = local()
 
 
-def seconds_compiling() -> float:
-    """How long this thread has compiled until now."""
+def seconds_done_once() -> float:
+    """How long this thread has compiled, loaded kernels and imported until now, where that was told."""
     return getattr(_spent, "seconds", 0.0)
+
+
+@contextmanager
+def done_once() -> Iterator[None]:
+    """Tell that what is done here belongs to a first use, and to no estimator's time."""
+    begun_s, before_s = time.perf_counter(), seconds_done_once()
+    try:
+        yield
+    finally:
+        _spent.seconds = before_s + time.perf_counter() - begun_s  # of one within another once
 
 
 @contextmanager
@@ -24,14 +34,14 @@ def compiling(title: str) -> Iterator[None]:
     """Say what is compiled where that takes longer than a second, and how long it took."""
     patience = Timer(_PATIENCE_S, _say, (f"compiling {title}, once",))
     patience.daemon = True
-    begun_s, before_s = time.perf_counter(), seconds_compiling()
+    begun_s = time.perf_counter()
     patience.start()
     try:
-        yield
+        with done_once():
+            yield
     finally:
         patience.cancel()
-        took_s = time.perf_counter() - begun_s
-        _spent.seconds = before_s + took_s  # of one within another once
+    took_s = time.perf_counter() - begun_s
     if took_s > _PATIENCE_S:
         _say(f"compiled {title} in {took_s:.1f} s")
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from recorders.errors import BadInput
 from recorders.log import Clock, make_stream, schemas
 from recorders.log.planes import Origin, in_plane
-from replay.engine.compiling.notices import seconds_compiling
+from replay.engine.compiling.notices import seconds_done_once
 from replay.engine.compiling.scratch import Scratch
 from replay.engine.replaying.coverage import Coverage
 from replay.engine.replaying.soundness import UNSOUND, unsound_over_runs
@@ -47,7 +47,7 @@ class RunMonitor:
     Attributes:
         name: the bound estimator's.
         runs: how many there are.
-        seconds: how long the estimator worked, without compiling.
+        seconds: how long the estimator worked, without what is done once, as compiling.
         usage: what became of its measurements; None where that is not counted.
         static: the streams that it begins with.
         refused: what all runs of a part of an ensemble raised.
@@ -108,7 +108,7 @@ class RunMonitor:
         self._note_span(streams)
         if self.usage is not None:
             self.usage.note_given(streams, self.static, self._order)
-        began, compiled = time.perf_counter(), seconds_compiling()
+        began, compiled = time.perf_counter(), seconds_done_once()
         try:
             try:
                 return work(self._before(streams, self._end_ns) if self._has_ends else streams)
@@ -116,7 +116,7 @@ class RunMonitor:
                 self._end_raising(work, streams, error)
                 return work(self._before(streams, self._end_ns))
         finally:
-            self.seconds += time.perf_counter() - began - (seconds_compiling() - compiled)
+            self.seconds += time.perf_counter() - began - (seconds_done_once() - compiled)
 
     def receive(self, outputs: Sequence[Ragged]) -> list[Ragged]:
         """Take a block's outputs up to the first that is no estimate; failures are held back."""

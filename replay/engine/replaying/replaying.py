@@ -38,7 +38,7 @@ class Report:
     """Reports on a replay beside its outputs.
 
     Attributes:
-        seconds: how long each estimator worked, by label, without compiling.
+        seconds: how long each estimator worked, by label, without what is done once, as compiling.
         coverage: for each case, how much of every run was estimated (`schemas.COVERAGE`).
         refused: by estimator, why no run of a part can be replayed.
         usages: by estimator, what became of its measurements.

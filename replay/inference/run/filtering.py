@@ -13,6 +13,7 @@ from recorders.log.streams import computed_stream
 from replay.distributions import chi2
 from replay.engine.arrays import Floats, Function, Integers
 from replay.engine.compiling.compile import compile_over_runs
+from replay.engine.compiling.notices import done_once
 from replay.engine.compiling.scratch import Scratch
 from replay.engine.streams.blocks import Block, Ragged, copied, of_runs, ragged_rows
 from replay.engine.streams.geodetic import origins_of
@@ -278,7 +279,8 @@ class Filter:
     ) -> tuple[FilterState, tuple[Any, Integers], list[Ragged]]:
         """Filter events: the state after them, the estimates, their offsets, and the other outputs."""
         sensors = self.stage.sensors
-        loop, _ = _compiled(self.stage, self.method)
+        with done_once():
+            loop, _ = _compiled(self.stage, self.method)
         before, carried = state.carried, copied(state.carried)
         runs = len(before.time_ns)
         due = ragged_rows(events.wants_estimate, events.offsets)

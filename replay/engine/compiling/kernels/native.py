@@ -38,7 +38,7 @@ from replay.engine.compiling.kernels.arguments import describe, letters, value_o
 from replay.engine.compiling.kernels.lowering import lower
 from replay.engine.compiling.kernels.numbers import WHOLE, Emitter, Number
 from replay.engine.compiling.kernels.program import Program
-from replay.engine.compiling.notices import compiling
+from replay.engine.compiling.notices import compiling, done_once
 from replay.engine.compiling.scratch import Memory
 
 _ALL = 64  # axes that an array may have
@@ -119,7 +119,8 @@ class Kernel:
         key = is_checked, described
         if key not in self._loaded:
             make = _checked_entry if is_checked else _kept_entry
-            self._loaded[key] = make(self._function, described, self._title)
+            with done_once():
+                self._loaded[key] = make(self._function, described, self._title)
         return Struct(f"={''.join(map(letters, described))}"), self._loaded[key]
 
 

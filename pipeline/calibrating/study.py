@@ -1,0 +1,100 @@
+"""The study of calibration: how often its intervals hold the truth, and what each motion leaves open.
+
+Cars are calibrated one by one, from a start that knows nothing. What a motion determines is asked of a
+log without noise, under a prior so wide that it tells nothing.
+"""
+
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import pandas as pd
+from pydantic import NonNegativeInt
+
+from pipeline.calibrating.calibrating import calibrate
+from pipeline.calibrating.car import MOTIONS, NAMES, OURS, TRUTH, drive, recorded
+from pipeline.output.charts import coverage
+from pipeline.output.results import Outcome
+from pipeline.runs.estimates import hash_streams
+from pipeline.runs.experiment import Experiment, Setting, Study
+from recorders.parameters import Parameters
+
+WIDE = (1000.0, 1000.0, 1.0)  # of a start, in m and rad
+# the car's noise is that of its motion, the model's that of the readings
+NOISE = {"forward_noise_density": 0.05 * TRUTH[0], "turn_noise_density": 0.01 * TRUTH[1]}
+
+
+class CalibrationOptions(Parameters):
+    """Which cars are calibrated.
+
+    Attributes:
+        seeds: the first seed of each block of the experiment's runs.
+    """
+
+    seeds: tuple[NonNegativeInt, ...] = ()
+
+
+def study(experiment: Experiment, setting: Setting) -> Outcome:
+    """Run the experiment; see `pipeline.runs.experiment.Study`."""
+    options: CalibrationOptions = setting.options
+    [(label, settings)] = experiment.estimators.items()
+    wanted = settings | NOISE
+    rows: list[dict[str, Any]] = []
+    for block, first in enumerate(options.seeds):
+        title = f"cars from seed {first}"
+        for seed in setting.progress(range(first, first + experiment.runs), title, experiment.runs):
+            rows += _calibrated(label, wanted, block, seed)
+    found = pd.DataFrame(rows)
+    outcome = Outcome(tables={"calibrated": found})
+    held: dict[str, dict[str, float]] = {f"seeds from {first}": {} for first in options.seeds}
+    for (place, counts), name in product(enumerate(held.values()), NAMES):
+        those = found[(found["block"] == place) & (found["parameter"] == name)]
+        spread = float(those["value"].std() / those["sigma"].mean())
+        outcome.metrics[f"{label}.covered.{place}-{name}"] = counts[name] = float(
+            those["is_covered"].sum()
+        )
+        outcome.metrics[f"{label}.spread.{place}-{name}"] = spread
+    outcome.figures["coverage"] = coverage("calibration of a car", held)
+    motions = [_left_open(label, wanted, motion) for motion in MOTIONS]
+    outcome.tables["motions"] = pd.DataFrame(motions, columns=["motion", *NAMES])
+    for name, *are_open in motions:
+        outcome.metrics |= {
+            f"{label}.left_open.{name.replace(' ', '-')}-{parameter}": float(is_open)
+            for parameter, is_open in zip(NAMES, are_open, strict=True)
+        }
+    outcome.input_sha256 = hash_streams([recorded(drive(first)) for first in options.seeds])
+    return outcome
+
+
+def _calibrated(label: str, settings: dict[str, Any], block: int, seed: int) -> list[dict[str, Any]]:
+    """A row per parameter of one car."""
+    table = calibrate(recorded(drive(seed)), {label: settings}).parameters.set_index("parameter")
+    rows: list[dict[str, Any]] = []
+    for name, true in zip(NAMES, OURS, strict=True):
+        value, low, high = table.loc[name, ["value", "low", "high"]].to_numpy(float)
+        rows.append(
+            {
+                "block": block,
+                "seed": seed,
+                "parameter": name,
+                "true": true,
+                "value": value,
+                "sigma": (high - low) / 3.919928,
+                "is_covered": low <= true <= high,
+            }
+        )
+    return rows
+
+
+def _left_open(label: str, settings: dict[str, Any], motion: str) -> Sequence[Any]:
+    """The motion, and of each parameter whether it stays undetermined."""
+    found = calibrate(recorded(drive(None, MOTIONS[motion]), WIDE), {label: settings})
+    held = set(found.found.held)
+    return [motion, *(name in held for name in NAMES)]
+
+
+CALIBRATION = Study(
+    "how often the intervals of a calibration hold the truth, and what each motion leaves open",
+    study,
+    CalibrationOptions,
+)
