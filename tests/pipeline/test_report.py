@@ -288,6 +288,32 @@ def test_a_card_says_what_a_message_cost() -> None:
     assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
 
 
+@pytest.mark.parametrize(
+    ("seconds", "take"),
+    [
+        ((0.03, 0.04), "take either; a needs 0.75 times the time of b."),
+        ((0.04, 0.03), "take either; b needs 0.75 times the time of a."),
+        ((0.038, 0.04), "take either."),
+        ((0.003, 0.004), "take either."),
+    ],
+    ids=["first", "second", "alike", "too short to measure"],
+)
+def test_a_tie_is_broken_by_the_time_where_that_was_measured_and_differs(
+    seconds: tuple[float, float], take: str
+) -> None:
+    error = 1.0 + NOISE[0]
+    told = _told(
+        {
+            "a": {"position_rmse_m": list(error)},
+            "b": {"position_rmse_m": list(error + 1e-3 * NOISE[2])},
+        },
+        timings={
+            label: {"seconds": each, "messages": 5000} for label, each in zip("ab", seconds, strict=True)
+        },
+    )
+    assert told.verdict[0].endswith(take)
+
+
 def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure() -> None:
     error = 1.0 + NOISE[0]
     runs = {
@@ -365,6 +391,11 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     write_report([compare, sweep], tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert page.texts["h1"] == ["2 results"]
+    assert re.search(
+        r"The errors of its runs at [\d. and]+ overlap those at the best point: a sweep does not test "
+        r"whether that is chance; fuselog compare does\.",
+        (tmp_path / "page.html").read_text(encoding="utf-8"),
+    )
     assert not re.search(r"\de[-+]\d", " ".join(page.texts["h3"]))
 
 
@@ -375,7 +406,7 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     folder = tmp_path / "broken"
     broken = ["--set", "ekf.sigma_range_m=0.025", "--set", "duration_s=5", "--runs", "2"]
     done = fuselog("run", "landmarks", *broken, "--diagnose", "--out", folder)
-    assert "likeliest cause of ekf: sigma_range_m: the standard deviation is" in done.out
+    assert "likeliest cause of ekf: sigma_range_m (standard deviation of a range) is" in done.out
     [cause] = read_result(folder).causes
     key, _, value = cause.setting.partition("=")
     assert (cause.estimator, key) == ("ekf", "ekf.sigma_range_m")

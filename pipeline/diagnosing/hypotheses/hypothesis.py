@@ -117,7 +117,7 @@ def times(at: float, low: float, high: float) -> str:
         number(np.exp(abs(end))) if at * end > 0 else "1" for end in sorted((low, high), key=abs)
     )
     factor = number(np.exp(abs(at)))
-    return f"the standard deviation is {factor} times ({least} to {most}) too {size_of(at)}"
+    return f"{factor} times ({least} to {most}) too {size_of(at)}"
 
 
 def size_of(at: float) -> str:

@@ -1,5 +1,6 @@
 """Faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -22,7 +23,7 @@ from pipeline.diagnosing.likelihood import Trial
 from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
 from recorders.log import Stream, Topic
-from recorders.parameters import Parameters
+from recorders.parameters import Parameters, meanings
 from replay.engine.replaying.estimator import Bound, Reading
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
@@ -52,18 +53,20 @@ def of_noises(
         if value is None:
             continue
         kind: Kind = "measurement noise" if topic else "process noise"
-        yield _noise(name, value, kind)
+        yield _noise(name, meanings(type(parameters)).get(name, ""), value, kind)
 
 
-def _noise(name: str, value: float, kind: Kind) -> Hypothesis:
+def _noise(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
     letter = "R" if kind == "measurement noise" else "Q"
+    what = re.split("[,.:;]", meaning)[0]
+    named = f"{name} ({what})" if what else name
 
     def without(trial: Trial, logarithm: float) -> Trial:
         settings = with_values(trial.settings, [name], np.array([value * np.exp(logarithm)]))
         return trial._replace(settings=settings)
 
     def words(at: float, low: float, high: float) -> str:
-        return f"{name}: {times(at, low, high)}, so that {letter} is too {size_of(at)}"
+        return f"{named} is {times(at, low, high)}, so that {letter} is too {size_of(at)}"
 
     def mend(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
@@ -92,8 +95,8 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
     for field, spread in fields:
 
         def words(at: float, low: float, high: float, field: str = field) -> str:
-            said = times(at, low, high)
-            return f"{stream.topic}: of {field} {said}, so that R is too {size_of(at)}"
+            said = f"of {field} the standard deviation is {times(at, low, high)}"
+            return f"{stream.topic}: {said}, so that R is too {size_of(at)}"
 
         def mend(at: float) -> Advice:
             return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))

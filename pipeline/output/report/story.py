@@ -16,6 +16,8 @@ from replay.judging.diagnostics import LEAST_SHARE
 from replay.judging.errors.differences import FEWEST_RUNS
 
 MOST_CARDS = 6
+CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
+TIMED_S = 0.02  # if it was measured for so long
 
 Look = Literal["broken", "careful", "best", "fair"]
 Relation = Literal["draw", "unclear", "beyond chance", "untold"]
@@ -73,7 +75,7 @@ def story(found: Findings, causes: Sequence[Cause] = (), timings: Timings | None
         for label in ordered[:MOST_CARDS]
     ]
     draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
-    verdict = _verdict(found, broken, take, equal, own, by_label)
+    verdict = _verdict(found, broken, take, equal, own, by_label, timings or {})
     is_sound = all(each.state(found.runs) == "honest" for each in found.of.values())
     return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:], bool(cards) and is_sound)
 
@@ -132,6 +134,7 @@ def _verdict(
     equal: list[str],
     own: Scale,
     causes: dict[str, Cause],
+    timings: Timings,
 ) -> list[str]:
     """What to do, then who cannot be believed, and why."""
     if not found.labels:
@@ -152,10 +155,17 @@ def _verdict(
             *named,
             *([least_is.strip()] if least_is else []),
         ]
-    return [_advice(found, broken, take, equal, own), *named]
+    return [_advice(found, broken, take, equal, own, timings), *named]
 
 
-def _advice(found: Findings, broken: list[Evidence], take: str, equal: list[str], own: Scale) -> str:
+def _advice(
+    found: Findings,
+    broken: list[Evidence],
+    take: str,
+    equal: list[str],
+    own: Scale,
+    timings: Timings,
+) -> str:
     """Whom to take; or that who errs least is not to be believed."""
     error = found.of[take].error
     main = quantity(found.main).name.removesuffix(", RMS")
@@ -178,7 +188,7 @@ def _advice(found: Findings, broken: list[Evidence], take: str, equal: list[str]
         both = listed([take, *equal])
         either = "either" if len(equal) == 1 else "any of them"
         if all(relation(found, take, each) == "draw" for each in equal):
-            return f"{both} tie in {main}: take {either}."
+            return f"{both} tie in {main}: take {either}{_cheapest([take, *equal], timings)}."
         return f"A tie so far: {runs} do not tell {both} apart; take {either}."
     if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
@@ -187,6 +197,15 @@ def _advice(found: Findings, broken: list[Evidence], take: str, equal: list[str]
         chance = f"; whether by chance{',' if few else ''} {tells}"
         return f"Take {take}: it has the least {main} {alone}, {_value(error, own)}{chance}."
     return f"Take {take}: it has the least {main}, {_value(error, own)}."
+
+
+def _cheapest(labels: list[str], timings: Timings) -> str:
+    """Who of estimators that are as good needs the least time, where that is known and matters."""
+    seconds = {label: timings.get(label, {}).get("seconds", 0.0) for label in labels}
+    first, second = sorted(labels, key=lambda label: seconds[label])[:2]
+    if not TIMED_S < seconds[first] < CHEAPER * seconds[second]:
+        return ""
+    return f"; {first} needs {number(seconds[first] / seconds[second], 2)} times the time of {second}"
 
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
