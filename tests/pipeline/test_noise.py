@@ -254,8 +254,8 @@ def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.
     assert found["noise.spread.0-white"] == pytest.approx(np.std(np.log([1, 2, 3, 4]), ddof=1))
 
 
-@pytest.mark.parametrize("name", ["sensor-noise", "calibration"])
+@pytest.mark.parametrize("name", ["sensor-noise", "calibration", "ellipsoid"])
 def test_of_a_hundred_intervals_ninety_to_ninety_nine_hold_the_truth(name: str) -> None:
     covered = {key: each for key, each in stored()[name].metrics.items() if ".covered." in key}
-    assert len(covered) == {"sensor-noise": 10, "calibration": 14}[name]
+    assert len(covered) == {"sensor-noise": 10, "calibration": 14, "ellipsoid": 36}[name]
     assert {key: each for key, each in covered.items() if not 90 <= each <= 99} == {}
