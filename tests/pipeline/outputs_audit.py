@@ -159,7 +159,7 @@ def prepare() -> None:
             )
         ],
     )
-    write_log("turned.mcap", recorded("magnetometer", 1))
+    write_log("turned.mcap", [*recorded("magnetometer", 1).streams.values()])
     Path("dead.toml").write_text(EXPERIMENT)
     Path("settings.toml").write_text("")
     Path("line.tum").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in range(9)))

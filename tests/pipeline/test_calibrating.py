@@ -91,6 +91,17 @@ def test_what_the_motion_does_not_determine_is_named_and_held(
     assert np.all(computed[: 7 - known] < 1e-3)
 
 
+def test_bounds_above_zero_leave_a_parameter_its_intervals() -> None:
+    """The search goes over the lever arm itself, not over its logarithm."""
+    log, known = recorded(drive(1, duration_s=30.0)), [*NAMES[:3], *NAMES[4:]]
+    given = {"fixed": known, "set": OPEN | dict(zip(NAMES, OURS.tolist(), strict=True))}
+    found = fl.calibrate(log, "ekf", bounds={"lever_x_m": (0.1, 3.0)}, **given).parameters.iloc[0]
+    alone = fl.calibrate(log, "ekf", **given).parameters.iloc[0]
+    assert [*found[["value", "low", "high"]]] == pytest.approx(
+        [*alone[["value", "low", "high"]]], rel=1e-3
+    )
+
+
 def test_what_cannot_be_calibrated_is_refused() -> None:
     log = recorded(drive(None, duration_s=3.0))
     with pytest.raises(
@@ -99,6 +110,13 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         fl.calibrate(log, "ekf", fixed=["lever_z_m"])
     with pytest.raises(fl.BadInput, match="calibrate: by is for tune"):
         fl.calibrate(log, "ekf", by="rmse")
+    bounds = {"lever_x_m": (0.1, 2.0)}
+    with pytest.raises(
+        fl.BadInput,
+        match=r"--bound lever_x_m=0.1:2: the search starts from 0, which must lie between; give other "
+        r"bounds, or --set lever_x_m=...",
+    ):
+        fl.calibrate(log, "ekf", bounds=bounds)
     without = replace(
         log, streams={name: log.streams[name] for name in log.streams if "fix" not in name}
     )
