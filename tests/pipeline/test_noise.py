@@ -1,6 +1,8 @@
 """Noise of sensors: the reference sheet's numbers, what is found, said, written and refused."""
 
+import io
 import json
+import tarfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -205,6 +207,20 @@ def test_the_command_writes_what_others_read(
     assert f"gyroscope_noise_density: {white:.6g}" in Path("noise/kalibr-imu.yaml").read_text()
     assert f"setGyroscopeCovariance(I_3x3 * {white**2:.6g})" in Path("noise/gtsam.cpp").read_text()
     assert json.loads(Path("noise/result.json").read_text())["experiment"] == "noise"
+
+
+def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: Path) -> None:
+    """An ADIS16405 at rest, 10,000 s; read where it lies, and left there: its licence is CC BY-NC-SA."""
+    archive = real_data / "sensors" / "sensors-data.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    with tarfile.open(archive) as members:
+        file = members.extractfile("./adis16405/imu1_blocks_of_20.npy")
+        assert file is not None
+        turn_radps = np.radians(np.load(io.BytesIO(file.read()))[:, 1].astype(float))
+    found = fl.noise(study.at_rest(turn_radps, 0.2), study.TURN, sheet={"turn_radps": "2 deg/sqrt(h)"})
+    assert any("yours 1.28 (" in note for note in found.notes)
+    assert len(found.densities.doubts) == 1
 
 
 def test_bad_input_is_a_sentence() -> None:
