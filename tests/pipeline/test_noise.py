@@ -206,6 +206,9 @@ def test_the_command_writes_what_others_read(
     assert float(px4["EKF2_GYR_NOISE"]) == pytest.approx(10 * white, rel=1e-5)
     assert f"gyroscope_noise_density: {white:.6g}" in Path("noise/kalibr-imu.yaml").read_text()
     assert f"setGyroscopeCovariance(I_3x3 * {white**2:.6g})" in Path("noise/gtsam.cpp").read_text()
+    shown = fuselog("info", "noise/timeline.rrd", "--json").json["entities"]
+    drawn = {name.rpartition("/")[2].replace("\\", "") for name in shown if "/curves/5/" in name}
+    assert {"measured", "95 % from", "95 % to", "fitted model"} <= drawn
     assert json.loads(Path("noise/result.json").read_text())["experiment"] == "noise"
 
 
