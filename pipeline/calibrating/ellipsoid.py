@@ -69,8 +69,9 @@ class Ellipsoid:
 
     @property
     def left_open(self) -> list[str]:
-        """What the readings do not determine."""
-        return [NAMES[place] for place in self.fitted.lacking.places]
+        """What the readings do not determine: all, where they are of too few sides for any ellipsoid."""
+        places = self.fitted.lacking.places
+        return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
 
     @property
     def table(self) -> pd.DataFrame:
@@ -116,14 +117,15 @@ class Ellipsoid:
                 f"the unit was turned {turned}; that does not determine {', '.join(self.left_open)}: "
                 f"they have no value; turn it {others}"
             )
-        said.append(
-            f"{len(self.readings)} readings: their lengths differ from {self.length:.5g} {unit} by "
-            f"{before:.3g} {unit} as they are, by {after:.3g} {unit} corrected (root mean square)"
-        )
+        else:
+            said.append(
+                f"{len(self.readings)} readings: their lengths differ from {self.length:.5g} {unit} by "
+                f"{before:.3g} {unit} as they are, by {after:.3g} {unit} corrected (root mean square)"
+            )
         if self.is_assumed:
             said.append(
-                f"no --length was given: {self.length:.5g} {unit} is that of the readings about their "
-                "middle, so that scales are right among each other"
+                f"no --length was given: with {self.length:.5g} {unit} the mean of the scales is one; "
+                "only their ratios count"
             )
         if fitted.correlation:
             said.append(
@@ -180,8 +182,8 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     Args:
         logs: paths, logs that were opened, or recordings, of one unit that is turned to all sides.
         field: which, as `/imu.magnetic_field_ut`.
-        length: of the vector, in the field's unit; by default gravity's of a specific force, else the
-            median of the readings about their middle.
+        length: of the vector, in the field's unit; by default gravity's of a specific force, else what
+            makes the mean of the scales one.
 
     Raises BadInput where a log has no such field, or too few readings.
     """
@@ -197,16 +199,17 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
     readings = readings[:: -(-len(readings) // MOST)]
     topic, _, name = field.rpartition(".")
     _, unit = middle(readings)
+    fitted = fit(readings / unit)
     stated = GRAVITY_MPS2 if length is None and unit_of(name) == "m/s^2" else length
     return Ellipsoid(
         topic,
         name,
         [source.name for source in sources],
-        unit if stated is None else stated,
+        unit / float(np.mean(fitted.numbers[3:6])) if stated is None else stated,
         stated is None,
         unit,
         readings,
-        fit(readings / unit),
+        fitted,
     )
 
 

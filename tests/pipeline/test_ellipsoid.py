@@ -41,7 +41,17 @@ def test_settings_correct_the_log() -> None:
     relative = fl.ellipsoid(log, study.FIELD)
     assert relative.offset == pytest.approx(found.offset, rel=1e-6)
     assert relative.matrix / relative.length == pytest.approx(found.matrix / found.length, rel=1e-6)
+    assert np.trace(relative.matrix) == pytest.approx(3.0)
     assert any("no --length was given" in each for each in relative.notes)
+
+
+def test_readings_of_one_side_determine_nothing() -> None:
+    log = study.recorded("magnetometer", 1)
+    stream = log.streams["/imu"]
+    is_near = stream["magnetic_field_ut"] @ [1.0, 0.0, 0.0] > 44.0
+    found = fl.ellipsoid(fl.Recording([stream.take(np.flatnonzero(is_near))]), study.FIELD)
+    assert "to too few sides; that does not determine offset_x" in found.notes[0]
+    assert found.left_open == list(NAMES)
 
 
 @pytest.mark.parametrize("axis", [0, 2])
