@@ -21,6 +21,8 @@ from pipeline.api.replays import replay as replay
 from pipeline.api.trajectories import Evaluation as Evaluation
 from pipeline.api.trajectories import evaluate as evaluate
 from pipeline.calibrating.calibrating import calibrate as calibrate
+from pipeline.calibrating.ellipsoid import Ellipsoid as Ellipsoid
+from pipeline.calibrating.ellipsoid import ellipsoid as ellipsoid
 from pipeline.comparing.comparing import Differences as Differences
 from pipeline.comparing.comparing import compare as compare
 from pipeline.deploying.deploying import deploy as deploy

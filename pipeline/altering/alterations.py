@@ -58,6 +58,11 @@ def _scaled(field: str, entry: int | None, stream: Stream, factor: float) -> Str
     return _with(stream, **{field: column})
 
 
+def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]:
+    """A vector is multiplied by a matrix, as where a sensor's axes are not at right angles."""
+    return lambda stream: _with(stream, **{field: stream[field] @ matrix.T})
+
+
 def spread(field: str) -> Alteration:
     """A covariance is multiplied, that of standard deviations e^value times as large."""
     return partial(_spread, field)

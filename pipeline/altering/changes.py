@@ -27,6 +27,8 @@ WHATS = {
     "FIELD_bias": "The field is too large by it, and is reduced by it.",
     "FIELD_drift": "The field is too large by it for every s since the run's begin, and is reduced so.",
     "FIELD_axes": "The order of the vector's entries: yx, where x and y are exchanged.",
+    "FIELD_matrix": "The vector is multiplied by this matrix, nine numbers by rows, as `fuselog "
+    "ellipsoid` finds it.",
     "FIELD_turn": "The vector is turned about the vertical by this angle (rad), and is turned back.",
     "heading_bias": "The heading of orientations, or of a prior, is too large by it (rad); they have "
     "heading_scale and heading_drift as well.",
@@ -246,7 +248,7 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
     of_heading = _of_heading(given, first_ns)
     if of_heading is not None:
         return of_heading
-    if not name or what not in ("scale", "bias", "drift", "axes", "turn"):
+    if not name or what not in ("scale", "bias", "drift", "axes", "matrix", "turn"):
         known = f"of a topic can be set {', '.join(WHATS)}"
         raise BadInput(f"--set {given.key}: {known}; {choices(given.what, list(WHATS))}")
     full, (field_, entry) = _field(given, name)
@@ -264,6 +266,8 @@ def _of_column(given: _Setting, first_ns: int) -> Callable[[Stream], Stream]:
         return partial(_by, alter.ramped(first_ns, field_, entry), -rate)
     if what == "axes":
         return partial(_by, alter.permuted(field_, _order(given, field_)), 0.0)
+    if what == "matrix":
+        return _matrix(given, field_)
     if entry is not None or not field_.startswith(("position", "velocity")):
         raise BadInput(f"--set {given.key}: only positions and velocities are turned, as position_turn")
     angle = given.number("turn_rad", "an angle in rad, such as 0.1 or 5 deg")
@@ -277,6 +281,15 @@ def _order(given: _Setting, field_: str) -> list[int]:
     if sorted(order) != list(range(len(order))) or len(order) < 2:
         raise given.refused(f"the order of the entries of {field_}, such as yx or yxz")
     return order
+
+
+def _matrix(given: _Setting, field_: str) -> Callable[[Stream], Stream]:
+    """The matrix that a vector of three entries is multiplied by."""
+    example = "nine numbers by rows, such as 1,0,0,0,1,0,0,0,1"
+    if given.empty[field_].shape[1:] != (3,):
+        raise BadInput(f"--set {given.key}: {field_} is no vector of three entries; leave it out")
+    numbers = [_plain(given, text, example) for text in given.several((9,), example)]
+    return alter.mixed(field_, np.reshape(numbers, (3, 3)))
 
 
 def _by(alteration: alter.Alteration, value: float, stream: Stream) -> Stream:

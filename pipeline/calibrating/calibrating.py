@@ -9,6 +9,7 @@ from typing import Any
 
 from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
+from pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from pipeline.calibrating.manoeuvres import advice
 from pipeline.tuning.outcome import Tuning
 from pipeline.tuning.tuning import tune
@@ -71,4 +72,7 @@ def calibrate(
             raise BadInput(f"--fixed {name}: is not of the calibration; it is {', '.join(marked)}")
     free = [name for name in marked if name not in fixed]
     found = tune(logs, estimator, free, set=set, **options)
-    return replace(found, advice=advice(found)) if next_motion else found
+    names = [each.name for each in found.found.coordinates.free]
+    values = dict(zip(names, found.found.optimum.tolist(), strict=True))
+    files = {FILE: kalibr_yaml(values, found.found.held)}
+    return replace(found, advice=advice(found) if next_motion else (), files=files)

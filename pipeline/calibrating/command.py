@@ -1,12 +1,20 @@
-"""The command `fuselog calibrate`: it prints what was found, and writes the result folder."""
+"""The commands `fuselog calibrate` and `ellipsoid`: what is printed and written."""
 
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipeline.calibrating.calibrating import calibrate
+from pipeline.calibrating.ellipsoid import ellipsoid
+from pipeline.logs.folders import logs_in
+from pipeline.output.outputs import check_outputs
+from pipeline.output.terminal import print_json, print_table, say
 from pipeline.tuning.command import tune_logs
+from recorders.log import open_log
+from replay.engine.streams.sources import LogSource
 
 
 def calibrate_logs(
@@ -14,3 +22,35 @@ def calibrate_logs(
 ) -> None:
     """Search a model's calibration; `fixed`, `next_motion` as of `calibrate`, others of `tune_logs`."""
     tune_logs(logs, search=partial(calibrate, fixed=fixed, next_motion=next_motion), **options)
+
+
+def show_ellipsoid(
+    logs: Sequence[Path],
+    field: str,
+    *,
+    length: float | None,
+    out: Path | None,
+    recover: bool,
+    as_json: bool,
+) -> None:
+    """Print a table of numbers with intervals, then sentences."""
+    paths = [log for path in logs for log in logs_in(path)]
+    check_outputs(out, None, {"log": paths})
+    sources = [LogSource(open_log(path, recover=recover)) for path in paths]
+    found = ellipsoid(sources, field, length=length)
+    written = [str(found.save(out).folder)] if out is not None else []
+    table = found.table.replace({np.nan: None})
+    if as_json:
+        print_json(
+            {
+                "logs": [str(path) for path in paths],
+                "parameters": table.to_dict("records"),
+                "settings": found.settings,
+                "notes": found.notes,
+                "written": written,
+            }
+        )
+        return
+    print_table(("parameter", "value", "95 % from", "to"), table.to_numpy().tolist())
+    for sentence in [*found.notes, *written]:
+        say(sentence)

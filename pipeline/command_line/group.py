@@ -29,8 +29,8 @@ for each in (
     replaying.deploy,
     *(judging.evaluate, judging.compare, judging.diagnose, judging.stress, judging.observability),
     *(experiments.run, experiments.sweep, experiments.report),
-    *(logs.info, logs.lint, logs.noise, logs.view, logs.export, logs.cut, logs.merge),
-    *(logs.constrain, logs.relabel),
+    *(logs.info, logs.lint, logs.noise, logs.ellipsoid, logs.view, logs.export),
+    *(logs.cut, logs.merge, logs.constrain, logs.relabel),
     *(
         lists.scenarios,
         lists.models,

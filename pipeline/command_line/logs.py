@@ -92,6 +92,33 @@ def noise(log: Path, topics: tuple[str, ...], sheet: tuple[str, ...], **options:
 
 
 @command(
+    "Calibrate a magnetometer or an accelerometer that was turned.",
+    "fuselog ellipsoid turned.mcap --field /imu.magnetic_field_ut --length 48.5",
+    "fuselog ellipsoid positions.mcap --field /imu.specific_force_mps2",
+)
+@click.argument("logs", nargs=-1, required=True, type=ANY_PATH)
+@click.option("--field", required=True, metavar="TOPIC.FIELD", help="The vector that is calibrated.")
+@click.option(
+    "--length",
+    type=click.FloatRange(min=0, min_open=True),
+    help="The length of the vector, in the field's unit [default: gravity's, else the readings' own].",
+)
+@click.option("--out", type=RESULT, help="A result folder to write: the table, and lengths as a figure.")
+@recover_option
+@json_option
+def ellipsoid(logs: tuple[Path, ...], field: str, **options: Any) -> None:
+    """Find offsets, scales and cross terms of a sensor by LOGS, in which it is turned to all sides.
+
+    The Earth's magnetic field and gravity have one length, so readings lie on an ellipsoid. An
+    accelerometer is held still in each position. What the turns do not determine is named, and has no
+    value.
+    """
+    from pipeline.calibrating.command import show_ellipsoid
+
+    show_ellipsoid(list(logs), field, **options)
+
+
+@command(
     "Say what is wrong with a log as it is written.",
     "fuselog lint run.mcap",
     "fuselog lint run.mcap --set /imu.turn_rate_scale=0.01745",

@@ -161,8 +161,32 @@ class SensorNoise:
         title = "slopes: -1 quantised angle, -1/2 white noise, 0 least, +1/2 random walk, +1 ramp"
         return Chart(title=title, panels=panels, columns=min(3, len(panels)))
 
+    def draw(self, rrd: Path) -> None:
+        """Write the curves to an .rrd file for the viewer."""
+        from replay.timeline.drawing.canvas import MUTED, PALETTE
+        from replay.timeline.drawing.curves import CurvePanel, save_curves
+        from replay.timeline.drawing.plane import Stroke
+
+        interval_stroke = Stroke(MUTED, 1.0)
+        strokes = {
+            "measured": Stroke(PALETTE[0], 1.5),
+            "95 % from": interval_stroke,
+            "95 % to": interval_stroke,
+            "fitted model": Stroke(PALETTE[1], 1.0),
+        }
+        panels = []
+        for name, of_column in self.curves.groupby("column", sort=False):
+            taus_s = of_column["tau_s"].to_numpy()
+            columns = zip(strokes, ("deviation", "low", "high", "model"), strict=True)
+            curves = {
+                each: np.stack([taus_s, of_column[key].to_numpy()], axis=1) for each, key in columns
+            }
+            title = f"{name}: Allan deviation over averaging time (s)"
+            panels.append(CurvePanel(title, curves, strokes))
+        save_curves(f"noise of {self.name}", panels, rrd)
+
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write tables, the curves' figure, and the numbers as other programs read them.
+        """Write tables, the curves as figure and timeline, and the numbers as other programs read them.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -175,6 +199,7 @@ class SensorNoise:
                 outcome.measure(f"noise.{name}.{column.name.replace('.', '_')}", *number)
         settings = {"title": f"Noise of {self.name}", "logs": [self.name], "notes": self.notes}
         with result_folder(place) as part:
+            self.draw(part / "timeline.rrd")
             for name, text in FILES.items():
                 written = text(self.densities)
                 if written:

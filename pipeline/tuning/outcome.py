@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -50,6 +50,7 @@ class Tuning:
         folds: a row per fold: the values by all other logs, and what its own logs cost with them.
         gate: the probability of the gate that was open in the search.
         advice: sentences on what to record next.
+        files: texts that are written beside the settings, by their names.
     """
 
     label: str
@@ -63,6 +64,7 @@ class Tuning:
     folds: pd.DataFrame
     gate: float
     advice: Sequence[str] = ()
+    files: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         title = f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}"
@@ -347,7 +349,8 @@ class Tuning:
             "gap_limit_s": self.objective.gap_limit_s,
         }
         with result_folder(place) as part:
-            (part / SETTINGS).write_text(self.toml, encoding="utf-8")
+            for name, text in {SETTINGS: self.toml, **self.files}.items():
+                (part / name).write_text(text, encoding="utf-8")
             self.replay.view(save=part / "timeline.rrd")
             return ResultFolder(place, write_outcome(part, "tune", settings, outcome))
 

@@ -215,15 +215,15 @@ def _free(name: str, given: tuple[float, float] | None, source: Source, bound: B
     except BadInput as error:
         raise BadInput(f"--free {name}: {error}") from None
     start, is_assumed = value_at_start(name, source, bound)
-    is_positive = least >= 0.0 or (given is not None and given[0] > 0.0)
-    if is_positive and start <= 0.0:
+    useful = 0.0
+    if least < 0.0 and isinstance(bound, Recursive) and bound.reading is not None:
+        useful = bound.reading().calibration.get(name, 0.0)
+    is_positive = least >= 0.0 or (given is not None and given[0] > 0.0 and not useful)
+    if is_positive and start <= 0.0 and given is None:
         raise BadInput(
             f"--free {name}: its logarithm is searched for, and it starts from {start:g}; give a start "
             f"above zero, --set {name}=..."
         )
-    useful = 0.0
-    if not is_positive and isinstance(bound, Recursive) and bound.reading is not None:
-        useful = bound.reading().calibration.get(name, 0.0)
     low, high = given or ((start / REACH, start * REACH) if is_positive else (least, greatest))
     if not (low < start < high and (low > 0.0 if is_positive else low >= least)):
         raise BadInput(

@@ -19,6 +19,7 @@ from mcap.writer import Writer
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from pipeline.calibrating.ellipsoid_study import recorded
 from pipeline.command_line.group import fuselog
 from pipeline.command_line.options import Output
 from recorders.log import make_stream, schemas, write_log
@@ -50,6 +51,7 @@ QUICK = {
     "run": "run dead.toml --runs 1",
     "sweep": "sweep dead.toml --over duration_s=1,2 --runs 1",
     "noise": "noise rest.mcap",
+    "ellipsoid": "ellipsoid turned.mcap --field /imu.magnetic_field_ut",
     "report": "report result",
     "view": "view run.mcap",
     "export": "export run.mcap --to csv",
@@ -157,6 +159,7 @@ def prepare() -> None:
             )
         ],
     )
+    write_log("turned.mcap", [*recorded("magnetometer", 1).streams.values()])
     Path("dead.toml").write_text(EXPERIMENT)
     Path("settings.toml").write_text("")
     Path("line.tum").write_text("".join(f"{time} {time} 0 0 0 0 0 1\n" for time in range(9)))

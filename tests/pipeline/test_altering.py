@@ -199,6 +199,7 @@ def test_of_a_model_that_is_not_registered_the_line_is_python(run: fl.MemorySour
         (f"{SEEN}.delay_s=3 m", "the unit 'm' does not fit"),
         (f"{SEEN}.speed_scale=2", "has no field speed; there are: range_m, bearing_rad"),
         (f"{SEEN}.range_scale=inf", "expected a factor, such as -1 or 3.6"),
+        (f"{SEEN}.range_matrix=1", "range_m is no vector of three entries"),
         (f"{SEEN}.range_sign=2", "of a topic can be set"),
         (f"{SEEN}.origin=1,2", "only positions and geodetic fixes have an origin"),
         (f"{SEEN}.exchanged={ODOMETRY}", "only topics of one type are exchanged"),

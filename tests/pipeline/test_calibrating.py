@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 import fuselog as fl
 from pipeline.calibrating import study
@@ -23,9 +24,11 @@ from pipeline.calibrating.car import (
     slalom,
     straight,
 )
+from pipeline.calibrating.kalibr import FILE, kalibr_yaml
 from pipeline.calibrating.manoeuvres import advice, gain
 from pipeline.tuning.information import information
 from pipeline.tuning.objective import in_memory
+from recorders.models.inertial import from_mounting
 from replay.engine.replaying.estimator import bind
 
 A_V, A_W, B_W = TRUTH[:3]
@@ -56,6 +59,9 @@ def test_the_car_of_the_sheet() -> None:
     assert errors[3:] == pytest.approx(sigma[3:], rel=0.02)
     assert -found.costs[1] == pytest.approx(1304.018371, abs=0.5)
     assert not found.found.held
+    assert yaml.safe_load(found.files[FILE])["fix"]["timeshift_sensor_body"] == pytest.approx(
+        -0.1637, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,6 +97,31 @@ def test_what_the_motion_does_not_determine_is_named_and_held(
     assert np.all(computed[: 7 - known] < 1e-3)
 
 
+def test_kalibr_is_told_what_sensors_measure() -> None:
+    """A point on the unit's forward axis, and a heading, are as the models have them."""
+    angles, point = (0.3, -0.2, 1.1), np.array([1.0, 2.0, 3.0])
+    names = ("mounting_roll_rad", "mounting_pitch_rad", "mounting_yaw_rad")
+    values = dict(zip(names, angles, strict=True)) | {"lever_x_m": 1.2, "velocity_delay_s": 0.1}
+    told = yaml.safe_load(kalibr_yaml(values | {"turn_scale": 1.02}, ["lever_x_m"]))
+    in_body = np.array(from_mounting(*angles, tuple(point)))
+    in_sensor = np.array(told["inertial"]["T_sensor_body"]) @ [*in_body, 1.0]
+    assert in_sensor == pytest.approx([*point, 1.0], abs=1e-5)
+    assert np.array(told["fix"]["T_sensor_body"]) @ [1.2, 0.0, 0.0, 1.0] == pytest.approx([0, 0, 0, 1])
+    assert told["velocity"] == {"timeshift_sensor_body": -0.1}
+    assert told["errors"] == {"turn_scale": 1.02}
+
+
+def test_bounds_above_zero_leave_a_parameter_its_intervals() -> None:
+    """The search goes over the lever arm itself, not over its logarithm."""
+    log, known = recorded(drive(1, duration_s=30.0)), [*NAMES[:3], *NAMES[4:]]
+    given = {"fixed": known, "set": OPEN | dict(zip(NAMES, OURS.tolist(), strict=True))}
+    found = fl.calibrate(log, "ekf", bounds={"lever_x_m": (0.1, 3.0)}, **given).parameters.iloc[0]
+    alone = fl.calibrate(log, "ekf", **given).parameters.iloc[0]
+    assert [*found[["value", "low", "high"]]] == pytest.approx(
+        [*alone[["value", "low", "high"]]], rel=1e-3
+    )
+
+
 def test_what_cannot_be_calibrated_is_refused() -> None:
     log = recorded(drive(None, duration_s=3.0))
     with pytest.raises(
@@ -99,6 +130,13 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         fl.calibrate(log, "ekf", fixed=["lever_z_m"])
     with pytest.raises(fl.BadInput, match="calibrate: by is for tune"):
         fl.calibrate(log, "ekf", by="rmse")
+    bounds = {"lever_x_m": (0.1, 2.0)}
+    with pytest.raises(
+        fl.BadInput,
+        match=r"--bound lever_x_m=0.1:2: the search starts from 0, which must lie between; give other "
+        r"bounds, or --set lever_x_m=...",
+    ):
+        fl.calibrate(log, "ekf", bounds=bounds)
     without = replace(
         log, streams={name: log.streams[name] for name in log.streams if "fix" not in name}
     )

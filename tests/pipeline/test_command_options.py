@@ -195,6 +195,7 @@ COMMANDS_ELSEWHERE = {
     "compare": ("test_comparing", "test_trajectories", "test_stressing"),
     "deploy": ("test_deploying",),
     "diagnose": ("test_battery", "test_diagnosing", "test_outputs"),
+    "ellipsoid": ("test_ellipsoid",),
     "evaluate": ("test_trajectories", "test_command_line"),
     "explore": ("test_exploring",),
     "import": ("test_table_import", "test_ros_import", "../recorders/test_ulog"),

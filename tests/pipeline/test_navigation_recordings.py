@@ -3,6 +3,7 @@
 import re
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,3 +95,44 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
         rates, right = (each.streams["/inertial"]["turn_rate_radps"] for each in (mended, walk))
         assert np.allclose(rates[:1000], right[:1000], rtol=1e-3)
     assert len(sought) == 2
+
+
+@pytest.mark.paper
+def test_the_delay_of_a_receiver_is_found(navigation: Path) -> None:
+    """The mapping's own delay is taken back. The velocity is late, so the search starts above zero."""
+    walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
+    start = {"/velocity.delay_s": -0.125, "velocity_delay_s": 0.05}
+    [found] = fl.tune(walk, "ekf", "velocity_delay_s", set=start).parameters.to_dict("records")
+    assert 0.125 <= found["value"] <= 0.15
+    assert found["low"] < found["value"] < found["high"] < 0.15
+
+
+DENSITIES = {
+    "force_noise_density": 0.12,
+    "gyro_noise_density": 0.002,
+    "force_bias_density": 0.02,
+    "gyro_bias_density": 1e-4,
+}
+PLACE = {"origin_latitude_deg": 32.805, "origin_altitude_m": 0.0}
+
+
+@pytest.mark.paper
+@pytest.mark.parametrize(("path", "offset_s"), [(1, -0.75), (3, -0.10), (9, -0.45)])
+def test_the_clock_of_a_unit_is_found_from_zero(navigation: Path, path: int, offset_s: float) -> None:
+    """By the true positions; 2 s at both ends are left out, that all delays explain the same ones."""
+    log = fl.import_("table", navigation / "quad_mimu" / f"path_{path}", mapping="quadrotor", seed=1)
+    truth = log.streams["/truth"]
+    stamps_ns = truth.publish_time_ns
+    inside = (stamps_ns > stamps_ns[0] + 2e9) & (stamps_ns < stamps_ns[-1] - 2e9)
+    fix = fl.make_stream(
+        "/fix",
+        fl.schemas.POSITION_FIX,
+        stamps_ns[inside],
+        metadata=log.streams["/fix"].metadata,
+        position_m=truth["state"][inside, :3],
+        covariance_m2=np.tile(0.25 * np.eye(3).ravel(), (int(inside.sum()), 1)),
+    )
+    given = {"topics": {"inertial": "/imu1/inertial"}, **DENSITIES, **PLACE}
+    log = replace(log, streams={**log.streams, "/fix": fix})
+    found = fl.tune(log, "ekf", "inertial_delay_s", set=given).parameters["value"].iloc[0]
+    assert -found == pytest.approx(offset_s, abs=0.075)

@@ -1,6 +1,8 @@
 """Noise of sensors: the reference sheet's numbers, what is found, said, written and refused."""
 
+import io
 import json
+import tarfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -204,7 +206,24 @@ def test_the_command_writes_what_others_read(
     assert float(px4["EKF2_GYR_NOISE"]) == pytest.approx(10 * white, rel=1e-5)
     assert f"gyroscope_noise_density: {white:.6g}" in Path("noise/kalibr-imu.yaml").read_text()
     assert f"setGyroscopeCovariance(I_3x3 * {white**2:.6g})" in Path("noise/gtsam.cpp").read_text()
+    shown = fuselog("info", "noise/timeline.rrd", "--json").json["entities"]
+    drawn = {name.rpartition("/")[2].replace("\\", "") for name in shown if "/curves/5/" in name}
+    assert {"measured", "95 % from", "95 % to", "fitted model"} <= drawn
     assert json.loads(Path("noise/result.json").read_text())["experiment"] == "noise"
+
+
+def test_a_real_unit_is_compared_with_its_sheet_and_its_misfit_said(real_data: Path) -> None:
+    """An ADIS16405 at rest, 10,000 s; read where it lies, and left there: its licence is CC BY-NC-SA."""
+    archive = real_data / "sensors" / "sensors-data.tar.xz"
+    if not archive.exists():
+        pytest.skip(f"no {archive}")
+    with tarfile.open(archive) as members:
+        file = members.extractfile("./adis16405/imu1_blocks_of_20.npy")
+        assert file is not None
+        turn_radps = np.radians(np.load(io.BytesIO(file.read()))[:, 1].astype(float))
+    found = fl.noise(study.at_rest(turn_radps, 0.2), study.TURN, sheet={"turn_radps": "2 deg/sqrt(h)"})
+    assert any("yours 1.28 (" in note for note in found.notes)
+    assert len(found.densities.doubts) == 1
 
 
 def test_bad_input_is_a_sentence() -> None:
@@ -254,8 +273,8 @@ def test_the_study_counts_the_intervals_that_hold_the_truth(monkeypatch: pytest.
     assert found["noise.spread.0-white"] == pytest.approx(np.std(np.log([1, 2, 3, 4]), ddof=1))
 
 
-@pytest.mark.parametrize("name", ["sensor-noise", "calibration"])
+@pytest.mark.parametrize("name", ["sensor-noise", "calibration", "ellipsoid"])
 def test_of_a_hundred_intervals_ninety_to_ninety_nine_hold_the_truth(name: str) -> None:
     covered = {key: each for key, each in stored()[name].metrics.items() if ".covered." in key}
-    assert len(covered) == {"sensor-noise": 10, "calibration": 14}[name]
+    assert len(covered) == {"sensor-noise": 10, "calibration": 14, "ellipsoid": 36}[name]
     assert {key: each for key, each in covered.items() if not 90 <= each <= 99} == {}

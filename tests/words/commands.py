@@ -42,6 +42,8 @@ tune run.mcap -e ekf --free sigma_range_m --validate other.mcap
 calibrate run.mcap -e ekf
 deploy run.mcap -e smoother:ekf -o never
 noise run.mcap
+ellipsoid car.mcap --field /body/inertial.specific_force_mps2
+ellipsoid car.mcap --field /body/inertial
 check run.mcap --against ekf.golden.xz --update -e ekf
 check run.mcap --against ekf.golden.xz
 check other.mcap --against ekf.golden.xz

@@ -1,0 +1,239 @@
+"""The calibration of a magnetometer or an accelerometer by turning it: offsets, scales, cross terms.
+
+The field of the Earth and gravity have one length, whichever way a unit is turned. So corrected readings
+lie on a sphere, and readings on an ellipsoid, see `ellipsoid_fit`.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pipeline.api.api import ResultFolder
+from pipeline.api.planning import Log, sources_of
+from pipeline.calibrating.ellipsoid_fit import AXES, NAMES, Fit, fit, matrix_of, middle
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.output.outputs import check_folder
+from pipeline.output.results import Outcome, result_folder, write_outcome
+from pipeline.sensing.units import unit_of
+from pipeline.tuning.confidence import QUANTILE
+from recorders.errors import BadInput, choices
+from replay.engine.streams.sources import LogSource, MemorySource
+
+Floats = NDArray[np.float64]
+GRAVITY_MPS2 = 9.80665
+FEWEST, MOST = 30, 20_000  # readings; of more, one in so many is taken
+_STILL_S = 0.5  # of an accelerometer, readings are means over so long in which it is still
+_STILL = 3.0  # times the spread of the quietest tenth
+_DRAWN = 500
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Ellipsoid:
+    """Holds the calibration of a sensor that was turned: corrected = matrix (reading - offset).
+
+    Attributes:
+        topic, field: where the readings stand.
+        logs: the names of the logs.
+        length: what corrected readings have.
+        is_assumed: whether that is the readings' own, which no one stated.
+        unit: a factor of what the fit calls one.
+        readings: (n, 3) that were fitted.
+        fitted: the ellipsoid.
+    """
+
+    topic: str
+    field: str
+    logs: Sequence[str]
+    length: float
+    is_assumed: bool
+    unit: float
+    readings: Floats
+    fitted: Fit
+
+    def __repr__(self) -> str:
+        return "\n".join([self.table.to_string(index=False), *self.notes])
+
+    @property
+    def offset(self) -> Floats:
+        """(3,) in the field's unit; a magnetometer's hard iron, an accelerometer's bias."""
+        return self.unit * self.fitted.numbers[:3]
+
+    @property
+    def matrix(self) -> Floats:
+        """(3, 3), symmetric; a magnetometer's soft iron, an accelerometer's scales and misalignment."""
+        return matrix_of(self.fitted.numbers) * self.length / self.unit
+
+    @property
+    def left_open(self) -> list[str]:
+        """What the readings do not determine: all, where they are of too few sides for any ellipsoid."""
+        places = self.fitted.lacking.places
+        return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """A row per number: value and 95 % interval; none of what is not determined."""
+        factors = np.where(np.arange(len(NAMES)) < 3, self.unit, self.length / self.unit)
+        values = self.fitted.numbers * factors
+        reach = QUANTILE * np.sqrt(np.diagonal(self.fitted.covariance)) * factors
+        is_open = np.isin(NAMES, self.left_open)
+        numbers = {"value": values, "low": values - reach, "high": values + reach}
+        known = {name: np.where(is_open, np.nan, column) for name, column in numbers.items()}
+        return pd.DataFrame({"parameter": NAMES, **known})
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What corrects the readings of a log, for `set`; nothing where something is not determined."""
+        if self.left_open:
+            return {}
+        stem, _, unit = self.field.rpartition("_")
+        corrected = {
+            f"{self.topic}.{stem}_{axis}_{unit}_bias": f"{value:.6g}"
+            for axis, value in zip(AXES, self.offset, strict=True)
+        }
+        rows = ",".join(f"{value:.6g}" for value in self.matrix.ravel())
+        return corrected | {f"{self.topic}.{self.field}_matrix": rows}
+
+    @property
+    def lengths(self) -> tuple[Floats, Floats]:
+        """The lengths (n,) of readings as they are, and corrected."""
+        corrected = (self.readings - self.offset) @ self.matrix
+        return np.linalg.norm(self.readings, axis=1), np.linalg.norm(corrected, axis=1)
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences: what is not determined, how well it fits, how it is applied."""
+        unit, fitted = unit_of(self.field), self.fitted
+        before, after = (float(np.sqrt(np.mean((each - self.length) ** 2))) for each in self.lengths)
+        said = []
+        if self.left_open:
+            axis = fitted.turned_about
+            turned = f"about one axis only, near {axis}" if axis else "to too few sides"
+            others = f"about {' or '.join(AXES.replace(axis, ''))} as well" if axis else "to all sides"
+            said.append(
+                f"the unit was turned {turned}; that does not determine {', '.join(self.left_open)}: "
+                f"they have no value; turn it {others}"
+            )
+        else:
+            said.append(
+                f"{len(self.readings)} readings: their lengths differ from {self.length:.5g} {unit} by "
+                f"{before:.3g} {unit} as they are, by {after:.3g} {unit} corrected (root mean square)"
+            )
+        if self.is_assumed:
+            said.append(
+                f"no --length was given: with {self.length:.5g} {unit} the mean of the scales is one; "
+                "only their ratios count"
+            )
+        if fitted.correlation:
+            said.append(
+                f"errors of one reading and the next correlate by {fitted.correlation:.2g}; that widens "
+                "the intervals"
+            )
+        if self.settings:
+            words = " ".join(f"--set {name}={value}" for name, value in self.settings.items())
+            said.append(f"corrected = matrix (reading - offset): fuselog replay {words}")
+        return said
+
+    @property
+    def chart(self) -> Chart:
+        """The lengths of the readings, as they are and corrected."""
+        rows = np.linspace(0, len(self.readings) - 1, min(_DRAWN, len(self.readings))).astype(int)
+        before, after = (each[rows] for each in self.lengths)
+        panel = Panel(
+            x=Axis(label="reading"),
+            y=Axis(label=f"length ({unit_of(self.field) or 'unit'})"),
+            series=[
+                curve("as they are", rows, before, "markers"),
+                curve("corrected", rows, after, "markers"),
+                level("stated", rows, self.length),
+            ],
+        )
+        return Chart(title=f"{self.topic}.{self.field}", panels=[panel])
+
+    def save(self, folder: str | Path) -> ResultFolder:
+        """Write the table and the figure as a result folder.
+
+        Raises BadInput where something else than a result of ours is in the place.
+        """
+        place = Path(folder)
+        check_folder(place, {"log": [Path(name) for name in self.logs]})
+        outcome = Outcome(tables={"ellipsoid": self.table}, figures={"lengths": self.chart})
+        for row in self.table.dropna().to_dict("records"):
+            outcome.measure(f"ellipsoid.{row['parameter']}", row["value"], row["low"], row["high"])
+        settings = {
+            "title": f"Ellipsoid of {self.topic}.{self.field}",
+            "logs": list(self.logs),
+            "alterations": self.settings,
+            "notes": self.notes,
+        }
+        with result_folder(place) as part:
+            return ResultFolder(place, write_outcome(part, "ellipsoid", settings, outcome))
+
+
+def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = None) -> Ellipsoid:
+    """Find offsets, scales and cross terms of a magnetometer or an accelerometer that was turned.
+
+    Of an accelerometer readings are taken where it is still, as gravity is all that it senses there. The
+    matrix is symmetric: readings do not tell how the sensor's axes are turned against the body's.
+
+    Args:
+        logs: paths, logs that were opened, or recordings, of one unit that is turned to all sides.
+        field: which, as `/imu.magnetic_field_ut`.
+        length: of the vector, in the field's unit; by default gravity's of a specific force, else what
+            makes the mean of the scales one.
+
+    Raises BadInput where a log has no such field, or too few readings.
+    """
+    sources = sources_of(logs)
+    readings = np.concatenate([_readings(source, field) for source in sources])
+    if len(readings) < FEWEST:
+        raise BadInput(
+            f"{field}: has {len(readings)} readings; an ellipsoid takes {FEWEST} at least, those of an "
+            "accelerometer half a second each in which it is still"
+        )
+    if np.ptp(readings, axis=0).max() == 0.0:
+        raise BadInput(f"{field}: has {len(readings)} readings that are all alike; turn the unit")
+    readings = readings[:: -(-len(readings) // MOST)]
+    topic, _, name = field.rpartition(".")
+    _, unit = middle(readings)
+    fitted = fit(readings / unit)
+    stated = GRAVITY_MPS2 if length is None and unit_of(name) == "m/s^2" else length
+    return Ellipsoid(
+        topic,
+        name,
+        [source.name for source in sources],
+        unit / float(np.mean(fitted.numbers[3:6])) if stated is None else stated,
+        stated is None,
+        unit,
+        readings,
+        fitted,
+    )
+
+
+def _readings(source: LogSource | MemorySource, field: str) -> Floats:
+    """The readings (n, 3) of a field; of an accelerometer means where it is still."""
+    topic, _, name = field.rpartition(".")
+    if not topic:
+        raise BadInput(f"--field {field}: expected TOPIC.FIELD, as /imu.magnetic_field_ut")
+    if topic not in source.topics:
+        raise BadInput(f"{source.name}: has no topic {topic}; {choices(topic, source.topics)}")
+    stream = source.read([topic])[topic]
+    known = [each for each, column in stream.columns.items() if column.shape[1:] == (3,)]
+    if name not in known:
+        raise BadInput(f"{topic}: has no vector {name}; {choices(name, known)}")
+    is_there = np.isfinite(stream[name]).all(axis=1)
+    readings, times_s = stream[name][is_there], 1e-9 * stream.publish_time_ns[is_there]
+    return _still(readings, times_s) if unit_of(name) == "m/s^2" else readings
+
+
+def _still(readings: Floats, times_s: Floats) -> Floats:
+    """The means (m, 3) of readings (n, 3) over half seconds in which they are still."""
+    if len(readings) < FEWEST:
+        return readings[:0]
+    size = max(2, round(_STILL_S / float(np.median(np.diff(times_s)))))
+    windows = readings[: len(readings) // size * size].reshape(-1, size, 3)
+    spread = windows.std(axis=1).max(axis=1)
+    return windows.mean(axis=1)[spread <= _STILL * np.quantile(spread, 0.1)]

@@ -1,0 +1,133 @@
+"""The ellipsoid on which readings of a constant vector lie, however the unit is turned.
+
+A sensor reads m = A^-1 u + b + n of a vector u of known length, with noise n that is alike in all
+directions. The length tells b and the symmetric A, by maximum likelihood; it does not tell a rotation
+of the sensor's axes. Sets of readings that leave something open: Vasconcelos et al., IEEE T-AES 2011.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from pipeline.tuning.information import Undetermined, undetermined
+
+Floats = NDArray[np.float64]
+AXES = "xyz"
+PAIRS = (0, 1), (0, 2), (1, 2)
+NAMES = (
+    *(f"offset_{axis}" for axis in AXES),
+    *(f"scale_{axis}" for axis in AXES),
+    *(f"cross_{AXES[first]}{AXES[second]}" for first, second in PAIRS),
+)
+START = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+USEFUL = 0.01  # of the length: the standard error that a calibration wants
+_WIDE = 1.0  # of the length: how far from its start a value may well be
+_OF_A_CONIC = 5  # numbers: what readings in a plane tell at most
+_STEP = 1e-6  # of the differences
+_LEAST_SIGMA = 1e-9  # of the length
+_FLAT = 0.1  # of how far readings spread in their plane: those of turns about one axis leave it by less
+
+
+class Fit(NamedTuple):
+    """Holds the ellipsoid of readings, in units of a length that they have about their middle.
+
+    Attributes:
+        numbers: (9,) as `NAMES` has them.
+        covariance: (9, 9) of the numbers that are determined; of others it is meaningless.
+        lacking: what the readings do not determine.
+        turned_about: the axis next to the only one about which the unit was turned; empty where there
+            were several.
+        sigma: the standard deviation of the noise.
+        correlation: of the noise of a reading with that of the next.
+    """
+
+    numbers: Floats
+    covariance: Floats
+    lacking: Undetermined
+    turned_about: str
+    sigma: float
+    correlation: float
+
+
+def matrix_of(values: Floats) -> Floats:
+    """The symmetric matrix A (3, 3) of values (9,)."""
+    matrix = np.diag(values[3:6])
+    for (row, column), value in zip(PAIRS, values[6:], strict=True):
+        matrix[row, column] = matrix[column, row] = value
+    return matrix
+
+
+def middle(readings: Floats) -> tuple[Floats, float]:
+    """The middle (3,) of readings (n, 3), and their median distance from there."""
+    place = 0.5 * (readings.min(axis=0) + readings.max(axis=0))
+    return place, float(np.median(np.linalg.norm(readings - place, axis=1)))
+
+
+def fit(readings: Floats) -> Fit:
+    """Find the ellipsoid of readings (n, 3), in units of their vector's length.
+
+    >>> rng = np.random.default_rng(1)
+    >>> directions = rng.standard_normal((500, 3))
+    >>> directions /= np.linalg.norm(directions, axis=1)[:, None]
+    >>> found = fit(directions / 1.02 + [0.3, 0.0, -0.1])
+    >>> found.numbers[:4].round(3).tolist(), found.lacking.places
+    ([0.3, 0.0, -0.1, 1.02], [])
+    """
+    spreads, axes = np.linalg.eigh(np.cov(readings.T))
+    is_flat = bool(spreads[0] < _FLAT**2 * spreads[2])
+    near, normal = middle(readings)[0], axes[:, 0]
+    starts, directions = [START, np.concatenate([near, START[3:]])], np.eye(len(START))
+    if is_flat:  # else noise across the plane would be taken for the thickness of an ellipsoid
+        readings = readings - np.outer((readings - readings.mean(axis=0)) @ normal, normal)
+        starts = [np.concatenate([near + normal, START[3:] / np.sqrt(2.0)])]  # a sphere through a circle
+        derivatives = _derivatives(starts[0], readings)
+        directions = np.linalg.svd(derivatives, full_matrices=False)[2][:_OF_A_CONIC]
+    values, left, sigma = START, np.zeros(len(readings)), 0.0
+    for _ in range(2):  # the second time with the noise that the first one found
+        searches = [_search(start, directions, readings, sigma) for start in starts]
+        values = searches[int(np.argmin([cost for cost, _ in searches]))][1]
+        left = _distances(values, readings) - sigma**2
+        sigma = max(float(np.sqrt(left @ left / (len(left) - len(START)))), _LEAST_SIGMA)
+    correlation = float(left[1:] @ left[:-1]) / max(float(left @ left), _LEAST_SIGMA**2)
+    if correlation < 2.0 / np.sqrt(len(left)):
+        correlation = 0.0
+    derivatives = _derivatives(values, readings) / sigma
+    information = derivatives.T @ derivatives * (1.0 - correlation) / (1.0 + correlation)
+    lacking = undetermined(USEFUL**2 * information)
+    about = AXES[int(np.argmax(np.abs(normal)))] if is_flat else ""
+    covariance = np.linalg.inv(information + np.eye(len(START)) / _WIDE**2).astype(np.float64)
+    return Fit(values, covariance, lacking, about, sigma, correlation)
+
+
+def _distances(values: Floats, readings: Floats) -> Floats:
+    """The distances (n,) of readings from an ellipsoid, to the first order, outward positive."""
+    matrix = matrix_of(values)
+    vectors = (readings - values[:3]) @ matrix
+    lengths = np.linalg.norm(vectors, axis=1)
+    gradients = np.linalg.norm(vectors @ matrix, axis=1) / lengths
+    found: Floats = (lengths - 1.0) / gradients
+    return found
+
+
+def _derivatives(values: Floats, readings: Floats) -> Floats:
+    """The derivatives (n, 9) of the distances by the values."""
+    steps = _STEP * np.eye(len(START))
+    ways = [_distances(values + step, readings) - _distances(values - step, readings) for step in steps]
+    return np.stack(ways, axis=1) / (2.0 * _STEP)
+
+
+def _search(start: Floats, directions: Floats, readings: Floats, sigma: float) -> tuple[float, Floats]:
+    """The least cost from a start (9,) along directions (m, 9), under a wide prior; the values there.
+
+    Noise along the surface, which is curved, moves readings outward by its variance.
+    """
+
+    def residuals(along: Floats) -> Floats:
+        values = start + along @ directions
+        distances = _distances(values, readings) - sigma**2
+        return np.concatenate([distances / max(sigma, USEFUL), (values - START) / _WIDE])
+
+    found = least_squares(residuals, np.zeros(len(directions)))
+    return float(found.cost), start + found.x @ directions

@@ -1,0 +1,63 @@
+"""A calibration as Kalibr writes one: mountings, time shifts and errors of sensors, in YAML.
+
+T_sensor_body takes a point from the body's axes to the sensor's, and a message was measured at its stamp
+plus timeshift_sensor_body; Kalibr has both of a camera as T_cam_imu and timeshift_cam_imu.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FILE = "kalibr-calibration.yaml"
+HEAD = (
+    "# T_sensor_body: a point from the body's axes to the sensor's, in m, as Kalibr's T_cam_imu\n"
+    "# timeshift_sensor_body: was measured at the stamp plus this, in s, as Kalibr's timeshift_cam_imu\n"
+)
+DELAY = "_delay_s"
+LEVER = ("lever_x_m", "lever_y_m", "lever_z_m")
+MOUNTING = ("mounting_roll_rad", "mounting_pitch_rad", "mounting_yaw_rad")
+HEADING = "bias_heading_rad"
+
+
+def kalibr_yaml(values: Mapping[str, float], held: Sequence[str]) -> str:
+    """The values of a calibration by their names; of what is held it is said that nothing is known.
+
+    >>> print(kalibr_yaml({"lever_x_m": 1.2, "fix_delay_s": 0.15}, []).removeprefix(HEAD).strip())
+    fix:
+      T_sensor_body:
+      - [1, 0, 0, -1.2]
+      - [0, 1, 0, 0]
+      - [0, 0, 1, 0]
+      - [0, 0, 0, 1]
+      timeshift_sensor_body: -0.15
+    """
+    sensors: dict[str, list[str]] = {}
+    if {*LEVER} & {*values}:
+        arm = np.array([values.get(name, 0.0) for name in LEVER])
+        sensors["fix"] = _transform(np.eye(3), -arm)
+    if HEADING in values:
+        turned = Rotation.from_euler("z", values[HEADING]).as_matrix()
+        sensors["heading"] = _transform(turned.T, np.zeros(3))
+    if {*MOUNTING} & {*values}:
+        angles = [values.get(name, 0.0) for name in reversed(MOUNTING)]
+        turned = Rotation.from_euler("ZYX", angles).as_matrix()
+        sensors["inertial"] = _transform(turned.T, np.zeros(3))
+    for name, value in values.items():
+        if name.endswith(DELAY):
+            shift = f"timeshift_sensor_body: {-value:.6g}"
+            sensors.setdefault(name.removesuffix(DELAY), []).append(shift)
+        elif name not in (*LEVER, *MOUNTING, HEADING):
+            sensors.setdefault("errors", []).append(f"{name}: {value:.6g}")
+    unknown = f"# not determined, as they were at the start: {', '.join(held)}\n" if held else ""
+    blocks = [f"{name}:\n" + "".join(f"  {line}\n" for line in lines) for name, lines in sensors.items()]
+    return HEAD + unknown + "".join(blocks)
+
+
+def _transform(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> list[str]:
+    """The lines of T_sensor_body."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation, translation
+    rows = [", ".join(f"{entry + 0.0:.6g}" for entry in row) for row in matrix]
+    return ["T_sensor_body:", *(f"- [{row}]" for row in rows)]

@@ -1,0 +1,76 @@
+"""Curves over logarithms, a view for each panel: Rerun's own plots have time on their axis."""
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.canvas import Canvas, Colour
+from replay.timeline.drawing.plane import GRID, Stroke, bounds_of, draw_legend, turn_up
+from replay.timeline.sinks import open_recording
+
+
+class CurvePanel(NamedTuple):
+    """Holds the curves of a view: a name with its axes, positive places (n, 2) by curve, its strokes."""
+
+    name: str
+    curves: Mapping[str, Floats]
+    strokes: Mapping[str, Stroke]
+
+
+def save_curves(title: str, panels: Sequence[CurvePanel], rrd: Path) -> None:
+    """Write curves over logarithms as a timeline in which nothing moves.
+
+    Raises BadInput where the file cannot be written.
+    """
+    with open_recording("fuselog-curves", title, save=rrd) as recording:
+        recording.send_recording_name(title)
+        canvas = Canvas(recording, 0, 0, np.zeros(1, np.int64))
+        views = [_view(canvas, f"curves/{number}", panel) for number, panel in enumerate(panels)]
+        recording.send_blueprint(rrb.Blueprint(rrb.Grid(*views), collapse_panels=True))
+
+
+def _view(canvas: Canvas, root: str, panel: CurvePanel) -> rrb.Spatial2DView:
+    turn_up(canvas, root)
+    logs = {name: _drawn(places) for name, places in panel.curves.items()}
+    places = np.concatenate(list(logs.values()))
+    low, high = bounds_of(places)
+    _draw_decades(canvas, f"{root}/decades", low, high)
+    for name, line in logs.items():
+        canvas.fix(f"{root}/{name}", rr.LineStrips2D([line], **panel.strokes[name].fields()))
+    colours: dict[str, Colour] = {name: panel.strokes[name].colour for name in logs}
+    draw_legend(canvas, f"{root}/legend", colours, places)
+    return rrb.Spatial2DView(
+        origin="/",
+        contents=[f"{root}/**"],
+        name=panel.name,
+        visual_bounds=rrb.VisualBounds2D(x_range=(low[0], high[0]), y_range=(-high[1], -low[1])),
+    )
+
+
+def _drawn(places: Floats) -> Floats:
+    """The decimal logarithms of places (n, 2), those left out that are not positive numbers."""
+    is_there = (np.isfinite(places) & (places > 0)).all(axis=1)
+    found: Floats = np.log10(places[is_there])
+    return found
+
+
+def _draw_decades(canvas: Canvas, entity: str, low: Floats, high: Floats) -> None:
+    """Lines at the powers of ten, each with its number at the lower or left end."""
+    lines, at, labels = [], [], []
+    for axis, power in product(range(2), range(-30, 31)):
+        if low[axis] <= power <= high[axis]:
+            ends = np.stack([low, high])
+            ends[:, axis] = power
+            lines.append(ends)
+            at.append(ends[0])
+            labels.append(f"1e{power}")
+    strips = rr.LineStrips2D(lines, colors=[GRID], radii=rr.Radius.ui_points(0.5), draw_order=-1.0)
+    canvas.fix(entity, strips)
+    numbers = rr.Points2D(at, labels=labels, colors=[GRID], radii=rr.Radius.ui_points(1.0))
+    canvas.fix(f"{entity}/numbers", numbers)
