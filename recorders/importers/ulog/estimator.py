@@ -4,6 +4,7 @@ PX4's innovations are what was predicted minus what was measured; ours have the 
 component after the other, and logs the variance of each alone: the covariances here are diagonal.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -66,6 +67,21 @@ _SENSORS = {
     "airspeed": _Sensor(("airspeed",), ("airspeed_mps",), (-1.0,)),
     "sideslip": _Sensor(("beta",), ("sideslip_rad",), (-1.0,)),
 }
+# The parameters that are the sensors' noise.
+_NOISES = {
+    "gnss_velocity": "EKF2_GPS_V_NOISE", "gnss_position": "EKF2_GPS_P_NOISE",
+    "vision_velocity": "EKF2_EVV_NOISE", "vision_position": "EKF2_EVP_NOISE",
+    "barometer": "EKF2_BARO_NOISE", "range": "EKF2_RNG_NOISE", "heading": "EKF2_HEAD_NOISE",
+    "magnetometer": "EKF2_MAG_NOISE", "gravity": "EKF2_GRAV_NOISE", "flow": "EKF2_OF_N_MIN",
+    "drag": "EKF2_DRAG_NOISE", "airspeed": "EKF2_EAS_NOISE", "sideslip": "EKF2_BETA_NOISE",
+}  # fmt: skip
+# The bits of `control_mode_flags` that say that a sensor is in use (filter_control_status_u in PX4's
+# EKF/common.h). Without any of position PX4 puts those of a place that is held, or none of use, into the
+# topic's fields of fixes (`fuseFakePosition` in EKF/fake_pos_control.cpp).
+_USE_BITS = {
+    "gnss_velocity": 2, "gnss_position": 2, "flow": 3, "barometer": 9, "range": 10,
+    "vision_position": 12,
+}  # fmt: skip
 # The names that old firmware has for the same, in one topic with their variances.
 _OLD = {
     "gps_hvel[0]": "vel_pos_innov{}[0]", "gps_hvel[1]": "vel_pos_innov{}[1]",
@@ -104,14 +120,25 @@ def label_of(instance: int) -> str:
 
 
 class Autopilot:
-    """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block."""
+    """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block.
+
+    `left_out` counts what it leaves out, by reason.
+    """
 
     def __init__(self) -> None:
+        self.left_out: Counter[str] = Counter()
         self._waiting: dict[tuple[str, int], _Table] = {}
         self._last: dict[tuple[int, str], Floats] = {}
+        self._status: dict[int, _Table] = {}
 
     def parts(self, rows: list[Rows]) -> Iterator[Part]:
         """The parts of a block's rows; what lacks its counterpart waits for the next block."""
+        for each in rows:
+            fields = Fields(each)
+            if fields.has("control_mode_flags"):
+                status = _table(fields, ["control_mode_flags"])
+                known = self._status.get(each.instance, status.take(slice(0)))
+                self._status[each.instance] = known.take(slice(-1, None)).then(status)
         for each in rows:
             fields = Fields(each)
             if each.topic in ("estimator_states", "estimator_status") and fields.has("states[9]"):
@@ -168,7 +195,12 @@ class Autopilot:
             self._last[instance, name] = value[-1:]
             is_new = (np.diff(value, axis=0, prepend=before) != 0.0).any(axis=1)
             is_fused = np.isfinite(value) & np.isfinite(variance) & (variance > 0.0)
-            which = np.flatnonzero(is_new & is_fused.any(axis=1))
+            is_new &= is_fused.any(axis=1)
+            is_used = self._is_in_use(instance, name, innovations.time_us)
+            if (is_new & ~is_used).any():
+                of = f"{label_of(instance)}: left out innovations of {name}, which was not in use"
+                self.left_out[of] += int((is_new & ~is_used).sum())
+            which = np.flatnonzero(is_new & is_used)
             if not len(which):
                 continue
             # What is not fused has a ratio of zero.
@@ -183,6 +215,15 @@ class Autopilot:
                 innovations.take(which),
                 (kept, spread, ~is_rejected),
             )
+
+    def _is_in_use(self, instance: int, sensor: str, time_us: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the filter corrected itself by a sensor, as far as its status says."""
+        status = self._status.get(instance)
+        if status is None or sensor not in _USE_BITS:
+            return np.ones(len(time_us), bool)
+        rows = np.searchsorted(status.time_us, time_us, side="right") - 1
+        flags = status.values[np.maximum(rows, 0), 0].astype(np.int64)
+        return (rows >= 0) & ((flags >> _USE_BITS[sensor] & 1) != 0)
 
     def _truth(self) -> Iterator[Part]:
         """The simulator's truth: positions and velocities at the stamps of its attitudes."""
@@ -239,6 +280,8 @@ def _innovation(
         "log_likelihood": -0.5 * (squared + logs).sum(axis=1),
     }
     metadata = {**state_metadata(components), "truth": TRUTH}
+    noise = _NOISES.get(topic.split("/")[-2])
+    metadata |= {"noise": noise} if noise else {}
     return Part(topic, schemas.INNOVATION, at.time_us, at.logged_us, columns, metadata)
 
 
