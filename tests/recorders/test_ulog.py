@@ -157,19 +157,45 @@ def read(path: Path, content: bytes) -> tuple[np.ndarray, dict[str, str]]:
     return stream["turn_rate_radps"][:, 0] - row, blocks.notes
 
 
-def test_a_log_that_is_cut_gives_what_is_whole(tmp_path: Path):
+def rows_in(path: Path, content: bytes) -> bytes:
+    """The rows of `sensor_combined` that a file has, as they lie there; none where it is refused."""
+    path.write_bytes(content)
+    rows, said = None, ""
+    try:
+        rows = columns_of(UlogFile(path)).get(("sensor_combined", 0))
+    except BadInput as error:
+        said = str(error)
+    assert re.fullmatch(r"(/[^:]*\.ulg: [^:]*[;:][^:]*(: [^:]*)?)?", said), said
+    return b"" if rows is None else rows.tobytes()
+
+
+def test_a_log_that_is_cut_at_any_thousandth_gives_what_is_whole(tmp_path: Path):
     whole = by_hand()
-    for cut in np.unique(np.linspace(0, len(whole), 100).astype(int)):
-        off, said = np.zeros(0), ""
-        try:
-            off, _ = read(tmp_path / "cut.ulg", whole[:cut])
-        except BadInput as error:
-            said = str(error)
+    every = rows_in(tmp_path / "cut.ulg", whole)
+    assert len(every) == 300 * 32
+    begin = whole.index(b"D\x07\x00") - 2
+    for cut in np.linspace(0, len(whole), 1001).astype(int):
+        found = rows_in(tmp_path / "cut.ulg", whole[:cut])
+        assert every.startswith(found)
+        assert len(found) // 32 >= (cut - begin - 6 * 11) // 37
+    for cut in np.linspace(begin + 40, len(whole), 20).astype(int):
+        off, _ = read(tmp_path / "cut.ulg", whole[:cut])
+        assert len(off)
         assert not off.any()
-        assert len(off) or re.fullmatch(rf"{tmp_path}/cut.ulg: [^:]*[;:][^:]*(: log .*)?", said), said
-        begin = whole.index(b"D\x07\x00") - 2
-        assert len(off) >= (cut - begin - 6 * 11) // 37
-    assert len(read(tmp_path / "whole.ulg", whole)[0]) == 300
+
+
+def test_a_flipped_bit_changes_one_row_or_costs_those_up_to_the_next_mark(tmp_path: Path):
+    """Numbers have no checksum, so that nobody can know of theirs."""
+    whole = by_hand()
+    every = {each.tobytes() for each in np.frombuffer(rows_in(tmp_path / "whole.ulg", whole), "V32")}
+    rng = np.random.default_rng(6)
+    for _ in range(200):
+        content = bytearray(whole)
+        content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+        found = np.frombuffer(rows_in(tmp_path / "cut.ulg", bytes(content)), "V32")
+        changed = sum(each.tobytes() not in every for each in found)
+        assert changed <= 1
+        assert len(found) + changed >= 240 or not len(found)
 
 
 def test_what_flips_in_heads_costs_rows_and_no_wrong_number(tmp_path: Path):

@@ -166,13 +166,14 @@ class UlogFile:
         self, file: BinaryIO, begin: int, end: int, is_wanted: Callable[[str], bool]
     ) -> Iterator[list[Rows]]:
         """The rows between two bytes of the file; the message that the end cuts is none."""
-        held = bytearray(_PIECE_BYTES + BEYOND_BYTES)
-        data, free = np.frombuffer(held, np.uint8), memoryview(held)[:_PIECE_BYTES]
+        piece = min(_PIECE_BYTES, end - begin)
+        held = bytearray(piece + BEYOND_BYTES)
+        data, free = np.frombuffer(held, np.uint8), memoryview(held)[:piece]
         size, place, is_lost = 0, begin, False
         file.seek(begin)
         while True:
             size += file.readinto(free[size : max(end - place, 0)])  # type: ignore[attr-defined]
-            is_last = place + size >= end or size < _PIECE_BYTES
+            is_last = place + size >= end or size < piece
             if is_lost:
                 found = held.find(_SYNC, 0, size)
                 is_lost = found < 0
