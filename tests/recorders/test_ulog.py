@@ -274,3 +274,56 @@ def test_a_parameter_that_changes_is_no_value_from_the_start(tmp_path: Path):
     assert stream.components == ["SOME_X"]
     assert stream["value"].ravel().tolist() == [1.5, 2.5]
     assert stream.publish_time_ns[1] == 1000 * (1_000_000 + 299 * 4000)
+
+
+def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(tmp_path: Path):
+    """PX4's are predicted minus measured, north, east, down and forward, right, down; see `_SENSORS`."""
+    predicted = {
+        "gps_hpos": [10, 20],
+        "gps_vpos": [-30],
+        "heading": [0.5],
+        "mag_field": [0.2, 0.1, 0.4],
+        "flow": [0.1, 0.2],
+        "baro_vpos": [-30],
+    }
+    measured = {
+        "gps_hpos": [11, 22],
+        "gps_vpos": [-33],
+        "heading": [0.7],
+        "mag_field": [0.3, 0.15, 0.45],
+        "flow": [0.15, 0.3],
+        "baro_vpos": [-31],
+    }
+    fields = "".join(f"float[{len(each)}] {name};" for name, each in predicted.items()).replace(
+        "[1]", ""
+    )
+    topics = ("estimator_innovations", "estimator_innovation_variances", "estimator_status")
+    stamps = "uint64_t timestamp;uint64_t timestamp_sample;"
+    formats = tuple(f"{topic}:{stamps}{fields}" for topic in topics[:2])
+    formats += (f"{topics[2]}:{stamps}uint64_t control_mode_flags;",)
+    subscribed = [message("A", struct.pack("<BH", 0, 20 + n) + t.encode()) for n, t in enumerate(topics)]
+    off = np.concatenate([np.subtract(predicted[name], measured[name]) for name in predicted])
+    in_use = sum(1 << bit for bit in (2, 3, 4, 5, 9))  # not the height of fixes
+
+    def row(number: int, stamp: int, body: bytes) -> bytes:
+        return message("D", struct.pack("<HQQ", number, stamp, stamp) + body)
+
+    rows = b""
+    for step, flags in enumerate((in_use, 0, in_use)):
+        stamp = 1_000_000 + 100_000 * step
+        rows += row(22, stamp, struct.pack("<Q", flags))
+        rows += row(20, stamp, ((1 + step) * off).astype("<f4").tobytes())
+        rows += row(21, stamp, np.ones(len(off), "<f4").tobytes())
+    path = tmp_path / "signs.ulg"
+    path.write_bytes(by_hand(*subscribed, formats=formats, last=rows))
+    streams = streams_of(path)
+    expected = {
+        "gnss_position": [2, 1, np.nan],  # east, north; 22 and 11 were measured, 20 and 10 predicted
+        "barometer": [1],
+        "heading": [-0.2],  # counterclockwise from east: 90 deg less PX4's
+        "magnetometer": [0.1, -0.05, -0.05],
+        "flow": [0.05, -0.1],
+    }
+    for name, once in expected.items():
+        innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]
+        np.testing.assert_allclose(innovation, [once, np.multiply(3, once)], rtol=1e-5)
