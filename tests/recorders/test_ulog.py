@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from pyulog import ULog
 
+import fuselog as fl
 from recorders.errors import BadInput
 from recorders.importers.ulog.file import MAGIC, UlogFile
 from recorders.importers.ulog.importer import ULOG, UlogParameters
+from recorders.importers.ulog.settings import carried, stated_noise
 from recorders.models.orientation import rotate
 
 # Of the sheet, section 6: streams, rows, changed parameters, defaults, texts, dropouts and their ms.
@@ -327,3 +329,37 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     for name, once in expected.items():
         innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]
         np.testing.assert_allclose(innovation, [once, np.multiply(3, once)], rtol=1e-5)
+
+
+def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
+    """Noise by the sheet, section 1: PX4's defaults are .0015 and .035 for a step of 10 ms."""
+    parameters = {
+        "EKF2_GYR_NOISE": 0.015,
+        "EKF2_ACC_NOISE": 0.35,
+        "EKF2_PREDICT_US": 10_000,
+        "EKF2_GPS_DELAY": 110.0,
+        "EKF2_GPS_POS_Y": 0.3,
+        "EKF2_IMU_POS_Y": 0.1,
+        "EKF2_ABIAS_INIT": 0.2,
+        "EKF2_HDG_GATE": 2.6,
+        "EKF2_TAU_POS": 0.25,
+        "CAL_ACC0_XOFF": 0.1,
+        "MPC_XY_P": 1.0,
+    }
+    stated = stated_noise(parameters)["inertial"]
+    assert stated == {"gyro_noise_density": "0.0015", "force_noise_density": "0.035"}
+    notes = carried(parameters)
+    settings = notes.pop("settings that the filter had").split(" --set ")
+    assert settings == [
+        "--set fix_delay_s=0.11",
+        "velocity_delay_s=0.11",
+        "force_bias_sigma_mps2=0.2",
+        "lever_y_m=-0.2",
+    ]
+    replayed = fl.replay(fl.record("navigation", duration_s=12.0), "ekf", set=dict(
+        each.removeprefix("--set ").split("=") for each in settings
+    ))  # fmt: skip
+    assert not replayed.failures  # the model has them all
+    assert notes["EKF2_HDG_GATE"].startswith("test each component by itself")
+    assert notes["EKF2_TAU_POS"] == "have no counterpart in the model inertial"
+    assert notes["CAL_ACC0_XOFF"].startswith("had their effect before")
