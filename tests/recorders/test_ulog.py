@@ -322,7 +322,10 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
         rows += row(20, stamp, ((1 + step) * off).astype("<f4").tobytes())
         rows += row(21, stamp, np.ones(len(off), "<f4").tobytes())
     path = tmp_path / "signs.ulg"
-    path.write_bytes(by_hand(*subscribed, formats=formats, last=rows))
+    gate = message("P", bytes([21]) + b"float EKF2_GPS_P_GATE" + struct.pack("<f", 5.0))
+    whole = by_hand(*subscribed, formats=formats, last=rows)
+    other = message("P", bytes([12]) + b"float SOME_X" + struct.pack("<f", 1.5))
+    path.write_bytes(whole.replace(other, other + gate))
     streams = streams_of(path)
     expected = {
         "gnss_position": [2, 1, np.nan],  # east, north; 22 and 11 were measured, 20 and 10 predicted
@@ -334,6 +337,8 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     for name, once in expected.items():
         innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]
         np.testing.assert_allclose(innovation, [once, np.multiply(3, once)], rtol=1e-5)
+    stream = streams["/estimates/ekf2/vehicle/gnss_position/innovation"]
+    assert stream["accepted"].tolist() == [1, 0]  # the last is six standard deviations to the east
 
 
 def test_parameters_are_settings_of_ours_or_it_is_said_why_not():

@@ -5,7 +5,7 @@ component after the other, and logs the variance of each alone: the covariances 
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -87,13 +87,13 @@ _SENSORS = {
     "airspeed": _single("airspeed", "airspeed_mps", -1.0, 19),
     "sideslip": _single("beta", "sideslip_rad", -1.0, 15),
 }
-# The parameters that are the sensors' noise.
-_NOISES = {
-    "gnss_velocity": "EKF2_GPS_V_NOISE", "gnss_position": "EKF2_GPS_P_NOISE",
-    "vision_velocity": "EKF2_EVV_NOISE", "vision_position": "EKF2_EVP_NOISE",
-    "barometer": "EKF2_BARO_NOISE", "range": "EKF2_RNG_NOISE", "heading": "EKF2_HEAD_NOISE",
-    "magnetometer": "EKF2_MAG_NOISE", "gravity": "EKF2_GRAV_NOISE", "flow": "EKF2_OF_N_MIN",
-    "drag": "EKF2_DRAG_NOISE", "airspeed": "EKF2_EAS_NOISE", "sideslip": "EKF2_BETA_NOISE",
+# The parameters of a sensor's noise and of its gate, in standard deviations: EKF2_*_NOISE, EKF2_*_GATE.
+_PARAMETERS = {
+    "gnss_velocity": ("GPS_V", "GPS_V"), "gnss_position": ("GPS_P", "GPS_P"),
+    "vision_velocity": ("EVV", "EVV"), "vision_position": ("EVP", "EVP"), "barometer": ("BARO", "BARO"),
+    "range": ("RNG", "RNG"), "heading": ("HEAD", "HDG"), "magnetometer": ("MAG", "MAG"),
+    "gravity": ("GRAV", ""), "flow": ("OF_N_MIN", "OF"), "drag": ("DRAG", ""),
+    "airspeed": ("EAS", "TAS"), "sideslip": ("BETA", "BETA"),
 }  # fmt: skip
 # The names that old firmware has for the same, in one topic with their variances: "0-2 vel, 3-5 pos"
 # (estimator_interface.h). The height is that of the sensor in use.
@@ -137,10 +137,14 @@ def label_of(instance: int) -> str:
 class Autopilot:
     """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block.
 
-    `left_out` counts what it leaves out, by reason.
+    `left_out` counts what it leaves out, by reason. The autopilot's `parameters` have its gates.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, parameters: Mapping[str, float]) -> None:
+        self._gates = {
+            sensor: parameters.get(f"EKF2_{gate}_GATE", np.inf)
+            for sensor, (_, gate) in _PARAMETERS.items()
+        }
         self.left_out: Counter[str] = Counter()
         self._waiting: dict[tuple[str, int], _Table] = {}
         self._last: dict[tuple[int, str], Floats] = {}
@@ -219,17 +223,19 @@ class Autopilot:
             which = np.flatnonzero(is_new & is_fused.any(axis=1))
             if not len(which):
                 continue
-            # What is not fused has a ratio of zero.
-            is_rejected = np.zeros(len(which), bool)
-            if ratios is not None:
-                is_rejected |= (ratios[which][:, columns] > 1.0).any(axis=1)
             kept = np.where(is_fused, value, np.nan)[which] * sensor.signs
             spread = np.where(is_fused, variance, np.nan)[which]
+            # By setEstimatorAidStatusTestRatio; the ratios that are logged may be of other samples.
+            tested = kept**2 / spread / self._gates[name] ** 2
+            if ratios is not None:
+                stated = ratios[which][:, columns]
+                tested = np.where(np.isfinite(stated), stated, tested)
+            is_accepted = np.logical_not((tested > 1.0).any(axis=1))
             yield _innovation(
                 f"/estimates/{label_of(instance)}{BODY}/{name}/innovation",
                 sensor.components,
                 innovations.take(which),
-                (kept, spread, ~is_rejected),
+                (kept, spread, is_accepted),
             )
 
     def _is_in_use(
@@ -302,8 +308,8 @@ def _innovation(
         "log_likelihood": -0.5 * (squared + logs).sum(axis=1),
     }
     metadata = {**state_metadata(components), "truth": TRUTH}
-    noise = _NOISES.get(topic.split("/")[-2])
-    metadata |= {"noise": noise} if noise else {}
+    noise = _PARAMETERS[topic.split("/")[-2]][0]
+    metadata["noise"] = f"EKF2_{noise}" if noise.startswith("OF_") else f"EKF2_{noise}_NOISE"
     return Part(topic, schemas.INNOVATION, at.time_us, at.logged_us, columns, metadata)
 
 

@@ -57,7 +57,7 @@ class _Import:
 
     def __init__(self, file: UlogFile, origin: Origin | None) -> None:
         self._file, self._origin = file, origin
-        self._autopilot = Autopilot()
+        self._autopilot = Autopilot(file.parameters)
         self._noise = stated_noise(file.parameters)
         self._told: Counter[str] = Counter()
         self._first_ns: int | None = None
