@@ -33,7 +33,7 @@ from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
 from recorders.log import open_log, schemas
 from replay.engine.streams.blocks import gather
-from replay.engine.streams.sources import LogSource, MemorySource
+from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.judging.errors.evaluation import Errors, innovations_of
 from replay.judging.judge import Judge
 from replay.judging.tables import error_table, joined
@@ -123,7 +123,7 @@ class Replay:
     """
 
     logs: Sequence[LogSource | MemorySource]
-    estimates: Sequence[LogSource]
+    estimates: Sequence[Source]
     settings: Settings
     done: Pass
     gap_limit_s: float
@@ -184,7 +184,7 @@ class Replay:
     def innovations(self) -> pd.DataFrame:
         """Return a row per predicted measurement: its NIS, its components, whether it was let in."""
         found = [
-            innovations_of(gather([log[topic]]), run)
+            innovations_of(gather([log.read([topic])[topic]]), run)
             for run, log in enumerate(self.estimates)
             for topic, stated in log.topics.items()
             if stated.schema_name == schemas.INNOVATION.full_name

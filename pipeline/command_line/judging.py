@@ -155,9 +155,10 @@ def evaluate(
 def compare(sides: tuple[Path, ...], labels: tuple[str, ...], **options: Any) -> None:
     """Compare SIDES: result folders, estimates logs or folders of them, trajectory files.
 
-    Or estimators over logs, LOG.mcap ... with -e for each estimator. All others are compared with the
-    first, metric by metric over the runs that both have, with intervals of 95 % by the bootstrap over
-    runs.
+    Or estimators over logs, LOG.mcap ... with -e for each estimator; those of which the logs have
+    estimates already, such as an autopilot's, come first and are not replayed. All others are compared
+    with the first, metric by metric over the runs that both have, with intervals of 95 % by the
+    bootstrap over runs.
     """
     from pipeline.comparing.command import compare_candidates
 

@@ -19,7 +19,7 @@ from pipeline.comparing.renamed import Renamed
 from pipeline.output.coverage import recounted, rows_of_candidate, stored_rows
 from pipeline.output.results import RESULT_FILE, Result, read_result, read_table, split_metric
 from pipeline.runs.ensemble import Progress, judge_logs, parts_of
-from pipeline.runs.estimates import source_of_estimates, stated_estimators
+from pipeline.runs.estimates import labels_of, source_of_estimates, stated_estimators
 from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.initial_states import check_same_run
 from pipeline.runs.inputs import load_scenario
@@ -33,7 +33,7 @@ from replay.engine.replaying.replaying import BLOCK_MESSAGES
 from replay.engine.replaying.usage import Row
 from replay.engine.streams.sources import LogSource, MemorySource, Source
 from replay.foreign.naming import of_file
-from replay.judging.errors.evaluation import POSITION, split_topic
+from replay.judging.errors.evaluation import POSITION
 from replay.judging.errors.trajectory_streams import estimates_of
 from replay.judging.errors.truths import Doubt
 from replay.judging.metrics.measuring import find_metrics
@@ -59,7 +59,7 @@ class Candidate:
         rows: a row per run, case and quantity: `run`, `case`, `quantity`, `value`.
         times: a row per run, case and span of time; see `Judge.times`.
         sizes: of a mean NEES, by quantity and case, how large it should be.
-        settings: what decided about it, by dotted name.
+        settings: what decided about it, by dotted name; None of what was recorded.
         truths: by run, a hash of what it was judged by.
         pairs: by run, those that can be drawn: the log, and the estimates.
         notes: sentences on where it comes from.
@@ -73,7 +73,7 @@ class Candidate:
     rows: pd.DataFrame
     times: pd.DataFrame
     sizes: Mapping[tuple[str, str], float]
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any] | None
     truths: Mapping[str, str] = field(default_factory=dict)
     pairs: Pairs = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -104,7 +104,7 @@ class Given:
 
 
 def measured(
-    name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any]
+    name: str, label: str, pairs: Pairs, gap_limit_s: float, settings: Mapping[str, Any] | None
 ) -> Candidate:
     """Judge the estimates of a label, each run by itself: of every pair of a log and its estimates."""
     metrics = find_metrics()
@@ -183,8 +183,8 @@ def name_of(path: Path) -> str:
     return re.sub(r"[^\w:=+-]+", "-", stem).strip("-") or "side"
 
 
-def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
-    """The estimators of a replay."""
+def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[str] = ()) -> Given:
+    """The estimators of a replay, after those whose estimates its logs have already."""
     runs = list(map(key_of, done.logs))
     for run in runs:
         if runs.count(run) > 1:
@@ -193,11 +193,15 @@ def of_replay(name: str, done: Replay, gap_limit_s: float) -> Given:
     stated = done.done.parameters
 
     def candidate(label: str, name: str) -> Candidate:
+        if label in recorded:
+            own = {run: (log, log) for run, (log, _) in pairs.items()}
+            return measured(name, label, own, gap_limit_s, None)
         settings = settings_of(done.logs[0], label, stated.get(label, {}))
         found = measured(name, label, pairs, gap_limit_s, settings)
         return replace(found, replay=done, coverage=rows_of_candidate(done.done.coverage, label, name))
 
-    return Given(name, list(done.settings), candidate, {run: log for run, (log, _) in pairs.items()})
+    labels = [*recorded, *done.settings]
+    return Given(name, labels, candidate, {run: log for run, (log, _) in pairs.items()})
 
 
 def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
@@ -232,18 +236,13 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
         settings = settings_of(log_of_first, label, stated.get(label, {}))
         found = measured(name, label, own, gap_limit_s, settings)
         logs, estimates = zip(*own.values(), strict=True)
-        counted = recounted(estimates, logs, {label: stated.get(label, {})}, found.doubts)
+        own_settings = {label: stated[label]} if label in stated else {}
+        counted = recounted(estimates, logs, own_settings, found.doubts)
         return replace(found, coverage=rows_of_candidate(counted, label, name))
 
     return Given(
         name_of(path), labels_of(first), candidate, {run: log for run, (log, _) in pairs.items()}
     )
-
-
-def labels_of(estimates: Source) -> list[str]:
-    """The estimators of an estimates log."""
-    topics = (topic for topic in estimates.topics if topic.startswith("/estimates/"))
-    return list(dict.fromkeys(split_topic(topic)[0] for topic in topics))
 
 
 def of_result(folder: Path, progress: Progress) -> Given:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.comparing.comparing import compare
+from pipeline.comparing.groups import recorded_labels
 from pipeline.output.outputs import check_outputs
 from pipeline.output.terminal import print_json, print_table, progress, say, warn
 from pipeline.runs.settings import settings_of_estimators, split_texts
@@ -44,10 +45,12 @@ def compare_candidates(
     """Compare, print a table for each pair and case and the verdicts, write folder and timeline."""
     check_outputs(out, save, {"input": [*candidates, *filter(None, [truth, settings_file])]})
     alterations, own = split_texts(settings)
-    chosen = settings_of_estimators(labels, own, settings_file)
+    has = recorded_labels(candidates, recover=recover)
+    recorded = [label for label in labels if label in has]
+    chosen = settings_of_estimators([label for label in labels if label not in has], own, settings_file)
     found = compare(
         *candidates,
-        estimators=[{label: values} for label, values in chosen.items()],
+        estimators=[*recorded, *({label: values} for label, values in chosen.items())],
         truth=truth,
         case=case,
         margin=margin,

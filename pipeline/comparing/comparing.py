@@ -217,8 +217,8 @@ def compare(
     Args:
         candidates: result folders, estimates logs or folders of them, and trajectory files; or with
             `estimators` logs to replay.
-        estimators: which ones, as for `replay`; by default those that all candidates have,
-            or the only ones.
+        estimators: which ones, as for `replay`, or the labels of estimates that a recording has beside
+            its sensors, which come first; by default those that all candidates have, or the only ones.
         truth: the true trajectory, as a file, where all candidates are files.
         case: what trajectory files are of, such as `robot2`, where a log has several truths.
         margin: which share of a metric is no matter.
@@ -260,7 +260,8 @@ def compare(
     table = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
     found = None
     if stress:
-        if {kind_of(path, recover=recover) for path in paths} != {"log"}:
+        named = [label for each in estimators for label in _labels(each)]
+        if {kind_of(path, named, recover=recover) for path in paths} != {"log"}:
             raise BadInput(
                 f"--stress: {paths[0]} is no log to replay; give logs, and estimators with -e"
             )

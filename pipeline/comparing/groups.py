@@ -19,6 +19,7 @@ from pipeline.comparing.candidates import (
 )
 from pipeline.output.results import RESULT_FILE
 from pipeline.runs.ensemble import Progress
+from pipeline.runs.estimates import labels_of, recorded_estimators
 from recorders.errors import BadInput, choices, some_of
 from recorders.log import NotMcap, RunMetadata, open_log, schemas
 from recorders.trajectories import read_trajectory
@@ -27,6 +28,7 @@ from replay.judging.errors.trajectory_streams import truth_of
 
 # So many settings that differ are named.
 NAMED = 8
+IN_LOGS = ("estimates", "log")
 
 
 def runs_of(count: int) -> str:
@@ -45,21 +47,21 @@ def inputs_of(
     gap_limit_s: float,
     recover: bool,
 ) -> list[Given]:
-    """Read what every path stands for; logs without estimates are replayed together."""
-    kinds = [kind_of(path, recover=recover) for path in paths]
+    """Read what every path stands for; logs that lack what is named are replayed together."""
+    named = [label for each in estimators for label in ([each] if isinstance(each, str) else each)]
+    kinds = [kind_of(path, named, recover=recover) for path in paths]
     logs = [path for path, kind in zip(paths, kinds, strict=True) if kind == "log"]
     if logs and len(logs) < len(paths):
         raise BadInput(f"{logs[0]}: is a log without estimates; make them with fuselog replay")
     if logs:
         if not estimators:
             raise BadInput(f"{logs[0]}: is a log without estimates; name two estimators: -e ekf -e ukf")
-        done = replay(
-            [LogSource(open_log(path, recover=recover)) for path in logs],
-            estimators,
-            gap_limit_s=gap_limit_s,
-            set=set_,
-        )
-        return [of_replay(name_of(logs[0]), done, gap_limit_s)]
+        sources = [LogSource(open_log(path, recover=recover)) for path in logs]
+        has = recorded_labels(logs, recover=recover)
+        recorded = [each for each in estimators if isinstance(each, str) and each in has]
+        others = [each for each in estimators if each not in recorded]
+        done = replay(sources, others, gap_limit_s=gap_limit_s, set=set_)
+        return [of_replay(name_of(logs[0]), done, gap_limit_s, recorded)]
     if set_:
         raise BadInput(
             f"--set {next(iter(set_))}: is for logs that are replayed; {paths[0]} has estimates already"
@@ -79,15 +81,28 @@ def inputs_of(
     return [found[number] for number in range(len(paths))]
 
 
-def kind_of(path: Path, *, recover: bool) -> str:
-    """What stands at a path: "result", "estimates", "log" or "trajectory"."""
+def recorded_labels(paths: Sequence[Path], *, recover: bool) -> list[str]:
+    """The estimators of which all of some logs brought estimates along, as an autopilot's."""
+    logs = [path for path in paths if kind_of(path, recover=recover) in IN_LOGS and path.is_file()]
+    found = [recorded_estimators(open_log(path, recover=recover)) for path in logs]
+    return [label for label in found[0] if all(label in each for each in found)] if found else []
+
+
+def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
+    """What stands at a path: "result", "estimates", "log" or "trajectory".
+
+    A recording with estimates of its own is a log to whoever asks for `labels` that it lacks.
+    """
     if path.is_dir():
         return "result" if (path / RESULT_FILE).is_file() else "estimates"
     try:
         log = open_log(path, recover=recover)
     except NotMcap:
         return "trajectory"
-    return "estimates" if any(topic.startswith("/estimates/") for topic in log.topics) else "log"
+    recorded = recorded_estimators(log)
+    if recorded and any(label not in recorded for label in labels):
+        return "log"
+    return "estimates" if labels_of(log) else "log"
 
 
 def _true_source(truth: str | Path | None, others: Sequence[Given]) -> Source:
@@ -182,10 +197,9 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
         count = runs_of(len(apart))
         yield f"{first.name} and {second.name} have different truths in {count}: {apart[0]}"
     missing = "not stated"
-    names = dict.fromkeys([*first.settings, *second.settings])
-    values = {
-        name: [candidate.settings.get(name, missing) for candidate in (first, second)] for name in names
-    }
+    settings = [each.settings for each in (first, second) if each.settings is not None]
+    names = dict.fromkeys(name for each in settings for name in each) if len(settings) == 2 else {}
+    values = {name: [each.get(name, missing) for each in settings] for name in names}
     differing = [f"{name} {a} and {b}" for name, (a, b) in values.items() if a != b]
     if differing:
         more = f", and {len(differing) - NAMED} more" if len(differing) > NAMED else ""

@@ -10,6 +10,7 @@ from pipeline.diagnosing.diagnosis import diagnose
 from pipeline.output.outputs import check_outputs
 from pipeline.output.results import plain
 from pipeline.output.terminal import print_json, print_metrics, print_table, say, status
+from pipeline.runs.estimates import recorded_estimators
 from pipeline.runs.settings import settings_of_estimators, split_texts
 from recorders.errors import BadInput
 from recorders.log import open_log
@@ -40,7 +41,10 @@ def diagnose_log(
         )
     check_outputs(out, save, {"log": [log], "settings": list(filter(None, [settings_file]))})
     alterations, own = split_texts(settings)
-    if label is not None:
+    opened = open_log(log, recover=recover)
+    if label is not None and label in recorded_estimators(opened):
+        given = parse_settings(own)
+    elif label is not None:
         [(label, given)] = settings_of_estimators([label], own, settings_file, model=model).items()
     elif settings_file is not None:
         raise BadInput(f"--settings {settings_file}: is for one estimator; name it with -e")
@@ -49,7 +53,7 @@ def diagnose_log(
     with status() as show:
         show("replaying with one fault undone after another")
         found = diagnose(
-            LogSource(open_log(log, recover=recover)),
+            LogSource(opened),
             label,
             set=given | alterations,
             gap_limit_s=gap_limit_s,

@@ -6,16 +6,19 @@ import numpy as np
 
 from pipeline.api.replays import Replay
 from pipeline.diagnosing.findings import Finding
+from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import MetricValue, split_metric
 from recorders.log import Stream, schemas
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.consistency.consistency import CONSISTENT
-from replay.judging.consistency.whiteness import whitened
+from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 from replay.judging.metrics.measuring import metric_key
 
 SAME = 0.9  # of the messages: a truth that equals as many of what the filter used is the same
 SEEN = 1.5  # NIS per component, up to which innovations have seen nothing
+CHART_BINS = 60
+BIASED = 0.7  # of the root mean square of innovations, which their mean is where half is a bias
 
 
 def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Finding]:
@@ -97,6 +100,62 @@ def unnamed(
                 f"NEES is {value:.3g}, where a consistent filter is within {low:.3g} and {high:.3g}"
             )
             yield _unnamed(_truth(case), case, evidence, faults)
+
+
+def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
+    """Find what each sensor's innovations say of an estimator that cannot be replayed.
+
+    Those that hang together in time are the motion's, or a delay's; others the sensor's own noise. Where
+    a channel states which of its estimator's parameters is that noise, it is named.
+    """
+    for topic, stream in innovations.items():
+        case, stated = split_topic(topic)[1], stream.metadata.get("noise", "")
+        for name, column in zip(stream.components, whitened(stream).T, strict=True):
+            told = whiteness([column])
+            if not np.isfinite(told.mean_square):
+                continue
+            low, high = (each / told.size for each in chi_square_interval(told.size, 1, CONSISTENT))
+            if low <= told.mean_square <= high:
+                continue
+            deviation, what = np.sqrt(told.mean_square), f"{case}: the innovations of {name}"
+            noise = f"its noise ({stated})" if stated else "its noise"
+            evidence = f"NIS is {told.mean_square:.3g}, if consistent {low:.3g} to {high:.3g}"
+            if told.mean_square < low:
+                size, mend = f"{1.0 / deviation:.3g} times smaller", f"{noise} is stated too large"
+            elif told.correlation[0] > told.bound:
+                size = f"{deviation:.3g} times larger"
+                mend = "they hang together, so that it is late, or the process noise too small"
+            else:
+                size, mend = f"{deviation:.3g} times larger", f"{noise} is stated too small"
+            mean = float(np.nanmean(column))
+            if abs(mean) > BIASED * max(deviation, 1.0):
+                mend = f"on average they are {mean:.3g} standard deviations: it is biased"
+            yield Finding(
+                "measurement noise",
+                topic,
+                f"{what} are {size} than their variances say ({evidence}): {mend}",
+            )
+
+
+def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> dict[str, Chart]:
+    """NIS per component over time, by case."""
+    charts: dict[str, Chart] = {}
+    for stream in innovations.values():
+        case = split_topic(stream.topic)[1]
+        nis = stream["normalised_innovation_squared"]
+        degrees = np.isfinite(stream["innovation"]).sum(axis=1)
+        used = (degrees > 0) & np.isfinite(nis)
+        times_s = 1e-9 * (stream.publish_time_ns[used] - epoch_ns)
+        count, edges = np.histogram(times_s, CHART_BINS, weights=degrees[used])
+        total, _ = np.histogram(times_s, edges, weights=nis[used])
+        there = count > 0
+        middle_s = 0.5 * (edges[1:] + edges[:-1])[there]
+        panel = Panel(x=Axis(label="time (s)"), y=Axis(label="NIS per component", log=True))
+        panel.series.append(curve(label, middle_s, total[there] / count[there], "line+markers"))
+        panel.series.append(level("if consistent", middle_s, 1.0))
+        name = " ".join(filter(None, ("NIS", case)))
+        charts[name.lower().replace(" ", "-")] = Chart(title=name, panels=[panel])
+    return charts
 
 
 def comparable(metrics: Mapping[str, MetricValue], log_likelihood: float) -> dict[str, MetricValue]:

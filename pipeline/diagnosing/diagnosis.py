@@ -21,7 +21,13 @@ from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Advice, Trying
 from pipeline.diagnosing.causes import Cause, Told, Tried, least_gain, seek, tried_table
-from pipeline.diagnosing.consistency import judged_by_itself, unnamed, unseen_errors
+from pipeline.diagnosing.consistency import (
+    judged_by_itself,
+    nis_charts,
+    of_each_component,
+    unnamed,
+    unseen_errors,
+)
 from pipeline.diagnosing.findings import (
     Finding,
     component_table,
@@ -30,28 +36,29 @@ from pipeline.diagnosing.findings import (
     of_plausibility,
     without_filter,
 )
-from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest
-from pipeline.diagnosing.sentences import Sentence, ranked
-from pipeline.output.charts import Axis, Chart, Panel, curve, level
+from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded
+from pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
+from pipeline.output.charts import Chart
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
-from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
+from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import source_of_estimates, stated_estimators
+from pipeline.runs.estimates import (
+    labels_of,
+    recorded_estimators,
+    source_of_estimates,
+    stated_estimators,
+)
 from pipeline.tuning.measured import until_last_measured
 from recorders.errors import BadInput, choices
 from recorders.log import Stream, schemas
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import Estimator, bind
-from replay.engine.streams.failures import reason_stream
-from replay.engine.streams.sources import LogSource, MemorySource
+from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from replay.foreign.naming import allowed, of_file, refuse_programs
-from replay.judging.errors.evaluation import split_topic
 
-MOST_SENTENCES = 5
 NOTHING = "nothing found"
 OPEN = {"gate_probability": 1.0}
-PROFILE_BINS = 60
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -130,48 +137,14 @@ class Diagnosis:
     @cached_property
     def profiles(self) -> dict[str, Chart]:
         """NIS per component over time, by case."""
-        charts: dict[str, Chart] = {}
-        for stream in Outputs(self.replay, schemas.INNOVATION).values():
-            case = split_topic(stream.topic)[1]
-            nis = stream["normalised_innovation_squared"]
-            degrees = np.isfinite(stream["innovation"]).sum(axis=1)
-            used = (degrees > 0) & np.isfinite(nis)
-            times_s = 1e-9 * (stream.publish_time_ns[used] - self.replay.logs[0].epoch_ns)
-            count, edges = np.histogram(times_s, PROFILE_BINS, weights=degrees[used])
-            total, _ = np.histogram(times_s, edges, weights=nis[used])
-            there = count > 0
-            middle_s = 0.5 * (edges[1:] + edges[:-1])[there]
-            panel = Panel(x=Axis(label="time (s)"), y=Axis(label="NIS per component", log=True))
-            panel.series.append(curve(self.label, middle_s, total[there] / count[there], "line+markers"))
-            panel.series.append(level("if consistent", middle_s, 1.0))
-            name = " ".join(filter(None, ("NIS", case)))
-            charts[name.lower().replace(" ", "-")] = Chart(title=name, panels=[panel])
-        return charts
+        innovations = Outputs(self.replay, schemas.INNOVATION)
+        return nis_charts(self.label, innovations, self.replay.logs[0].epoch_ns)
 
     @property
     def marks(self) -> dict[str, Stream]:
         """The sentences as messages by topic, for the timeline: at the stamp where each one began."""
-        log = self.replay.logs[0]
-        cases = list(dict.fromkeys(split_topic(topic)[1] for topic in self.replay.estimates[0].topics))
-        first_ns = log.extent("publish_time")[0]
-        found: dict[str, list[Sentence]] = {}
-        for each in self.sentences:
-            case = next(
-                (case for case in cases if case and each.topic.startswith(f"/{case}/")), cases[0]
-            )
-            found.setdefault(case, []).append(each)
-        marks = {}
-        for case, own in found.items():
-            own = sorted(own, key=lambda each: each.time_ns or first_ns)
-            topic = "/".join(filter(None, ("/estimates", self.label, case, "diagnosis")))
-            marks[topic] = reason_stream(
-                topic,
-                schemas.DIAGNOSED,
-                np.array([each.time_ns or first_ns for each in own], np.int64),
-                np.arange(len(own)),
-                [each.words for each in own],
-            )
-        return marks
+        first_ns = self.replay.logs[0].extent("publish_time")[0]
+        return marks_of(self.sentences, self.label, [*self.replay.estimates[0].topics], first_ns)
 
     def view(self, save: str | Path) -> None:
         """Write the timeline of the replay, the sentences among its events, to an .rrd file.
@@ -256,6 +229,9 @@ def diagnose(
             f"{len(sources)} logs: one log is diagnosed at a time; give one, such as {sources[0].name}. "
             "The table `runs` of a replay shows which run is worst, and tune takes several logs"
         )
+    labels = [label for label in recorded_estimators(sources[0]) if estimator in (None, label)]
+    if labels:
+        return _of_recorded(sources[0], labels, given, gap_limit_s)
     source, chosen = _asked(sources[0], estimator)
     [(label, own)] = chosen.items()
     settings = merge(own, allowed(given))
@@ -311,8 +287,50 @@ def diagnose(
         component_table(innovations),
         tried_table(tried),
         least,
-        [*notes, *no_judges.values(), *_notes(done, sentences)],
+        [*notes, *no_judges.values(), *notes_of(done, sentences)],
         likely,
+    )
+
+
+def _of_recorded(
+    source: LogSource | MemorySource,
+    labels: Sequence[str],
+    settings: Mapping[str, Any],
+    gap_limit_s: float,
+) -> Diagnosis:
+    """What an autopilot's innovations say of its filter, which cannot be replayed.
+
+    Raises BadInput where there are several filters, settings of one, or no innovations.
+    """
+    label, *others = labels
+    if others:
+        raise BadInput(f"{source.name}: has {', '.join(labels)}; name the one to diagnose with -e")
+    if settings:
+        raise BadInput(
+            f"--set {next(iter(settings))}: {label} was recorded and takes no settings; leave it out"
+        )
+    done = recorded(source, label, gap_limit_s)
+    innovations = Outputs(done, schemas.INNOVATION)
+    if not innovations:
+        raise BadInput(f"{source.name}: has no innovations of {label}; a diagnosis needs them")
+    sensed = [topic for topic in source.topics if is_sensed(source, topic)]
+    findings = [
+        *of_plausibility(source, sensed),
+        *of_each_component(innovations),
+        *of_innovations(innovations, None, source.epoch_ns, has_outliers=False),
+        *unseen_errors(done, label, has_causes=False),
+    ]
+    sentences = [Sentence.of(each) for each in findings]
+    note = f"{label} was recorded: no fault can be undone and tried; what its innovations say is said"
+    return Diagnosis(
+        label,
+        done,
+        sentences[:MOST_SENTENCES],
+        component_table(innovations),
+        tried_table([]),
+        np.inf,
+        [note, *notes_of(done, sentences)],
+        np.nan,
     )
 
 
@@ -361,7 +379,8 @@ def _asked(
     source: LogSource | MemorySource, estimator: Named | None
 ) -> tuple[LogSource | MemorySource, dict[str, dict[str, Any]]]:
     """The log and the one estimator that are asked for; of estimates the log that they are of."""
-    if any(topic.startswith("/estimates/") for topic in source.topics) and isinstance(source, LogSource):
+    has_estimates = labels_of(source) and not recorded_estimators(source)
+    if has_estimates and isinstance(source, LogSource):
         stated = stated_estimators(source.log)
         labels = list(stated if estimator is None else settings_of(estimator))
         for label in labels:
@@ -379,16 +398,3 @@ def _asked(
     if len(chosen) > 1:
         raise BadInput(f"{', '.join(chosen)}: one estimator is diagnosed at a time; give one")
     return source, chosen
-
-
-def _notes(done: Replay, sentences: Sequence[Sentence]) -> list[str]:
-    notes = list(done.judge.components_without_truth)
-    if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
-        notes.append(
-            "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"
-        )
-    elif len(done.logs) == 1:
-        notes.append("one run: the interval of NEES is that of a single step; give more to fuselog run")
-    if len(sentences) > MOST_SENTENCES:
-        notes.append(f"{len(sentences) - MOST_SENTENCES} more were found; mend these first")
-    return notes

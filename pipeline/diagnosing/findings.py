@@ -119,17 +119,19 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
 
 
 def of_innovations(
-    innovations: Mapping[str, Stream], gate: float, epoch_ns: int, *, has_outliers: bool
+    innovations: Mapping[str, Stream], gate: float | None, epoch_ns: int, *, has_outliers: bool
 ) -> Iterator[Finding]:
-    """What the gate keeps out, and where a filter diverges; `gate` is its probability."""
+    """What the gate keeps out, and where a filter diverges; `gate` is its probability, if it is ours."""
     for topic, stream in innovations.items():
         case = split_topic(topic)[1] or "the estimate"
         is_in = stream["accepted"] != 0
         times_ns = stream.publish_time_ns
         share = float(np.mean(~is_in)) if len(stream) else 0.0
-        of_all = (
-            f"{100.0 * share:.2g} % of the measurements, where {100.0 * (1.0 - gate):.2g} % are expected"
-        )
+        of_all, reopened, opened = f"{100.0 * share:.2g} % of the measurements", "", ""
+        if gate is not None:
+            of_all += f", where {100.0 * (1.0 - gate):.2g} % are expected"
+            reopened = "; --set gate_probability=1, or gate_reopens_s=1"
+            opened = "; --set gate_probability=1 until the cause is mended"
         locked_out = _long_runs(~is_in, LOCKED_OUT)
         if locked_out:
             begin, end = locked_out[0]
@@ -139,16 +141,14 @@ def of_innovations(
                 topic,
                 f"{case}: the gate keeps out all {end - begin} measurements from "
                 f"{_at(times_ns[begin], epoch_ns)} to {_at(times_ns[end - 1], epoch_ns)}{more}, "
-                f"{of_all}: also what would correct the filter; --set gate_probability=1, or "
-                "gate_reopens_s=1",
+                f"{of_all}: also what would correct the filter{reopened}",
                 int(times_ns[begin]),
             )
         elif share > KEPT_OUT and not has_outliers:
             yield Finding(
                 "gate",
                 topic,
-                f"{case}: the gate keeps out {of_all}, and they are no outliers; "
-                "--set gate_probability=1 until the cause is mended",
+                f"{case}: the gate keeps out {of_all}, and they are no outliers{opened}",
             )
         yield from _divergence(topic, case, stream, epoch_ns)
 

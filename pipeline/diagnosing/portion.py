@@ -1,4 +1,4 @@
-"""Long logs: causes are sought in their first part, and tried on the rest."""
+"""What is diagnosed: of a long log its first part, of an autopilot what it recorded itself."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -7,12 +7,15 @@ import numpy as np
 
 from pipeline.altering.sources import alter, split_settings
 from pipeline.api.replays import Replay, replay
+from pipeline.comparing.renamed import Renamed
 from pipeline.diagnosing.advice import number
+from pipeline.runs.ensemble import Pass, judge_logs
 from recorders.log import RunMetadata, Schema, Stream, schemas
 from recorders.log.streams import concatenate
 from recorders.parameters import merge
 from replay.engine.replaying.estimator import Bound
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.judging.metrics.measuring import find_metrics
 
 MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
 
@@ -32,7 +35,7 @@ class Outputs(Mapping[str, Stream]):
         ]
 
     def __getitem__(self, topic: str) -> Stream:
-        return self._estimates[topic]
+        return self._estimates.read([topic])[topic]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._topics)
@@ -44,6 +47,13 @@ class Outputs(Mapping[str, Stream]):
         """Whether all of them have a column."""
         firsts = (next(iter(self._estimates.blocks([topic], "publish_time", 1))) for topic in self)
         return all(column in stream.columns for first in firsts for stream in first.values())
+
+
+def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:
+    """The estimates that a recording has of an estimator, as if a replay had made them."""
+    estimates = Renamed(source, label, label)
+    judge = judge_logs([estimates], [source], find_metrics(), gap_limit_s=gap_limit_s)
+    return Replay([source], [estimates], {label: {}}, Pass(judge, {label: {}}), gap_limit_s)
 
 
 class Portion(NamedTuple):

@@ -3,10 +3,17 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from pipeline.api.replays import Replay
 from pipeline.diagnosing.advice import Trying
 from pipeline.diagnosing.causes import Cause
 from pipeline.diagnosing.findings import FIRST, Finding
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
+from pipeline.output.results import split_metric
+from recorders.log import Stream, schemas
+from replay.engine.streams.failures import reason_stream
+from replay.judging.errors.evaluation import split_topic
 
 # What explains the numbers themselves, and no noise or bias that would have to be large.
 OF_FORM = (
@@ -15,6 +22,7 @@ OF_FORM = (
 )
 CONSEQUENCES = ("delay", "clock drift", "measurement noise", "process noise")  # of such stamps
 
+MOST_SENTENCES = 5
 Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over the rest of a long log
 
 
@@ -75,6 +83,42 @@ def ranked(
         *(_sentence(each, trying, of_stamps, rest) for each in causes),
         *map(Sentence.of, after),
     ]
+
+
+def marks_of(
+    sentences: Sequence[Sentence], label: str, outputs: Sequence[str], first_ns: int
+) -> dict[str, Stream]:
+    """Sentences as messages by topic, for a timeline: at the stamp where each one began.
+
+    `outputs` are the topics of what was estimated, `first_ns` is the first stamp of the log.
+    """
+    cases = list(dict.fromkeys(split_topic(topic)[1] for topic in outputs))
+    found: dict[str, list[Sentence]] = {}
+    for each in sentences:
+        case = next((case for case in cases if case and each.topic.startswith(f"/{case}/")), cases[0])
+        found.setdefault(case, []).append(each)
+    marks = {}
+    for case, own in found.items():
+        own = sorted(own, key=lambda each: each.time_ns or first_ns)
+        topic = "/".join(filter(None, ("/estimates", label, case, "diagnosis")))
+        times_ns = np.array([each.time_ns or first_ns for each in own], np.int64)
+        words = [each.words for each in own]
+        marks[topic] = reason_stream(topic, schemas.DIAGNOSED, times_ns, np.arange(len(own)), words)
+    return marks
+
+
+def notes_of(done: Replay, sentences: Sequence[Sentence]) -> list[str]:
+    """What has to be known of a diagnosis: what was not judged, and how many sentences are not said."""
+    notes = list(done.judge.components_without_truth)
+    if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
+        notes.append(
+            "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"
+        )
+    elif len(done.logs) == 1:
+        notes.append("one run: the interval of NEES is that of a single step; give more to fuselog run")
+    if len(sentences) > MOST_SENTENCES:
+        notes.append(f"{len(sentences) - MOST_SENTENCES} more were found; mend these first")
+    return notes
 
 
 def _sentence(

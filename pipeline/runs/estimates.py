@@ -12,11 +12,17 @@ from recorders.errors import BadInput
 from recorders.log import Log, open_log
 from recorders.parsing import parse_json
 from replay.engine.streams.sources import LogSource, MemorySource, Source
+from replay.judging.errors.evaluation import split_topic
 
 
 def log_of_estimates(estimates: Log) -> Path:
-    """The log that an estimates log was replayed from; raises BadInput where it is not to be found."""
+    """The log that an estimates log was replayed from; raises BadInput where it is not to be found.
+
+    A recording that has estimates beside its sensors is itself what they are of.
+    """
     named = estimates.run.notes.get("log") if estimates.run else None
+    if named is None and recorded_estimators(estimates):
+        return estimates.path
     if named is None:
         raise BadInput(
             f"{estimates.path}: does not state the log that it was made from; give that with --log"
@@ -51,6 +57,22 @@ def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
     except ValueError:
         return {}
     return stated if isinstance(stated, dict) else {}
+
+
+def labels_of(estimates: Log | Source) -> list[str]:
+    """The estimators of which a log has estimates."""
+    topics = (topic for topic in estimates.topics if topic.startswith("/estimates/"))
+    return list(dict.fromkeys(split_topic(topic)[0] for topic in topics))
+
+
+def recorded_estimators(log: Log | Source) -> list[str]:
+    """The estimators of which a recording has estimates beside its sensors, such as an autopilot's own.
+
+    An estimates log, which is of another log, has none of these.
+    """
+    notes = log.run.notes if log.run else {}
+    has_sensors = any(not topic.startswith("/estimates/") for topic in log.topics)
+    return labels_of(log) if has_sensors and "log" not in notes else []
 
 
 def hash_streams(sources: Iterable[MemorySource]) -> str:

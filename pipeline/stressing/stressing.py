@@ -146,7 +146,7 @@ def _is_doubtful(each: Tried) -> bool:
 def _estimates(done: Replay, run: int) -> dict[str, Stream]:
     log = done.estimates[run]
     wanted = schemas.GAUSSIAN_ESTIMATE.full_name
-    return {topic: log[topic] for topic, each in log.topics.items() if each.schema_name == wanted}
+    return log.read([topic for topic, each in log.topics.items() if each.schema_name == wanted])
 
 
 def _tried(

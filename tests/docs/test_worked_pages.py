@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tarfile
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from importlib.util import find_spec
@@ -37,8 +38,10 @@ WORKED = [
     "your-log",
     "your-model",
     "timeline",
+    "flight",
     pytest.param("navigation", marks=pytest.mark.paper),
 ]
+FLIGHT = "sensors/sensors-data.tar.xz", "ulog/sample_logging_tagged_and_default_params.ulg"
 UNCOMPILED = ["your-model"]  # a model of the page's own: quicker in Python than its kernels are compiled
 PEERS = (
     "evo",
@@ -100,6 +103,8 @@ def test_a_page_can_be_worked_through(
     monkeypatch.chdir(tmp_path)
     if name in UNCOMPILED:
         request.getfixturevalue("uncompiled")
+    if name == "flight":
+        _unpack_flight(request.getfixturevalue("real_data"))
     names: dict[str, Any] = {}
     printed, shown, left_out = "", 0, list[str]()
     for language, file, text in blocks_of(name):
@@ -122,6 +127,14 @@ def test_a_page_can_be_worked_through(
     assert shown, "a worked page shows what its commands print"
     if left_out:
         pytest.skip(f"all but the code for {', '.join(left_out)}, which are not installed here")
+
+
+def _unpack_flight(data: Path) -> None:
+    archive, log = FLIGHT
+    with tarfile.open(data / archive) as members:
+        member = members.extractfile(f"./{log}")
+        assert member is not None
+        Path("flight.ulg").write_bytes(member.read())
 
 
 def test_a_drawing_of_ones_own_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from pyulog import ULog
 
+import fuselog as fl
 from recorders.errors import BadInput
 from recorders.importers.ulog.file import MAGIC, UlogFile
 from recorders.importers.ulog.importer import ULOG, UlogParameters
+from recorders.importers.ulog.settings import carried, stated_noise
 from recorders.models.orientation import rotate
 
 # Of the sheet, section 6: streams, rows, changed parameters, defaults, texts, dropouts and their ms.
@@ -100,14 +102,20 @@ def test_the_filters_state_is_an_estimate_near_the_simulators_truth(logs: Path):
 
 
 def test_innovations_are_new_ones_of_sensors_that_were_fused(logs: Path):
-    streams = streams_of(logs / f"{TAGGED}.ulg")
-    found = {topic.split("/")[4] for topic in streams if topic.startswith("/estimates/ekf2/v")}
-    assert found == {"barometer", "gnss_position", "heading", "state"}
+    def sensors_of(streams: dict) -> set[str]:
+        return {topic.split("/")[4] for topic in streams if topic.startswith("/estimates/ekf2/v")}
+
+    # It waits for its fixes, and holds its place until then.
+    assert sensors_of(streams_of(logs / f"{TAGGED}.ulg")) == {"barometer", "heading", "state"}
+    streams = streams_of(logs / "sample_px4_events.ulg")
+    gnss = {"gnss_position", "gnss_velocity"}
+    assert sensors_of(streams) == {"barometer", *gnss, "gravity", "heading", "state"}
     stream = streams["/estimates/ekf2/vehicle/gnss_position/innovation"]
+    assert len(stream) == 22  # of 31; before it had an origin nine were a thousand kilometres long
+    assert np.abs(stream["innovation"]).max() < 1.0
     assert (np.diff(stream["innovation"][:, :2], axis=0) != 0.0).any(axis=1).all()
-    assert np.isnan(stream["innovation"][:, 2]).all()  # the height is the barometer's
-    variance = stream["covariance"].reshape(-1, 3, 3)[:, [0, 1], [0, 1]]
-    nis = (stream["innovation"][:, :2] ** 2 / variance).sum(axis=1)
+    variance = np.diagonal(stream["covariance"].reshape(-1, 3, 3), axis1=1, axis2=2)
+    nis = (stream["innovation"] ** 2 / variance).sum(axis=1)
     np.testing.assert_allclose(stream["normalised_innovation_squared"], nis)
 
 
@@ -127,7 +135,9 @@ def message(kind: str, body: bytes, size: int | None = None) -> bytes:
     return struct.pack("<HB", len(body) if size is None else size, ord(kind)) + body
 
 
-def by_hand(*extra: bytes, formats: tuple[str, ...] = (), last: bytes = b"", rows: int = 300) -> bytes:
+def by_hand(
+    *extra: bytes, formats: tuple[str, ...] = (), last: bytes = b"", rows: int = 300, marks: bool = True
+) -> bytes:
     """A log of `sensor_combined`, with more definitions, then messages before its rows."""
     layout = "sensor_combined:uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;"
     parts = [MAGIC + b"\x01" + struct.pack("<Q", 1_000_000)]
@@ -137,7 +147,7 @@ def by_hand(*extra: bytes, formats: tuple[str, ...] = (), last: bytes = b"", row
     for row in range(rows):
         values = struct.pack("<HQ6f", 7, 1_000_000 + 4000 * row, row, 2, 3, 0, 0, -9.8)
         parts.append(message("D", values))
-        if row % 50 == 0:
+        if marks and row % 50 == 0:
             parts.append(message("S", bytes.fromhex("2f731320250cbb12")))
     return b"".join([*parts, last])
 
@@ -151,19 +161,45 @@ def read(path: Path, content: bytes) -> tuple[np.ndarray, dict[str, str]]:
     return stream["turn_rate_radps"][:, 0] - row, blocks.notes
 
 
-def test_a_log_that_is_cut_gives_what_is_whole(tmp_path: Path):
+def rows_in(path: Path, content: bytes) -> bytes:
+    """The rows of `sensor_combined` that a file has, as they lie there; none where it is refused."""
+    path.write_bytes(content)
+    rows, said = None, ""
+    try:
+        rows = columns_of(UlogFile(path)).get(("sensor_combined", 0))
+    except BadInput as error:
+        said = str(error)
+    assert re.fullmatch(r"(/[^:]*\.ulg: [^:]*[;:][^:]*(: [^:]*)?)?", said), said
+    return b"" if rows is None else rows.tobytes()
+
+
+def test_a_log_that_is_cut_at_any_thousandth_gives_what_is_whole(tmp_path: Path):
     whole = by_hand()
-    for cut in np.unique(np.linspace(0, len(whole), 100).astype(int)):
-        off, said = np.zeros(0), ""
-        try:
-            off, _ = read(tmp_path / "cut.ulg", whole[:cut])
-        except BadInput as error:
-            said = str(error)
+    every = rows_in(tmp_path / "cut.ulg", whole)
+    assert len(every) == 300 * 32
+    begin = whole.index(b"D\x07\x00") - 2
+    for cut in np.linspace(0, len(whole), 1001).astype(int):
+        found = rows_in(tmp_path / "cut.ulg", whole[:cut])
+        assert every.startswith(found)
+        assert len(found) // 32 >= (cut - begin - 6 * 11) // 37
+    for cut in np.linspace(begin + 40, len(whole), 20).astype(int):
+        off, _ = read(tmp_path / "cut.ulg", whole[:cut])
+        assert len(off)
         assert not off.any()
-        assert len(off) or re.fullmatch(rf"{tmp_path}/cut.ulg: [^:]*[;:][^:]*(: log .*)?", said), said
-        begin = whole.index(b"D\x07\x00") - 2
-        assert len(off) >= (cut - begin - 6 * 11) // 37
-    assert len(read(tmp_path / "whole.ulg", whole)[0]) == 300
+
+
+def test_a_flipped_bit_changes_one_row_or_costs_those_up_to_the_next_mark(tmp_path: Path):
+    """Numbers have no checksum, so that nobody can know of theirs."""
+    whole = by_hand()
+    every = {each.tobytes() for each in np.frombuffer(rows_in(tmp_path / "whole.ulg", whole), "V32")}
+    rng = np.random.default_rng(6)
+    for _ in range(200):
+        content = bytearray(whole)
+        content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
+        found = np.frombuffer(rows_in(tmp_path / "cut.ulg", bytes(content)), "V32")
+        changed = sum(each.tobytes() not in every for each in found)
+        assert changed <= 1
+        assert len(found) + changed >= 240 or not len(found)
 
 
 def test_what_flips_in_heads_costs_rows_and_no_wrong_number(tmp_path: Path):
@@ -184,11 +220,14 @@ def test_what_flips_in_heads_costs_rows_and_no_wrong_number(tmp_path: Path):
             assert any(each.startswith("lost, ") for each in notes)
 
 
+@pytest.mark.parametrize("marks", [True, False], ids=["marks", "no marks"])
 @pytest.mark.parametrize("size", [0, 65535])
-def test_an_impossible_length_costs_no_more_than_up_to_the_next_mark(tmp_path: Path, size: int):
-    off, notes = read(tmp_path / "length.ulg", by_hand(message("D", b"", size=size)))
+def test_an_impossible_length_costs_no_more_than_up_to_the_next_rows(
+    tmp_path: Path, size: int, marks: bool
+):
+    off, notes = read(tmp_path / "length.ulg", by_hand(message("D", b"", size=size), marks=marks))
     assert not off.any()
-    assert len(off) >= 250
+    assert len(off) >= 299
     assert any(each.startswith("lost, ") for each in notes)
 
 
@@ -242,3 +281,95 @@ def test_a_parameter_that_changes_is_no_value_from_the_start(tmp_path: Path):
     assert stream.components == ["SOME_X"]
     assert stream["value"].ravel().tolist() == [1.5, 2.5]
     assert stream.publish_time_ns[1] == 1000 * (1_000_000 + 299 * 4000)
+
+
+def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(tmp_path: Path):
+    """PX4's are predicted minus measured, north, east, down and forward, right, down; see `_SENSORS`."""
+    predicted = {
+        "gps_hpos": [10, 20],
+        "gps_vpos": [-30],
+        "heading": [0.5],
+        "mag_field": [0.2, 0.1, 0.4],
+        "flow": [0.1, 0.2],
+        "baro_vpos": [-30],
+    }
+    measured = {
+        "gps_hpos": [11, 22],
+        "gps_vpos": [-33],
+        "heading": [0.7],
+        "mag_field": [0.3, 0.15, 0.45],
+        "flow": [0.15, 0.3],
+        "baro_vpos": [-31],
+    }
+    fields = "".join(f"float[{len(each)}] {name};" for name, each in predicted.items()).replace(
+        "[1]", ""
+    )
+    topics = ("estimator_innovations", "estimator_innovation_variances", "estimator_status")
+    stamps = "uint64_t timestamp;uint64_t timestamp_sample;"
+    formats = tuple(f"{topic}:{stamps}{fields}" for topic in topics[:2])
+    formats += (f"{topics[2]}:{stamps}uint64_t control_mode_flags;",)
+    subscribed = [message("A", struct.pack("<BH", 0, 20 + n) + t.encode()) for n, t in enumerate(topics)]
+    off = np.concatenate([np.subtract(predicted[name], measured[name]) for name in predicted])
+    in_use = sum(1 << bit for bit in (2, 3, 4, 5, 9))  # not the height of fixes
+
+    def row(number: int, stamp: int, body: bytes) -> bytes:
+        return message("D", struct.pack("<HQQ", number, stamp, stamp) + body)
+
+    rows = b""
+    for step, flags in enumerate((in_use, 0, in_use)):
+        stamp = 1_000_000 + 100_000 * step
+        rows += row(22, stamp, struct.pack("<Q", flags))
+        rows += row(20, stamp, ((1 + step) * off).astype("<f4").tobytes())
+        rows += row(21, stamp, np.ones(len(off), "<f4").tobytes())
+    path = tmp_path / "signs.ulg"
+    gate = message("P", bytes([21]) + b"float EKF2_GPS_P_GATE" + struct.pack("<f", 5.0))
+    whole = by_hand(*subscribed, formats=formats, last=rows)
+    other = message("P", bytes([12]) + b"float SOME_X" + struct.pack("<f", 1.5))
+    path.write_bytes(whole.replace(other, other + gate))
+    streams = streams_of(path)
+    expected = {
+        "gnss_position": [2, 1, np.nan],  # east, north; 22 and 11 were measured, 20 and 10 predicted
+        "barometer": [1],
+        "heading": [-0.2],  # counterclockwise from east: 90 deg less PX4's
+        "magnetometer": [0.1, -0.05, -0.05],
+        "flow": [0.05, -0.1],
+    }
+    for name, once in expected.items():
+        innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]
+        np.testing.assert_allclose(innovation, [once, np.multiply(3, once)], rtol=1e-5)
+    stream = streams["/estimates/ekf2/vehicle/gnss_position/innovation"]
+    assert stream["accepted"].tolist() == [1, 0]  # the last is six standard deviations to the east
+
+
+def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
+    """Noise by the sheet, section 1: PX4's defaults are .0015 and .035 for a step of 10 ms."""
+    parameters = {
+        "EKF2_GYR_NOISE": 0.015,
+        "EKF2_ACC_NOISE": 0.35,
+        "EKF2_PREDICT_US": 10_000,
+        "EKF2_GPS_DELAY": 110.0,
+        "EKF2_GPS_POS_Y": 0.3,
+        "EKF2_IMU_POS_Y": 0.1,
+        "EKF2_ABIAS_INIT": 0.2,
+        "EKF2_HDG_GATE": 2.6,
+        "EKF2_TAU_POS": 0.25,
+        "CAL_ACC0_XOFF": 0.1,
+        "MPC_XY_P": 1.0,
+    }
+    stated = stated_noise(parameters)["inertial"]
+    assert stated == {"gyro_noise_density": "0.0015", "force_noise_density": "0.035"}
+    notes = carried(parameters)
+    settings = notes.pop("settings that the filter had").split(" --set ")
+    assert settings == [
+        "--set fix_delay_s=0.11",
+        "velocity_delay_s=0.11",
+        "force_bias_sigma_mps2=0.2",
+        "lever_y_m=-0.2",
+    ]
+    replayed = fl.replay(fl.record("navigation", duration_s=12.0), "ekf", set=dict(
+        each.removeprefix("--set ").split("=") for each in settings
+    ))  # fmt: skip
+    assert not replayed.failures  # the model has them all
+    assert notes["EKF2_HDG_GATE"].startswith("test each component by itself")
+    assert notes["EKF2_TAU_POS"] == "have no counterpart in the model inertial"
+    assert notes["CAL_ACC0_XOFF"].startswith("had their effect before")

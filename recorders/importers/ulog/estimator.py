@@ -4,7 +4,8 @@ PX4's innovations are what was predicted minus what was measured; ours have the 
 component after the other, and logs the variance of each alone: the covariances here are diagonal.
 """
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -33,44 +34,74 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 
 
 class _Sensor(NamedTuple):
-    """The innovations of a sensor: their fields, and what we call them; with the sign that is ours."""
+    """The innovations of a sensor: their fields, and what we call them; with the sign that is ours.
+
+    `bits` are by component those of the filter's status that say that it is in use: one of them is set;
+    none where no bit says it.
+    """
 
     fields: tuple[str, ...]
     components: tuple[str, ...]
     signs: tuple[float, ...]
+    bits: tuple[tuple[int, ...], ...]
 
 
-def _enu(what: str, unit: str, horizontal: str, vertical: str) -> _Sensor:
-    fields = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
+def _enu(what: str, unit: str, fields: tuple[str, str], bits: tuple[int, int]) -> _Sensor:
+    """Of north, east, down: `fields` and `bits` are those of the horizontal and of the vertical."""
+    (horizontal, vertical), (level, height) = fields, bits
     names = tuple(f"{what}{axis}_{unit}" for axis in "xyz")
-    return _Sensor(fields, names, (-1.0, -1.0, 1.0))
+    every = (f"{horizontal}[1]", f"{horizontal}[0]", vertical)
+    return _Sensor(every, names, (-1.0, -1.0, 1.0), ((level,), (level,), (height,)))
 
 
-def _flu(name: str, unit: str) -> _Sensor:
-    fields = tuple(f"{name}[{index}]" for index in range(3))
-    return _Sensor(fields, tuple(f"{name}_{axis}_{unit}" for axis in "xyz"), (-1.0, 1.0, 1.0))
+def _flu(name: str, unit: str, bits: tuple[int, ...], axes: str = "xyz") -> _Sensor:
+    """Of the body's forward, right, down, or the first of these."""
+    fields = tuple(f"{name}[{index}]" for index in range(len(axes)))
+    names = tuple(f"{name}_{axis}_{unit}" for axis in axes)
+    return _Sensor(fields, names, (-1.0, 1.0, 1.0)[: len(axes)], (bits,) * len(axes))
 
 
+def _single(field: str, name: str, sign: float, *bits: int) -> _Sensor:
+    return _Sensor((field,), (name,), (sign,), (bits,))
+
+
+# Signs and order by PX4's src/modules/ekf2/EKF: `_state.vel(i) - gps_sample.vel(i)` and `_state.pos(i) -
+# position(i)`, north, east, down (gps_fusion.cpp; of heights baro_height_control.cpp); `getEulerYaw -
+# measured_hdg`, clockwise (mag_control.cpp); `mag_I_body - mag_observation`; `predicted_flow -
+# opt_flow_rate` about forward and right (optflow_fusion.cpp); `pred_acc - mea_acc` (drag_fusion.cpp);
+# `v_tas_pred - true_airspeed` (airspeed_fusion.cpp). Bits by `filter_control_status_u` (common.h), the
+# same up to version 1.15. While EKF2 has no fix it holds its place, and logs innovations of that in the
+# fields of fixes: `_gps_pos_innov.xy() = Vector2f(_state.pos) - _last_known_posNE` (control.cpp).
 _SENSORS = {
-    "gnss_velocity": _enu("v", "mps", "gps_hvel", "gps_vvel"),
-    "gnss_position": _enu("", "m", "gps_hpos", "gps_vpos"),
-    "vision_velocity": _enu("v", "mps", "ev_hvel", "ev_vvel"),
-    "vision_position": _enu("", "m", "ev_hpos", "ev_vpos"),
-    "barometer": _Sensor(("baro_vpos",), ("z_m",), (1.0,)),
-    "range": _Sensor(("rng_vpos",), ("z_m",), (1.0,)),
-    "heading": _Sensor(("heading",), ("heading_rad",), (1.0,)),
-    "magnetometer": _flu("mag_field", "gauss"),
-    "gravity": _flu("gravity", "g"),
-    "flow": _Sensor(("flow[0]", "flow[1]"), ("flow_x_radps", "flow_y_radps"), (-1.0, -1.0)),
-    "drag": _Sensor(("drag[0]", "drag[1]"), ("drag_x_mps2", "drag_y_mps2"), (-1.0, -1.0)),
-    "airspeed": _Sensor(("airspeed",), ("airspeed_mps",), (-1.0,)),
-    "sideslip": _Sensor(("beta",), ("sideslip_rad",), (-1.0,)),
+    "gnss_velocity": _enu("v", "mps", ("gps_hvel", "gps_vvel"), (2, 2)),
+    "gnss_position": _enu("", "m", ("gps_hpos", "gps_vpos"), (2, 11)),
+    "vision_velocity": _enu("v", "mps", ("ev_hvel", "ev_vvel"), (24, 24)),
+    "vision_position": _enu("", "m", ("ev_hpos", "ev_vpos"), (12, 14)),
+    "barometer": _single("baro_vpos", "z_m", 1.0, 9),
+    "range": _single("rng_vpos", "z_m", 1.0, 10),
+    "heading": _single("heading", "heading_rad", 1.0, 4, 13, 22),
+    "magnetometer": _flu("mag_field", "gauss", (5, 35)),
+    "gravity": _flu("gravity", "mps2", (34,)),
+    "flow": _flu("flow", "radps", (3,), "xy"),
+    "drag": _flu("drag", "mps2", (), "xy"),
+    "airspeed": _single("airspeed", "airspeed_mps", -1.0, 19),
+    "sideslip": _single("beta", "sideslip_rad", -1.0, 15),
 }
-# The names that old firmware has for the same, in one topic with their variances.
+# The parameters of a sensor's noise and of its gate, in standard deviations: EKF2_*_NOISE, EKF2_*_GATE.
+_PARAMETERS = {
+    "gnss_velocity": ("GPS_V", "GPS_V"), "gnss_position": ("GPS_P", "GPS_P"),
+    "vision_velocity": ("EVV", "EVV"), "vision_position": ("EVP", "EVP"), "barometer": ("BARO", "BARO"),
+    "range": ("RNG", "RNG"), "heading": ("HEAD", "HDG"), "magnetometer": ("MAG", "MAG"),
+    "gravity": ("GRAV", ""), "flow": ("OF_N_MIN", "OF"), "drag": ("DRAG", ""),
+    "airspeed": ("EAS", "TAS"), "sideslip": ("BETA", "BETA"),
+}  # fmt: skip
+# The names that old firmware has for the same, in one topic with their variances: "0-2 vel, 3-5 pos"
+# (estimator_interface.h). The height is that of the sensor in use.
 _OLD = {
     "gps_hvel[0]": "vel_pos_innov{}[0]", "gps_hvel[1]": "vel_pos_innov{}[1]",
     "gps_vvel": "vel_pos_innov{}[2]", "gps_hpos[0]": "vel_pos_innov{}[3]",
-    "gps_hpos[1]": "vel_pos_innov{}[4]", "gps_vpos": "vel_pos_innov{}[5]",
+    "gps_hpos[1]": "vel_pos_innov{}[4]",
+    **dict.fromkeys(("gps_vpos", "baro_vpos"), "vel_pos_innov{}[5]"),
     "heading": "heading_innov{}", "airspeed": "airspeed_innov{}", "beta": "beta_innov{}",
     **{f"mag_field[{index}]": f"mag_innov{{}}[{index}]" for index in range(3)},
     **{f"flow[{index}]": f"flow_innov{{}}[{index}]" for index in range(2)},
@@ -104,14 +135,29 @@ def label_of(instance: int) -> str:
 
 
 class Autopilot:
-    """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block."""
+    """Makes estimates and truth of the topics of EKF2 and of a simulator, block after block.
 
-    def __init__(self) -> None:
+    `left_out` counts what it leaves out, by reason. The autopilot's `parameters` have its gates.
+    """
+
+    def __init__(self, parameters: Mapping[str, float]) -> None:
+        self._gates = {
+            sensor: parameters.get(f"EKF2_{gate}_GATE", np.inf)
+            for sensor, (_, gate) in _PARAMETERS.items()
+        }
+        self.left_out: Counter[str] = Counter()
         self._waiting: dict[tuple[str, int], _Table] = {}
         self._last: dict[tuple[int, str], Floats] = {}
+        self._status: dict[int, _Table] = {}
 
     def parts(self, rows: list[Rows]) -> Iterator[Part]:
         """The parts of a block's rows; what lacks its counterpart waits for the next block."""
+        for each in rows:
+            fields = Fields(each)
+            if fields.has("control_mode_flags"):
+                status = _table(fields, ["control_mode_flags"])
+                known = self._status.get(each.instance, status.take(slice(0)))
+                self._status[each.instance] = known.take(slice(-1, None)).then(status)
         for each in rows:
             fields = Fields(each)
             if each.topic in ("estimator_states", "estimator_status") and fields.has("states[9]"):
@@ -167,22 +213,45 @@ class Autopilot:
             before = self._last.get((instance, name), np.full((1, len(columns)), np.nan))
             self._last[instance, name] = value[-1:]
             is_new = (np.diff(value, axis=0, prepend=before) != 0.0).any(axis=1)
-            is_fused = np.isfinite(value) & np.isfinite(variance) & (variance > 0.0)
+            is_there = np.isfinite(value) & np.isfinite(variance) & (variance > 0.0)
+            is_fused = is_there & self._is_in_use(instance, sensor, innovations.time_us)
+            is_new &= is_there.any(axis=1)
+            unused = int((is_new & ~is_fused.any(axis=1)).sum())
+            if unused:
+                what = f"{label_of(instance)}: left out innovations of {name}, which was not in use"
+                self.left_out[what] += unused
             which = np.flatnonzero(is_new & is_fused.any(axis=1))
             if not len(which):
                 continue
-            # What is not fused has a ratio of zero.
-            is_rejected = np.zeros(len(which), bool)
-            if ratios is not None:
-                is_rejected |= (ratios[which][:, columns] > 1.0).any(axis=1)
             kept = np.where(is_fused, value, np.nan)[which] * sensor.signs
             spread = np.where(is_fused, variance, np.nan)[which]
+            # By setEstimatorAidStatusTestRatio; the ratios that are logged may be of other samples.
+            tested = kept**2 / spread / self._gates[name] ** 2
+            if ratios is not None:
+                stated = ratios[which][:, columns]
+                tested = np.where(np.isfinite(stated), stated, tested)
+            is_accepted = np.logical_not((tested > 1.0).any(axis=1))
             yield _innovation(
                 f"/estimates/{label_of(instance)}{BODY}/{name}/innovation",
                 sensor.components,
                 innovations.take(which),
-                (kept, spread, ~is_rejected),
+                (kept, spread, is_accepted),
             )
+
+    def _is_in_use(
+        self, instance: int, sensor: _Sensor, time_us: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Whether the filter corrected itself by a sensor's components (n, m), as its status says."""
+        is_used = np.ones((len(time_us), len(sensor.fields)), bool)
+        status = self._status.get(instance)
+        if status is None:
+            return is_used
+        rows = np.searchsorted(status.time_us, time_us, side="right") - 1
+        flags = np.where(rows >= 0, status.values[np.maximum(rows, 0), 0], 0.0).astype(np.int64)
+        for column, bits in enumerate(sensor.bits):
+            if bits:
+                is_used[:, column] = (flags & sum(1 << bit for bit in bits)) != 0
+        return is_used
 
     def _truth(self) -> Iterator[Part]:
         """The simulator's truth: positions and velocities at the stamps of its attitudes."""
@@ -239,6 +308,8 @@ def _innovation(
         "log_likelihood": -0.5 * (squared + logs).sum(axis=1),
     }
     metadata = {**state_metadata(components), "truth": TRUTH}
+    noise = _PARAMETERS[topic.split("/")[-2]][0]
+    metadata["noise"] = f"EKF2_{noise}" if noise.startswith("OF_") else f"EKF2_{noise}_NOISE"
     return Part(topic, schemas.INNOVATION, at.time_us, at.logged_us, columns, metadata)
 
 

@@ -1,7 +1,7 @@
 """Reads a ULog in blocks: what it defines at its beginning, then the rows of its topics.
 
-What cannot be read is counted in `losses`, and reading goes on after it: at the next synchronisation
-message where a message is none, at its offset where a section was appended.
+What cannot be read is counted in `losses`, and reading goes on after it: where a message is none, at the
+next synchronisation message or rows that follow one another; at its offset where a section was appended.
 """
 
 import struct
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from recorders.errors import BadInput
 from recorders.importers.ulog.formats import TYPES, Damaged, FormatField, Layout, layout_of, parsed
-from recorders.importers.ulog.loops import BEYOND_BYTES, HEAD_BYTES, NUMBERS, Known, sort, walk
+from recorders.importers.ulog.loops import BEYOND_BYTES, HEAD_BYTES, NUMBERS, Known, resume, sort, walk
 
 MAGIC = bytes.fromhex("554c6f67011235")
 _SYNC = bytes.fromhex("080053") + bytes.fromhex("2f731320250cbb12")
@@ -166,15 +166,16 @@ class UlogFile:
         self, file: BinaryIO, begin: int, end: int, is_wanted: Callable[[str], bool]
     ) -> Iterator[list[Rows]]:
         """The rows between two bytes of the file; the message that the end cuts is none."""
-        held = bytearray(_PIECE_BYTES + BEYOND_BYTES)
-        data, free = np.frombuffer(held, np.uint8), memoryview(held)[:_PIECE_BYTES]
+        piece = min(_PIECE_BYTES, end - begin)
+        held = bytearray(piece + BEYOND_BYTES)
+        data, free = np.frombuffer(held, np.uint8), memoryview(held)[:piece]
         size, place, is_lost = 0, begin, False
         file.seek(begin)
         while True:
             size += file.readinto(free[size : max(end - place, 0)])  # type: ignore[attr-defined]
-            is_last = place + size >= end or size < _PIECE_BYTES
+            is_last = place + size >= end or size < piece
             if is_lost:
-                found = held.find(_SYNC, 0, size)
+                found = self._resumption(data, held, 0, size, place)
                 is_lost = found < 0
                 done = max(size - len(_SYNC), 0) if is_lost else found
                 self.losses[_PASSED_OVER] += done
@@ -185,7 +186,9 @@ class UlogFile:
                 done, is_broken, rows = self._walked(data, size, place, is_wanted)
                 if rows:
                     yield rows
-                is_lost = is_broken or (is_last and held.find(_SYNC, done + 1, size) >= 0)
+                is_lost = is_broken or (
+                    is_last and self._resumption(data, held, done + 1, size, place) >= 0
+                )
                 if is_lost:
                     self.losses[_PASSED_OVER] += 1
                     done += 1
@@ -195,6 +198,13 @@ class UlogFile:
                     return
             held[: size - done] = held[done:size]
             size, place = size - done, place + done
+
+    def _resumption(
+        self, data: NDArray[np.uint8], held: bytearray, begin: int, size: int, place: int
+    ) -> int:
+        """Where messages begin again: at a mark, which old firmware lacks, or at rows; or -1."""
+        found = [held.find(_SYNC, begin, size), resume(data, begin, size, place, self._known)]
+        return min((each for each in found if each >= 0), default=-1)
 
     def _walked(
         self, data: NDArray[np.uint8], size: int, place: int, is_wanted: Callable[[str], bool]

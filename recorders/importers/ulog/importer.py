@@ -57,7 +57,7 @@ class _Import:
 
     def __init__(self, file: UlogFile, origin: Origin | None) -> None:
         self._file, self._origin = file, origin
-        self._autopilot = Autopilot()
+        self._autopilot = Autopilot(file.parameters)
         self._noise = stated_noise(file.parameters)
         self._told: Counter[str] = Counter()
         self._first_ns: int | None = None
@@ -163,7 +163,7 @@ class _Import:
         notes |= carried(file.parameters)
         for number, text in enumerate(file.texts, start=1):
             notes[f"text {number}, {text.time_us * 1e-6:.3f} s, {text.level}"] = text.text
-        for what, count in (+self._told).items():
+        for what, count in (self._told + self._autopilot.left_out).items():
             notes[what] = str(count)
         for what, count in (+file.losses).items():
             notes[f"lost, {what}"] = str(count)

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from recorders.log.loops import loop_for, words_of
 
 HEAD_BYTES = 3
+# So many rows after one another, whose lengths are those of their topics, are no chance.
+CHAIN = 3
 # Beyond the bytes that are walked there have to be so many more, of any value.
 BEYOND_BYTES = 16
 NUMBERS = 1 << 16
@@ -60,6 +62,11 @@ def walk(data: NDArray[np.uint8], size: int) -> Walk:
     """Walk the first `size` bytes of `data`, which has BEYOND_BYTES more."""
     found, others, end, is_broken = loop_for(_walk, size)(words_of(data), size)
     return Walk(found, others, int(end), bool(is_broken))
+
+
+def resume(data: NDArray[np.uint8], begin: int, size: int, place: int, known: Known) -> int:
+    """Where after bytes that are no messages rows begin again: several, of lengths that fit; or -1."""
+    return int(loop_for(_resume, size)(words_of(data), begin, size, place, known))
 
 
 def sort(
@@ -140,3 +147,24 @@ def _walk(words, size):  # type: ignore[no-untyped-def] # numba infers the types
             other += 1
         position = end
     return data[:count].copy(), others[:other].copy(), position, is_broken
+
+
+def _resume(words, begin, size, place, known):  # type: ignore[no-untyped-def]
+    least, most, _, since, until = known
+    for first in range(begin, size - 5):
+        position, count = np.int64(first), 0
+        while count < CHAIN and position + 5 <= size:
+            head = words[position]
+            number = np.int64(head >> np.uint64(24) & np.uint64(0xFFFF))
+            length = np.int64(head & np.uint64(0xFFFF)) - 2
+            if np.int64(head >> np.uint64(16) & np.uint64(0xFF)) != 68:
+                break
+            if not since[number] <= place + position < until[number]:
+                break
+            if length < least[number] or length > most[number]:
+                break
+            position += length + 5
+            count += 1
+        if count == CHAIN:
+            return first
+    return -1

@@ -14,6 +14,7 @@ from recorders.log import Schema, schemas
 Floats = NDArray[np.float64]
 BODY = "/vehicle"
 _GAUSS_UT = 100.0
+_FIELD = ("field_x_ut", "field_y_ut", "field_z_ut")
 # A time that is not known, as PX4 has it in microseconds relative to the stamp.
 _INVALID_US = 2**31 - 1
 
@@ -113,7 +114,9 @@ def _inertial(fields: Fields, topic: str, force: Floats, rate: Floats) -> Part:
 
 def _magnetic(fields: Fields, topic: str, field_ut: Floats) -> Part:
     unknown = np.full((len(field_ut), 9), np.nan)
-    return fields.part(topic, schemas.MAGNETIC_FIELD, magnetic_field_ut=field_ut, covariance_ut2=unknown)
+    metadata = {"components": ",".join(_FIELD), "kinds": ",".join(["linear"] * len(_FIELD))}
+    columns = {"magnetic_field_ut": field_ut, "covariance_ut2": unknown}
+    return fields.part(topic, schemas.MAGNETIC_FIELD, metadata, **columns)
 
 
 def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:

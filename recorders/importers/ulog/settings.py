@@ -1,6 +1,7 @@
-"""What parameters of PX4's EKF2 mean for a model of ours."""
+"""What parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing there."""
 
 from collections.abc import Mapping
+from fnmatch import fnmatchcase
 
 # EKF2's noise is the density over the root of its step: its variance is (step x noise)^2 in a step.
 _DENSITIES = {
@@ -11,7 +12,23 @@ _DENSITIES = {
 }
 _STEP_US = "EKF2_PREDICT_US"
 _DEFAULT_STEP_US = 10_000
+# By parameter, settings and what a unit of it is in theirs.
+_SETTINGS = {
+    "EKF2_GPS_DELAY": (("fix_delay_s", "velocity_delay_s"), 1e-3),
+    "EKF2_ABIAS_INIT": (("force_bias_sigma_mps2",), 1.0),
+    "EKF2_GBIAS_INIT": (("gyro_bias_sigma_radps",), 1.0),
+    "EKF2_ANGERR_INIT": (("tilt_sigma_rad",), 1.0),
+}
 _LEVERS = {"X": ("lever_x_m", 1.0), "Y": ("lever_y_m", -1.0), "Z": ("lever_z_m", -1.0)}
+# Why parameters do not carry over, by their names; the first that fits counts.
+_REASONS = {
+    "CAL_*": "had their effect before sensor_combined and vehicle_imu were logged; accelerometer_N, "
+    "gyro_N and magnetometer_N are as they were before",
+    "EKF2_*_GATE": "test each component by itself; ours all of a message at once: gate_probability",
+    "EKF2_GPS_?_NOISE": "are the least that EKF2 believes; here fixes have the noise that they state",
+    "EKF2_MAG_NOISE": "is, in gauss, a hundredth of sigma_field_ut, where the magnetometer is taken",
+    "EKF2_*": "have no counterpart in the model inertial",
+}
 
 
 def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
@@ -26,27 +43,29 @@ def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
 
 
 def carried(parameters: Mapping[str, float]) -> dict[str, str]:
-    """What becomes of the filter's parameters, by subject: channels' numbers, settings, or nothing."""
+    """What becomes of parameters, by subject: numbers of channels, settings, or why nothing."""
     notes = {}
-    used = {_STEP_US}
     stated = [name for name in _DENSITIES if name in parameters]
     if stated:
-        used |= {*stated}
         notes[", ".join(stated)] = "are noise densities that /vehicle/inertial states"
+    used = {_STEP_US, *stated}
     settings = []
-    if "EKF2_GPS_DELAY" in parameters:
-        used.add("EKF2_GPS_DELAY")
-        delay_s = 1e-3 * parameters["EKF2_GPS_DELAY"]
-        settings += [f"{of}_delay_s={delay_s:g}" for of in ("fix", "velocity")]
-    for axis, (name, sign) in _LEVERS.items():
-        antenna, unit = f"EKF2_GPS_POS_{axis}", f"EKF2_IMU_POS_{axis}"
+    for name, (ours, unit) in _SETTINGS.items():
+        if name in parameters:
+            used.add(name)
+            settings += [f"{each}={unit * parameters[name]:.6g}" for each in ours]
+    for axis, (lever, sign) in _LEVERS.items():
+        antenna, imu = f"EKF2_GPS_POS_{axis}", f"EKF2_IMU_POS_{axis}"
         if antenna in parameters:
-            used |= {antenna, unit}
-            lever_m = sign * (parameters[antenna] - parameters.get(unit, 0.0))
-            settings += [f"{name}={lever_m:g}"] if lever_m else []
+            used |= {antenna, imu}
+            lever_m = sign * (parameters[antenna] - parameters.get(imu, 0.0))
+            settings += [f"{lever}={lever_m:.6g}"] if lever_m else []
     if settings:
         notes["settings that the filter had"] = " ".join(f"--set {each}" for each in settings)
-    rest = [name for name in parameters if name.startswith(("EKF2_", "CAL_")) and name not in used]
-    if rest:
-        notes["parameters without a meaning here"] = ", ".join(sorted(rest))
+    rest: dict[str, list[str]] = {}
+    for name in sorted(parameters.keys() - used):
+        pattern = next((each for each in _REASONS if fnmatchcase(name, each)), None)
+        if pattern is not None:
+            rest.setdefault(pattern, []).append(name)
+    notes |= {", ".join(names): _REASONS[pattern] for pattern, names in rest.items()}
     return notes

@@ -63,6 +63,7 @@ class Reading:
         controls: the topics that drive it.
         kinds: by topic, the kinds of the numbers that it reads of a message: controls, or what is
             measured.
+        measured: by topic of a sensor, the names of these numbers, as innovations have them.
         numbers: stream of one of these topics -> these numbers (n, m); NaN where one is missing.
         noises: parameters that are standard deviations of noise, with the topic of the sensor whose it
             is; "" for that of the motion.
@@ -77,6 +78,7 @@ class Reading:
 
     controls: tuple[str, ...]
     kinds: Mapping[str, tuple[str, ...]]
+    measured: Mapping[str, tuple[str, ...]]
     numbers: Callable[[Stream], NDArray[np.float64]]
     noises: Mapping[str, str]
     augmentable: Mapping[str, tuple[str, tuple[str, ...]]]

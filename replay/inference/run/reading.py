@@ -56,6 +56,7 @@ def reading_of(stage: Stage, found: Found) -> Reading:
     return Reading(
         tuple(drives),
         kinds,
+        {topic: tuple(name for each in own for name in each.measured) for topic, own in sensors.items()},
         numbers,
         _noises(stage, found),
         _augmentable(stage, found),

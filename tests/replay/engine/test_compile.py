@@ -376,7 +376,11 @@ def test_every_kernel_of_replay_is_compiled_here():
 
 @pytest.mark.parametrize(
     ("module", "names"),
-    [(loops, {"_scan", "_agree"}), (ros1_file, {"_scan", "_number"}), (ulog_loops, {"_sort", "_walk"})],
+    [
+        (loops, {"_scan", "_agree"}),
+        (ros1_file, {"_scan", "_number"}),
+        (ulog_loops, {"_resume", "_sort", "_walk"}),
+    ],
     ids=["loops", "ros1_file", "ulog_loops"],
 )
 def test_the_loops_of_recorders_call_nothing_outside_their_file(module: ModuleType, names: set[str]):
