@@ -212,13 +212,11 @@ COMMANDS_ELSEWHERE = {
 
 
 UNMOVED = {
-    "calibrate --bound": "no test moves it yet",
     "calibrate --estimator": "no test moves it yet",
     "calibrate --folds": "no test moves it yet",
     "calibrate --gap-limit": "no test moves it yet",
     "calibrate --json": "no test moves it yet",
     "calibrate --out": "no test moves it yet",
-    "calibrate --set": "no test moves it yet",
     "calibrate --validate": "no test moves it yet",
     "evaluate --format": "it is found from the content, and another than that is refused",
     "evaluate --truth-format": "it is found from the content, and another than that is refused",
