@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploying.c_names import CFilter, filled
+from pipeline.deploying.c_source.names import CFilter, filled
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Recursive

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploying.c_names import CFilter
+from pipeline.deploying.c_source.names import CFilter
 from replay.inference.linear_algebra.covariances import COVARIANCES
 from replay.inference.linear_algebra.gaussian import (
     Innovation,

@@ -8,10 +8,10 @@ from pipeline.api.planning import open as open_source
 from pipeline.api.planning import settings_of
 from pipeline.checking.checking import Runs
 from pipeline.checking.stored import Golden
-from pipeline.deploying.c_filter import source
-from pipeline.deploying.c_header import header
-from pipeline.deploying.c_names import CFilter, identifier
 from pipeline.deploying.c_replay import replay_text, why_no_replay
+from pipeline.deploying.c_source.filter import source
+from pipeline.deploying.c_source.header import header
+from pipeline.deploying.c_source.names import CFilter, identifier
 from pipeline.deploying.c_test import test_text, vectors_of, vectors_text
 from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from pipeline.deploying.folder import cmake_text, readme_text

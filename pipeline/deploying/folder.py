@@ -1,8 +1,8 @@
 """What stands beside a filter in C: how to build it, and what it is."""
 
-from pipeline.deploying.c_header import data_of
-from pipeline.deploying.c_names import CFilter
 from pipeline.deploying.c_replay import why_no_replay
+from pipeline.deploying.c_source.header import data_of
+from pipeline.deploying.c_source.names import CFilter
 from pipeline.deploying.certificate import OPTIONS, Certificate, Cost
 
 

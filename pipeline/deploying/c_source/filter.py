@@ -4,10 +4,17 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.deploying.c_algebra import ALGEBRA
-from pipeline.deploying.c_header import predict_signature, update_signature
-from pipeline.deploying.c_names import CFilter, filled, identifier
-from pipeline.deploying.c_products import MEASURE, PROPAGATE, SLOPE, TURN, add_through, columns_text
+from pipeline.deploying.c_source.algebra import ALGEBRA
+from pipeline.deploying.c_source.header import predict_signature, update_signature
+from pipeline.deploying.c_source.names import CFilter, filled, identifier
+from pipeline.deploying.c_source.products import (
+    MEASURE,
+    PROPAGATE,
+    SLOPE,
+    TURN,
+    add_through,
+    columns_text,
+)
 from replay.inference.linear_algebra.manifold import manifold_blocks, right_jacobian_factors
 from replay.inference.whole_steps import Step
 from replay.tracing.c_text import Precision, c_lines, helpers_of, truth_text
