@@ -24,10 +24,10 @@ from replay.foreign.naming import shorthand
 from replay.foreign.native.library import HEADER
 from replay.inference.kalman.methods import FILTERS
 from replay.inference.run.filtering import Filter
-from replay.inference.whole_steps import EXTENDED, SAMPLED, whole_steps
+from replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
 from replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
-KINDS = {"ekf": EXTENDED, "ukf": SAMPLED}
+KINDS = {"ekf": EXTENDED, "iekf": ITERATED, "ukf": SAMPLED}
 
 
 def deploy(
@@ -47,7 +47,7 @@ def deploy(
     Args:
         log: a log that the filter fits: its sensors are those of the C, its channels state what is not
             given, and its first messages are the test.
-        estimator: `ekf` or `ukf`, or a table of settings by its label.
+        estimator: `ekf`, `iekf` or `ukf`, or a table of settings by its label.
         out: the folder to write, which must not be there or be empty; its name is the filter's in C.
         single: use single precision, `float`.
         parameters: of the estimator, such as `model="robot"`.
@@ -145,13 +145,13 @@ def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, F
     filtering = getattr(getattr(first, "run", None), "__self__", None)
     if not isinstance(first, Recursive) or type(filtering) is not Filter:
         raise BadInput(
-            f"estimator {label}: is no filter that can be written as C; give -e ekf or -e ukf"
+            f"estimator {label}: is no filter that can be written as C; give -e ekf, iekf or ukf"
         )
     kind = next((KINDS[each] for each in KINDS if filtering.method is FILTERS[each]), None)
     if kind is None:
         raise BadInput(
-            f"estimator {label}: {name} cannot be written as C yet; give -e ekf, or -e ukf for a state "
-            "without angles"
+            f"estimator {label}: {name} cannot be written as C yet; give -e ekf or iekf, or ukf for a "
+            "state without angles"
         )
     if others:
         several = ", ".join(each.name for each in found)

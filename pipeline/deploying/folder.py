@@ -4,6 +4,7 @@ from pipeline.deploying.c_replay import why_no_replay
 from pipeline.deploying.c_source.header import data_of
 from pipeline.deploying.c_source.names import CFilter
 from pipeline.deploying.certificate import OPTIONS, Certificate, Cost
+from replay.inference.kalman.iterated_update import ITERATIONS
 
 
 def cmake_text(made: CFilter) -> str:
@@ -34,7 +35,7 @@ def cmake_text(made: CFilter) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _costs(certificate: Certificate) -> str:
+def _costs(made: CFilter, certificate: Certificate) -> str:
     """Write what a step costs."""
     rows: dict[str, Cost] = {f"`{name}`": cost for name, cost in certificate.steps.items()}
     rows["worst case: `predict` and the costliest update"] = certificate.worst
@@ -52,11 +53,12 @@ def _costs(certificate: Certificate) -> str:
         if certificate.dense
         else ""
     )
+    iterated = f", and all {ITERATIONS} iterates of an update" if made.steps.is_iterated else ""
     return f"""| function | flops | square roots | other calls of libm |
 |---|---|---|---|
 {table}
 
-At most: both sides of every condition count.{saved}
+At most: both sides of every condition count{iterated}.{saved}
 
 {bytes_said}"""
 
@@ -116,5 +118,5 @@ all with the same libm, in double precision and without fused multiply-adds, whi
 
 ## What it costs
 
-{_costs(certificate)}
+{_costs(made, certificate)}
 """

@@ -50,6 +50,7 @@ def furthest(program: Path) -> float:
     ("scenario", "label", "options"),
     [
         ("landmarks", "ekf", {"model": "robot"}),
+        ("landmarks", "iekf", {"model": "robot"}),
         ("batch-reactor", "ekf", {}),
         ("batch-reactor", "ukf", {}),
     ],
@@ -134,7 +135,7 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "robot_ekf"
     for label, options, sentence in (
         ("smoother:ekf", {"model": "robot"}, "smoother:ekf: is no filter that can be written as C"),
-        ("iekf", {"model": "robot"}, "iekf cannot be written as C yet; give -e ekf"),
+        ("sqrt:ekf", {"model": "robot"}, "sqrt:ekf cannot be written as C yet; give -e ekf"),
         ("ukf", {"model": "robot"}, "the prediction cannot be written as C: samples of an angle"),
         ("ekf", {"model": "robot", "sigma_range_m": -1.0}, "sigma_range_m"),
     ):
