@@ -12,6 +12,7 @@ from pipeline.deploying.c_replay import replay_text, why_no_replay
 from pipeline.deploying.c_source.filter import source
 from pipeline.deploying.c_source.header import header
 from pipeline.deploying.c_source.names import CFilter, identifier
+from pipeline.deploying.c_target import LINKED, STARTING
 from pipeline.deploying.c_test import test_text, vectors_of, vectors_text
 from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from pipeline.deploying.folder import cmake_text, readme_text
@@ -74,6 +75,8 @@ def deploy(
         f"{made.name}.c": own_source,
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
+        "cortex_m4f.c": STARTING,
+        "cortex_m4f.ld": LINKED,
         "CMakeLists.txt": cmake_text(made),
         "README.md": readme_text(made, Path(log).name, certificate),
         CERTIFICATE: certificate_text(made, certificate),

@@ -1,6 +1,7 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
 from tests.pipeline.conftest import run_here
@@ -151,3 +153,25 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="robot_ekf: is not empty; give another folder with -o"):
         fl.deploy(log, "ekf", out, model="robot")
     assert [each.name for each in out.iterdir()] == ["mine.c"]
+
+
+NEEDED = ("arm-none-eabi-gcc", "qemu-system-arm")
+
+
+@pytest.mark.skipif(not all(map(shutil.which, NEEDED)), reason=f"needs {' and '.join(NEEDED)}")
+@pytest.mark.parametrize(("single", "away", "row"), [(False, 1e-12, "double"), (True, 2e-6, "float")])
+def test_an_emulated_cortex_m4f_gives_the_estimates(
+    tmp_path: Path, single: bool, away: float, row: str
+) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=10.0)
+    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", single=single)
+    build, run = (line.split() for line in target_lines("robot_ekf", argument=str(away)))
+    subprocess.run(build, cwd=folder, check=True)
+    found = subprocess.run(run, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    taken = re.search(r"(\d+) instructions for a message, at most (\d+)", found.stdout)
+    page = (Path(__file__).parents[2] / "docs/deploy.md").read_text()
+    stated = re.search(rf"\| `{row}`[^|]*\| (\d+) \| (\d+) \|", page)
+    assert taken is not None
+    assert stated is not None
+    assert [*map(int, taken.groups())] == pytest.approx([*map(int, stated.groups())], rel=0.1)
