@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from pipeline.deploying.c_names import CFilter, filled, identifier
+from pipeline.deploying.c_source.names import CFilter, filled, identifier
 from recorders.parameters import unit_of
 from replay.inference.model.model import Map, Sensor
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploying.c_names import CFilter, filled
+from pipeline.deploying.c_source.names import CFilter, filled
 from recorders.errors import BadInput
 from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Recursive
@@ -180,6 +180,12 @@ def test_text(made: CFilter) -> str:
 
 enum { CONTROL_AT = 0 }; /* of an event's numbers */
 
+#ifdef INSTRUCTIONS /* the name of a function of the target that counts them */
+unsigned long INSTRUCTIONS(void);
+#else
+#define INSTRUCTIONS() 0UL
+#endif
+
 static double furthest = 0.0;
 static int furthest_event = -1;
 
@@ -198,19 +204,25 @@ int main(int argc, char **argv)
     const double limit = argc > 1 ? strtod(argv[1], NULL) : 0.0;
     NAME filter;
     NAME_innovation innovation;
-    int estimates = 0, updates = 0;
+    int estimates = 0, updates = 0, messages = 0;
+    unsigned long taken = 0, most = 0;
     NAME_init(&filter, start_ns, prior_mean, prior_covariance);
     for (int event = 0; event < VECTORS_EVENTS; event++) {
         const REAL *data = event_data[event];
         int outcome = NAME_WELL;
         if (event_time_ns[event] < filter.time_ns)
             continue;
+        const unsigned long begin = INSTRUCTIONS();
         if (PREDICT != NAME_WELL) {
             printf("event %d: the covariance is no longer positive definite\\n", event);
             return 1;
         }
         switch (event_source[event]) {
 CASES        }
+        const unsigned long step = INSTRUCTIONS() - begin;
+        taken += step;
+        most = step > most ? step : most;
+        messages++;
         updates += event_source[event] >= 0;
         if (outcome == NAME_NOT_POSITIVE_DEFINITE) {
             printf("event %d: the covariance is no longer positive definite\\n", event);
@@ -229,6 +241,8 @@ CASES        }
     (void)innovation;
     printf("%d updates, %d estimates: furthest %.3g, at event %d\\n", updates, estimates, furthest,
            furthest_event);
+    if (messages > 0 && most > 0)
+        printf("%lu instructions for a message, at most %lu\\n", taken / (unsigned long)messages, most);
     return furthest <= limit ? 0 : 1;
 }
 """.replace("PREDICT", predict).replace("CASES", "".join(cases)),

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deploying.c_names import CFilter
+from pipeline.deploying.c_source.names import CFilter
+from replay.inference.kalman.iterated_update import ITERATIONS
 from replay.inference.linear_algebra.covariances import COVARIANCES
 from replay.inference.linear_algebra.gaussian import (
     Innovation,
@@ -46,7 +47,7 @@ _FREE = (
 
 
 class Cost(NamedTuple):
-    """Holds what a step costs at most: both sides of every condition count.
+    """Holds what a step costs at most: both sides of every condition count, and every iterate.
 
     Attributes:
         flops: additions, subtractions, multiplications and divisions.
@@ -110,7 +111,8 @@ def certificate_of(made: CFilter, source: str, header: str) -> Certificate:
         algebra = _algebra(m, t, any(value == value for value in robust.values()))
         products.append(_products(step, "H", m, t))
         own = _sum(_cost_of_step(step), products[-1][1], _entering(step, m))
-        steps[f"update_{name}"] = _sum(own, algebra, correct)
+        times = ITERATIONS if made.steps.is_iterated else 1
+        steps[f"update_{name}"] = _sum(*[own, algebra] * times, correct)
     updates = [cost for name, cost in steps.items() if name != "predict"]
     worst = _sum(steps["predict"], max(updates, default=NOTHING))
     dense, sparse = (sum(each[place].flops for each in products) for place in (0, 1))

@@ -8,10 +8,11 @@ from pipeline.api.planning import open as open_source
 from pipeline.api.planning import settings_of
 from pipeline.checking.checking import Runs
 from pipeline.checking.stored import Golden
-from pipeline.deploying.c_filter import source
-from pipeline.deploying.c_header import header
-from pipeline.deploying.c_names import CFilter, identifier
 from pipeline.deploying.c_replay import replay_text, why_no_replay
+from pipeline.deploying.c_source.filter import source
+from pipeline.deploying.c_source.header import header
+from pipeline.deploying.c_source.names import CFilter, identifier
+from pipeline.deploying.c_target import LINKED, STARTING
 from pipeline.deploying.c_test import test_text, vectors_of, vectors_text
 from pipeline.deploying.certificate import CERTIFICATE, certificate_of, certificate_text
 from pipeline.deploying.folder import cmake_text, readme_text
@@ -24,10 +25,10 @@ from replay.foreign.naming import shorthand
 from replay.foreign.native.library import HEADER
 from replay.inference.kalman.methods import FILTERS
 from replay.inference.run.filtering import Filter
-from replay.inference.whole_steps import EXTENDED, SAMPLED, whole_steps
+from replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
 from replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
-KINDS = {"ekf": EXTENDED, "ukf": SAMPLED}
+KINDS = {"ekf": EXTENDED, "iekf": ITERATED, "ukf": SAMPLED}
 
 
 def deploy(
@@ -47,7 +48,7 @@ def deploy(
     Args:
         log: a log that the filter fits: its sensors are those of the C, its channels state what is not
             given, and its first messages are the test.
-        estimator: `ekf` or `ukf`, or a table of settings by its label.
+        estimator: `ekf`, `iekf` or `ukf`, or a table of settings by its label.
         out: the folder to write, which must not be there or be empty; its name is the filter's in C.
         single: use single precision, `float`.
         parameters: of the estimator, such as `model="robot"`.
@@ -74,6 +75,8 @@ def deploy(
         f"{made.name}.c": own_source,
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
+        "cortex_m4f.c": STARTING,
+        "cortex_m4f.ld": LINKED,
         "CMakeLists.txt": cmake_text(made),
         "README.md": readme_text(made, Path(log).name, certificate),
         CERTIFICATE: certificate_text(made, certificate),
@@ -145,13 +148,13 @@ def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, F
     filtering = getattr(getattr(first, "run", None), "__self__", None)
     if not isinstance(first, Recursive) or type(filtering) is not Filter:
         raise BadInput(
-            f"estimator {label}: is no filter that can be written as C; give -e ekf or -e ukf"
+            f"estimator {label}: is no filter that can be written as C; give -e ekf, iekf or ukf"
         )
     kind = next((KINDS[each] for each in KINDS if filtering.method is FILTERS[each]), None)
     if kind is None:
         raise BadInput(
-            f"estimator {label}: {name} cannot be written as C yet; give -e ekf, or -e ukf for a state "
-            "without angles"
+            f"estimator {label}: {name} cannot be written as C yet; give -e ekf or iekf, or ukf for a "
+            "state without angles"
         )
     if others:
         several = ", ".join(each.name for each in found)

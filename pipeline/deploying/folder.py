@@ -1,9 +1,11 @@
 """What stands beside a filter in C: how to build it, and what it is."""
 
-from pipeline.deploying.c_header import data_of
-from pipeline.deploying.c_names import CFilter
 from pipeline.deploying.c_replay import why_no_replay
+from pipeline.deploying.c_source.header import data_of
+from pipeline.deploying.c_source.names import CFilter
+from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import OPTIONS, Certificate, Cost
+from replay.inference.kalman.iterated_update import ITERATIONS
 
 
 def cmake_text(made: CFilter) -> str:
@@ -34,7 +36,7 @@ def cmake_text(made: CFilter) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _costs(certificate: Certificate) -> str:
+def _costs(made: CFilter, certificate: Certificate) -> str:
     """Write what a step costs."""
     rows: dict[str, Cost] = {f"`{name}`": cost for name, cost in certificate.steps.items()}
     rows["worst case: `predict` and the costliest update"] = certificate.worst
@@ -52,11 +54,12 @@ def _costs(certificate: Certificate) -> str:
         if certificate.dense
         else ""
     )
+    iterated = f", and all {ITERATIONS} iterates of an update" if made.steps.is_iterated else ""
     return f"""| function | flops | square roots | other calls of libm |
 |---|---|---|---|
 {table}
 
-At most: both sides of every condition count.{saved}
+At most: both sides of every condition count{iterated}.{saved}
 
 {bytes_said}"""
 
@@ -110,11 +113,17 @@ cc -std=c99 -O2 -ffp-contract=off test_{name}.c {name}.c -lm -o test_{name}
 
 It runs over the first messages of {log}, and prints how far it is from fuselog's own filter: nothing at
 all with the same libm, in double precision and without fused multiply-adds, which
-`-ffp-contract=off` forbids.
+`-ffp-contract=off` forbids. With Debian's gcc-arm-none-eabi, libnewlib-arm-none-eabi and
+qemu-system-arm it runs on an emulated Cortex-M4F too, where it prints how many instructions a message
+takes as well. QEMU knows no cycles.
+
+```
+{chr(10).join(target_lines(name, argument="0.01" if made.precision.ending else "1e-12"))}
+```
 
 {back}
 
 ## What it costs
 
-{_costs(certificate)}
+{_costs(made, certificate)}
 """

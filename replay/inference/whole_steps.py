@@ -20,7 +20,7 @@ from replay.inference.kalman.update import reading, sensor_derivative
 from replay.inference.linear_algebra.gaussian import wrap
 from replay.inference.linear_algebra.manifold import boxplus
 from replay.inference.linear_algebra.tuples import adding_noise, tuple_of
-from replay.inference.model.corrections import stepping
+from replay.inference.model.corrections import relinearising, stepping
 from replay.inference.model.model import Model, Motion, Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.model.stage import Stage
@@ -63,18 +63,21 @@ class WholeSteps(NamedTuple):
     Attributes:
         predict: of (..., control, duration_s, parameters), it gives mean and F, G, u, N, or mean and P.
         innovate: of (..., data, parameters), for every sensor of m components: v (m) and H, G, u, N, or
-            v, S (m, m) and C (t, m), of S the lower triangle.
+            v, S (m, m) and C (t, m), of S the lower triangle. Where updates are iterated it is of (...,
+            data, parameters, step, slope): at the mean moved by a step, as an innovation about the mean.
         direction: of the state: `a` (t), along which the correction bends; None where it does not.
         correct: of (..., step, slope), it gives the mean, and F where covariances go with it by that.
+        is_iterated: whether updates are.
     """
 
     predict: Step
     innovate: tuple[Step, ...]
     direction: Step | None
     correct: Step
+    is_iterated: bool = False
 
 
-EXTENDED, SAMPLED = "extended", "sampled"
+EXTENDED, ITERATED, SAMPLED = "extended", "iterated", "sampled"
 _SPARSE = ("F", "H", "G", "N")
 
 
@@ -83,7 +86,8 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
 
     Args:
         filtering: the filter, bound to a log.
-        kind: EXTENDED for derivatives, SAMPLED for regression at samples.
+        kind: EXTENDED for derivatives, ITERATED where updates take them again at every iterate, SAMPLED
+            for regression at samples.
 
     Raises BadInput where a step is no graph, as that of sampled angles.
     """
@@ -102,17 +106,17 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
         move, samples = _sampled_motion(stage, memory), 1
     given = (*gaussian, Shape((model.controls,)), None, names)
     predict = _traced("the prediction", move, given)
-    innovations = []
+    innovations, step = [], Shape((model.tangent,))
     for number, sensor in enumerate(stage.sensors):
         if is_sampled and not sensor.linear:
             _check_straight(f"sensor {sensor.topic}", sensor.measured.values())
             innovate = _sampled_sensor(stage, number, samples, memory)
             samples += 1
         else:
-            innovate = _linear_sensor(model, sensor, memory)
+            innovate = _linear_sensor(model, sensor, memory, is_iterated=kind == ITERATED)
         given = (*gaussian, Shape((reading(sensor).width,)), names)
+        given += (step, step) if kind == ITERATED else ()
         innovations.append(_traced(f"sensor {sensor.topic}", innovate, given))
-    step = Shape((model.tangent,))
     correct = _traced("the correction", _correcting(model, memory), (*gaussian, step, step))
     direction = None
     if model.correct is not None:
@@ -120,7 +124,7 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
         direction = _traced(
             "the correction", lambda mean, _: (True, {"a": np.array(along(read_state(mean)))}), gaussian
         )
-    return WholeSteps(predict, tuple(innovations), direction, correct)
+    return WholeSteps(predict, tuple(innovations), direction, correct, kind == ITERATED)
 
 
 # --- what is traced: functions that return whether all is well, and arrays by name ------------------
@@ -161,14 +165,24 @@ def _sampled_motion(stage: Stage, memory: Callable[[], Any]) -> Function:
     return predict
 
 
-def _linear_sensor(model: Model, sensor: Sensor, memory: Callable[[], Any]) -> Function:
+def _linear_sensor(
+    model: Model, sensor: Sensor, memory: Callable[[], Any], *, is_iterated: bool
+) -> Function:
     linearise, read = sensor_derivative(model, sensor), reading(sensor)
     m, read_state, add = len(sensor.measured), tuple_of(model.size), adding_noise(len(sensor.measured))
     angular = [kind == "angle" for kind in sensor.measured.values()]
+    step_to, chain = relinearising(model)
 
-    def innovate(mean: Any, _: Any, data: Any, parameters: Any) -> Any:
-        work, noise = memory(), _zeros(m, m)
-        linearise(read_state(mean), read.reference(data), parameters, work)
+    def innovate(mean: Any, _: Any, data: Any, parameters: Any, *moved: Any) -> Any:
+        work, noise, state = memory(), _zeros(m, m), mean
+        rows = work.rows[:m]
+        if is_iterated:
+            work = work._replace(step=moved[0], slope=moved[1])
+            step_to(mean, work)
+            state = work.state
+        linearise(read_state(state), read.reference(data), parameters, work)
+        if is_iterated:
+            chain(rows, work)
         gain, variances = _zeros(m, 0), []
         if sensor.covariance:
             add(noise, read.noise(data))
@@ -177,7 +191,10 @@ def _linear_sensor(model: Model, sensor: Sensor, memory: Callable[[], Any]) -> F
         elif sensor.noise is not None:
             add(noise, sensor.noise(parameters))
         difference = [wrap(data[i] - work.predicted[i], angular[i]) for i in range(m)]
-        return True, {"v": difference, "H": work.rows[:m], "G": gain, "u": variances, "N": noise}
+        for i in range(m if is_iterated else 0):
+            for k in range(model.tangent):
+                difference[i] += rows[i, k] * work.step[k]
+        return True, {"v": difference, "H": rows, "G": gain, "u": variances, "N": noise}
 
     return innovate
 

@@ -1,6 +1,7 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -10,14 +11,15 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
 from tests.pipeline.conftest import run_here
 
-COMPILER = shutil.which("gcc") or shutil.which("clang")
+COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
 STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
-needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
+needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler here")
 
 
 def recorded(tmp_path: Path, scenario: str, **parameters: object) -> Path:
@@ -26,15 +28,16 @@ def recorded(tmp_path: Path, scenario: str, **parameters: object) -> Path:
     return log
 
 
-def compiled(folder: Path, *options: str) -> Path:
+def compiled(folder: Path, *options: str, compiler: str = "") -> Path:
     """Build the test program, or with `-shared` the library."""
-    assert COMPILER is not None
     name = folder.name
     is_library = "-shared" in options
     out = folder.parent / (f"{name}.so" if is_library else f"test_{name}")
     first = f"{name}_replay.c" if is_library else f"test_{name}.c"
     files = [str(folder / each) for each in (first, f"{name}.c")]
-    subprocess.run([COMPILER, *STRICT, *options, *files, "-lm", "-o", str(out)], check=True)
+    subprocess.run(
+        [compiler or COMPILERS[0], *STRICT, *options, *files, "-lm", "-o", str(out)], check=True
+    )
     return out
 
 
@@ -50,6 +53,7 @@ def furthest(program: Path) -> float:
     ("scenario", "label", "options"),
     [
         ("landmarks", "ekf", {"model": "robot"}),
+        ("landmarks", "iekf", {"model": "robot"}),
         ("batch-reactor", "ekf", {}),
         ("batch-reactor", "ukf", {}),
     ],
@@ -59,10 +63,13 @@ def test_estimates_are_equal_to_the_last_bit(
 ) -> None:
     log = recorded(tmp_path, scenario, **({"duration_s": 10.0} if scenario == "landmarks" else {}))
     folder = fl.deploy(log, label, tmp_path / "filter_c", **options)
-    assert furthest(compiled(folder)) == 0.0
+    for compiler in COMPILERS:
+        assert furthest(compiled(folder, compiler=compiler)) == 0.0
+        if sys.platform != "win32":
+            sanitized = compiled(folder, "-fsanitize=address,undefined", compiler=compiler)
+            assert furthest(sanitized) == 0.0
     if sys.platform == "win32":
         return
-    assert furthest(compiled(folder, "-fsanitize=address,undefined")) == 0.0
     library = compiled(folder, "-shared", "-fPIC")
     kinds = {"kind": label, **options}, {"kind": "lib", "path": str(library), "in_process": True}
     replays = [fl.replay(log, {"it": each}) for each in kinds]
@@ -134,7 +141,7 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "robot_ekf"
     for label, options, sentence in (
         ("smoother:ekf", {"model": "robot"}, "smoother:ekf: is no filter that can be written as C"),
-        ("iekf", {"model": "robot"}, "iekf cannot be written as C yet; give -e ekf"),
+        ("sqrt:ekf", {"model": "robot"}, "sqrt:ekf cannot be written as C yet; give -e ekf"),
         ("ukf", {"model": "robot"}, "the prediction cannot be written as C: samples of an angle"),
         ("ekf", {"model": "robot", "sigma_range_m": -1.0}, "sigma_range_m"),
     ):
@@ -146,3 +153,25 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="robot_ekf: is not empty; give another folder with -o"):
         fl.deploy(log, "ekf", out, model="robot")
     assert [each.name for each in out.iterdir()] == ["mine.c"]
+
+
+NEEDED = ("arm-none-eabi-gcc", "qemu-system-arm")
+
+
+@pytest.mark.skipif(not all(map(shutil.which, NEEDED)), reason=f"needs {' and '.join(NEEDED)}")
+@pytest.mark.parametrize(("single", "away", "row"), [(False, 1e-12, "double"), (True, 2e-6, "float")])
+def test_an_emulated_cortex_m4f_gives_the_estimates(
+    tmp_path: Path, single: bool, away: float, row: str
+) -> None:
+    log = recorded(tmp_path, "landmarks", duration_s=10.0)
+    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", single=single)
+    build, run = (line.split() for line in target_lines("robot_ekf", argument=str(away)))
+    subprocess.run(build, cwd=folder, check=True)
+    found = subprocess.run(run, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    assert found.returncode == 0, found.stdout + found.stderr
+    taken = re.search(r"(\d+) instructions for a message, at most (\d+)", found.stdout)
+    page = (Path(__file__).parents[2] / "docs/deploy.md").read_text()
+    stated = re.search(rf"\| `{row}`[^|]*\| (\d+) \| (\d+) \|", page)
+    assert taken is not None
+    assert stated is not None
+    assert [*map(int, taken.groups())] == pytest.approx([*map(int, stated.groups())], rel=0.1)

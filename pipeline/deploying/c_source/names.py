@@ -104,7 +104,7 @@ class CFilter(NamedTuple):
     @property
     def all_steps(self) -> list[Step]:
         """List the steps."""
-        predict, innovate, direction, correct = self.steps
+        predict, innovate, direction, correct, _ = self.steps
         return [predict, *innovate, *([] if direction is None else [direction]), correct]
 
     @property

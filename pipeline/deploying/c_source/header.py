@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from pipeline.deploying.c_names import CFilter, filled, identifier
+from pipeline.deploying.c_source.names import CFilter, filled, identifier
 from recorders.parameters import meanings, unit_of
 from replay.engine.vectors.tangent import tangent_components
 from replay.inference.formulas import reference_names

@@ -1,0 +1,200 @@
+"""The Kalman update in C, operation by operation that of `replay.inference.kalman.update`.
+
+`UPDATE` is the one of all filters but those that iterate, which have `ITERATE`; both call `ALGEBRA`.
+
+NAME, T and M stand for the filter's name, its tangent space's size, and the most components of a sensor;
+REAL and what ends numbers and functions of libm, _S, for the precision.
+"""
+
+ALGEBRA = """/* A = L L' in place, of the first `size` rows and columns; 0 where A is indefinite. */
+static int cholesky(REAL A[M][M], int size)
+{
+    for (int column = 0; column < size; column++)
+        for (int row = column; row < size; row++) {
+            REAL entry = A[row][column];
+            for (int k = 0; k < column; k++)
+                entry -= A[row][k] * A[column][k];
+            if (row > column)
+                A[row][column] = entry / A[column][column];
+            else if (entry > 0.0_S)
+                A[row][row] = sqrt_S(entry);
+            else
+                return 0;
+        }
+    return 1;
+}
+
+/* Moves the components that were measured to the front; returns how many there are. */
+static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
+{
+    int size = 0;
+    for (int component = 0; component < components; component++) {
+        if (isnan(v[component]))
+            continue;
+        if (size < component) {
+            v[size] = v[component];
+            for (int row = 0; row < T; row++)
+                C[row][size] = C[row][component];
+            for (int k = 0; k < components; k++)
+                S[size][k] = S[component][k];
+            for (int k = 0; k < components; k++)
+                S[k][size] = S[k][component];
+        }
+        size++;
+    }
+    return size;
+}
+
+/* How many times larger the covariance of an innovation counts, by the options of robust updates. */
+static REAL inflation(REAL nis, int size, const NAME_gate *gate)
+{
+    REAL factor = 1.0_S;
+    if (nis > gate->inflate_nis)
+        factor = nis / gate->inflate_nis;
+    if (gate->student_freedom > 0.0_S) {
+        const REAL wider = (gate->student_freedom + nis) / (gate->student_freedom + (REAL)size);
+        factor = wider > factor ? wider : factor;
+    }
+    if (nis > gate->switch_nis) {
+        const REAL half = 0.5_S * (1.0_S + nis / gate->switch_nis);
+        factor = half * half > factor ? half * half : factor;
+    }
+    return factor;
+}
+
+/* v becomes L^-1 v and S its factor L; the NIS is the square of that. 0 where S is indefinite. */
+static int whiten(int size, REAL v[M], REAL S[M][M], REAL *nis)
+{
+    *nis = 0.0_S;
+    if (!cholesky(S, size))
+        return 0;
+    for (int i = 0; i < size; i++) {
+        for (int k = 0; k < i; k++)
+            v[i] -= S[i][k] * v[k];
+        v[i] /= S[i][i];
+        *nis += v[i] * v[i];
+    }
+    return !isnan(*nis);
+}
+
+/* Makes the covariance of a whitened innovation `factor` times larger. */
+static void inflate(int size, REAL v[M], REAL S[M][M], REAL factor)
+{
+    const REAL root = sqrt_S(factor);
+    if (!(factor < 1.0_S || factor > 1.0_S))
+        return;
+    for (int i = 0; i < size; i++) {
+        v[i] /= root;
+        for (int k = 0; k <= i; k++)
+            S[i][k] *= root;
+    }
+}
+
+/* The step K v = W L^-1 v of a whitened innovation; C becomes W = C L^-T. */
+static void find_step(int size, REAL v[M], REAL S[M][M], REAL C[T][M], REAL step[T])
+{
+    for (int row = 0; row < T; row++) {
+        step[row] = 0.0_S;
+        for (int i = 0; i < size; i++) {
+            REAL entry = C[row][i];
+            for (int k = 0; k < i; k++)
+                entry -= S[i][k] * C[row][k];
+            C[row][i] = entry / S[i][i];
+            step[row] += C[row][i] * v[i];
+        }
+    }
+}
+
+/* P - W W'. */
+static void downdate(REAL P[T][T], int size, REAL W[T][M])
+{
+    for (int row = 0; row < T; row++)
+        for (int column = 0; column <= row; column++) {
+            REAL entry = P[row][column];
+            for (int i = 0; i < size; i++)
+                entry -= W[row][i] * W[column][i];
+            P[row][column] = P[column][row] = entry;
+        }
+}
+
+/* Whether a measurement is used: its NIS is below the bound, or the last one was used too long ago. */
+static int is_used(NAME *filter, int sensor, int size, REAL nis, const NAME_gate *gate)
+{
+    const double waited_s = (double)(filter->time_ns - filter->accepted_ns[sensor]) * 1e-9;
+    if (size == 0 || !(waited_s > gate->reopens_s || nis <= gate->nis[size]))
+        return 0;
+    filter->accepted_ns[sensor] = filter->time_ns;
+    return 1;
+}
+
+/* Keeps an innovation for whoever looks at it: each component at its place, NaN where it is missing. */
+static void keep(NAME_innovation *innovation, int components, const int *places, REAL v[M], REAL S[M][M])
+{
+    for (int i = 0; i < NAME_INNOVATION; i++) {
+        innovation->difference[i] = NAN;
+        for (int j = 0; j < NAME_INNOVATION; j++)
+            innovation->covariance[i][j] = NAN;
+    }
+    for (int i = 0; i < components; i++) {
+        innovation->difference[places[i]] = v[i];
+        for (int j = 0; j < components; j++)
+            innovation->covariance[places[i]][places[j]] = isnan(v[i] + v[j]) ? NAN : S[i][j];
+    }
+}
+"""
+
+UPDATE = """\
+/* x (+) K v and P - K S K'. The gain K is not formed: with S = L L' and W = C L^-T, K v is W L^-1 v,
+ * and K S K' is W W'. Components that are NaN in v are left out; v, S and C are used up. */
+static int update(NAME *filter, int sensor, int components, REAL v[M], REAL S[M][M], REAL C[T][M],
+                  const NAME_gate *gate, NAME_innovation *innovation)
+{
+    const int size = drop_missing(components, v, S, C);
+    REAL step[T];
+    if (!whiten(size, v, S, &innovation->nis))
+        return NAME_NOT_POSITIVE_DEFINITE;
+    innovation->is_accepted = is_used(filter, sensor, size, innovation->nis, gate);
+    if (!innovation->is_accepted)
+        return NAME_WELL;
+    inflate(size, v, S, inflation(innovation->nis, size, gate));
+    find_step(size, v, S, C, step);
+    downdate(filter->covariance, size, C);
+    FIND_SLOPE;
+    correct(filter, step, slope);
+    return NAME_WELL;
+}
+"""
+
+ITERATE = """\
+/* One iterate of Gauss-Newton on the posterior: finds the step of an innovation that was linearised at
+ * the step before; UNSETTLED while they differ. What is gated, and how much it counts, is decided at the
+ * first, whose step before is zero. Bell and Cathey, IEEE TAC 38(2), 1993. */
+enum { ITERATIONS = 50, UNSETTLED = -1 };
+static int iterate(NAME *filter, int sensor, int components, int iteration, REAL v[M], REAL S[M][M],
+                   REAL C[T][M], REAL step[T], const REAL slope[T], REAL *factor,
+                   const NAME_gate *gate, NAME_innovation *innovation)
+{
+    const int size = drop_missing(components, v, S, C);
+    REAL before[T], change = 0.0_S;
+    if (!whiten(size, v, S, &innovation->nis))
+        return NAME_NOT_POSITIVE_DEFINITE;
+    if (iteration == 0) {
+        *factor = inflation(innovation->nis, size, gate);
+        innovation->is_accepted = is_used(filter, sensor, size, innovation->nis, gate);
+        if (!innovation->is_accepted)
+            return NAME_WELL;
+    }
+    inflate(size, v, S, *factor);
+    for (int row = 0; row < T; row++)
+        before[row] = step[row];
+    find_step(size, v, S, C, step);
+    for (int row = 0; row < T; row++)
+        if (fabs_S(step[row] - before[row]) > change)
+            change = fabs_S(step[row] - before[row]);
+    if (change >= LEAST_CHANGE && iteration + 1 < ITERATIONS)
+        return UNSETTLED;
+    downdate(filter->covariance, size, C);
+    correct(filter, step, slope);
+    return NAME_WELL;
+}
+"""

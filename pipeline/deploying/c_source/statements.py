@@ -1,0 +1,156 @@
+"""Names, declarations and loops that the functions of a filter in C are put together of."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from pipeline.deploying.c_source.names import CFilter, identifier
+from pipeline.deploying.c_source.products import (
+    columns_text,
+)
+from replay.inference.linear_algebra.manifold import manifold_blocks
+from replay.inference.whole_steps import Step
+from replay.tracing.c_text import truth_text
+from replay.tracing.graph import INPUT, Node, needed
+
+
+class Inputs:
+    """Names what a step is given, and declares what it uses."""
+
+    def __init__(self, made: CFilter, part: str) -> None:
+        model = made.filtering.stage.model
+        self.state = [identifier(name) for name in model.state]
+        self.controls = [identifier(name) for name in made.controls]
+        self.part, self.made = part, made
+
+    def names(self, step: Step, *arrays: str) -> tuple[dict[Any, str], list[str]]:
+        """Return the names by place, and the lines that declare them.
+
+        Args:
+            step: the step.
+            arrays: what it is given behind mean and covariance; empty for what is none.
+        """
+        names: dict[Any, str] = {}
+        lines: dict[str, str] = {}
+        nodes = needed([*step.outputs.values(), *step.conditions])
+        real = self.made.precision.real
+        uses_covariance = False
+        for node in nodes:
+            if node.operation is not INPUT:
+                continue
+            argument, place = node.value
+            declared = ""
+            if argument == 0:
+                name = self.state[place[0]]
+                declared = f"filter->mean[{self.made.name.upper()}_{name.upper()}]"
+            elif argument == 1:
+                name, uses_covariance = f"P[{place[0]}][{place[1]}]", True
+            elif isinstance(place, str):
+                name = identifier(place)
+                name = f"{name}_" if name in (*self.state, *self.controls) else name
+                declared = f"parameters->{self.part}.{identifier(place)}"
+            elif place is None:
+                name = "duration_s"
+            elif arrays[argument - 2] == "control":
+                name = self.controls[place[0]]
+                declared = f"filter->control[{self.made.name.upper()}_CONTROL_{name.upper()}]"
+            else:
+                name = f"{arrays[argument - 2]}[{place[0]}]"
+            names[node.value] = name
+            if declared:
+                lines[name] = f"const {real} {name} = {declared};"
+        if uses_covariance:
+            lines["P"] = f"{real} (*const P)[{self.made.name.upper()}_TANGENT] = filter->covariance;"
+        return names, list(lines.values())
+
+
+def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
+    """Name what a step makes of mean and covariance, and write the assignments."""
+    state = [identifier(name) for name in made.filtering.stage.model.state]
+    named: dict[str, Node] = {}
+    lines: list[str] = []
+    for (array, place), node in step.outputs.items():
+        if array == "mean":
+            name = f"next_{state[place[0]]}"
+            named[name] = node
+            lines.append(f"filter->mean[{made.name.upper()}_{state[place[0]].upper()}] = {name};")
+        elif array == "P" and place[0] >= place[1]:
+            row, column = place
+            name = f"next_P{row}_{column}"
+            named[name] = node
+            twin = f"P[{column}][{row}] = " if row != column else ""
+            lines.append(f"P[{row}][{column}] = {twin}{name};")
+    return named, lines
+
+
+class Loops(NamedTuple):
+    """Holds what loops over a Jacobian go by: declarations, what the graph gives, and the calls."""
+
+    declared: list[str]
+    named: dict[str, Node]
+    calls: list[str]
+
+
+def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: str, what: str) -> Loops:
+    """Write what is done with a step's Jacobian, and the noise that is added to the product.
+
+    Args:
+        step: it gives the Jacobian, G and u, N.
+        jacobian: its name, F or H.
+        rows: how many it has.
+        multiply: the call that forms the product.
+        into: the matrix that becomes the product.
+        what: `states` or `components`, for the size of that matrix.
+    """
+    size = "T" if what == "states" else "M"
+    declared = [f"REAL {jacobian}[{size}][T];"]
+    declared.insert(0, columns_text(f"columns_of_{jacobian}", step.columns(jacobian, rows), size))
+    named = entries(step, jacobian)
+    calls = [multiply]
+    gains = count_gains(step)
+    if gains:
+        declared.append(f"REAL G[{size}][GAINS] = {{{{0}}}}, u[GAINS];")
+        named |= entries(step, "G") | entries(step, "u")
+        calls.append(f"add_through_{what}({into}, {rows}, G, u, {gains});")
+    for (array, (row, *column)), node in step.outputs.items():
+        if array == "N" and row >= column[0]:
+            name = f"noise_{row}_{column[0]}"
+            named[name] = node
+            calls.append(f"{into}[{row}][{column[0]}] += {name};")
+            if row > column[0]:
+                calls.append(f"{into}[{column[0]}][{row}] = {into}[{row}][{column[0]}];")
+    return Loops(declared, named, calls)
+
+
+def entries(step: Step, array: str) -> dict[str, Node]:
+    """Name the entries of an array that a step gives, as C does."""
+    return {
+        array + "".join(f"[{each}]" for each in place): node
+        for (name, place), node in step.outputs.items()
+        if name == array
+    }
+
+
+def count_gains(step: Step) -> int:
+    """Count the numbers of noise that enter a step."""
+    return sum(name == "u" for name, _ in step.outputs)
+
+
+def turned_axes(made: CFilter) -> list[int]:
+    """List where the covariance of an orientation begins that is turned with it."""
+    model = made.filtering.stage.model
+    blocks = manifold_blocks(model.kinds) if made.sensors and model.correct is None else ()
+    return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]
+
+
+def body(lines: Iterable[str]) -> str:
+    """Write the lines of a function."""
+    return "".join(f"    {each}\n" for each in lines)
+
+
+def guards(made: CFilter, step: Step, names: Mapping[Any, str]) -> list[str]:
+    """Return early where the step's conditions do not hold."""
+    return [
+        f"if (!({truth_text(each, names, made.precision)}))\n"
+        f"        return {made.name.upper()}_NOT_POSITIVE_DEFINITE;"
+        for each in step.conditions
+    ]
