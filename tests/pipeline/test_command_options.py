@@ -13,6 +13,8 @@ import pytest
 from pipeline.command_line import fuselog
 from tests.pipeline.conftest import run_here
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 ROOT = Path(__file__).parents[2]
 GROUP = click.Context(fuselog)
 COMMANDS = {name: fuselog.get_command(GROUP, name) for name in fuselog.list_commands(GROUP)}

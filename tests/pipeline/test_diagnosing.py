@@ -24,6 +24,8 @@ from pipeline.diagnosing.search import Gains, Peak, end, peak, side_by_side
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.sheet_robot import FREE, of_sigmas, recorded
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 OPEN = {"gate_probability": 1.0}
 SEEN = "/robot1/range_bearing"

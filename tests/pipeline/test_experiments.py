@@ -37,6 +37,7 @@ from recorders.recording import Recording
 from replay.engine.streams.blocks import gather
 from replay.engine.streams.sources import memory_source
 from replay.judging.judge import Judge
+from tests.conftest import without_drawing
 
 pytestmark = pytest.mark.paper
 
@@ -86,6 +87,7 @@ def test_what_estimators_cost_is_kept_beside_the_result(result: Path) -> None:
     assert json.loads((result / "result.json").read_text())["files"][TIMINGS] is None
 
 
+@without_drawing()
 def test_every_error_is_kept_where_that_is_asked_for(tmp_path: Path, fuselog: Fuselog) -> None:
     """A file per estimator and case; the sums of the other tables are made of the same errors."""
     assert fuselog(*RUN, "--errors", "--logs", "1", "--out", str(tmp_path / "all")).code == 0
@@ -154,6 +156,7 @@ def test_the_first_runs_log_is_recorded_again_from_the_seed(result: Path, fuselo
     assert again.read_bytes() == (result / "logs/run-0001.mcap").read_bytes()
 
 
+@without_drawing()
 def test_the_logs_of_a_result_replay_and_judge_as_the_result(result: Path, fuselog: Fuselog) -> None:
     """`evaluate` on the folder's estimates finds their logs, and says what result.json says."""
     estimates = sorted(map(str, (result / "estimates").iterdir()))
@@ -292,6 +295,7 @@ def test_topics_that_look_like_formulas_are_drawn(tmp_path: Path) -> None:
     assert len(list((tmp_path / "r/figures").glob("*.svg"))) == 2
 
 
+@without_drawing()
 def test_probabilities_of_modes_are_drawn_beside_the_errors(tmp_path: Path, fuselog: Fuselog) -> None:
     """Of the interacting filter alone, over time, and dashed in the same colour given all data."""
     folder = tmp_path / "result"
@@ -313,6 +317,7 @@ def test_probabilities_of_modes_are_drawn_beside_the_errors(tmp_path: Path, fuse
     assert "probability of each mode" in (tmp_path / "page.html").read_text()
 
 
+@without_drawing()
 def test_real_data_run_as_an_experiment(world: Path, tmp_path: Path, fuselog: Fuselog) -> None:
     """The MRCLAM layout goes in at --data; unknown barcodes are told."""
     data = str(world / "mrclam")
@@ -397,6 +402,7 @@ def test_a_study_that_fails_is_one_sentence_and_leaves_nothing(
 
 
 @pytest.mark.paper
+@without_drawing()
 def test_nothing_is_refuted_by_estimates_that_are_missing(tmp_path: Path) -> None:
     """All runs fail: comparisons with NaN are false, which must not read as a refutation."""
     label, experiment = load_experiment("reactor", {"prior_variance": 1e200}, {"runs": 2})
@@ -418,6 +424,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory, fuselog: Fuselog) -> Path:
     return folder
 
 
+@without_drawing()
 def test_logs_are_replayed_as_an_experiment(drives: Path, tmp_path: Path, fuselog: Fuselog) -> None:
     """By a file that names them, by --data, by their names: the same numbers as replayed and judged."""
     logs = [str(drives / f"drive-{seed}.mcap") for seed in (1, 2)]
@@ -490,6 +497,7 @@ def test_bad_input_to_a_run_of_logs_is_one_sentence(
     assert sorted(drives.iterdir()) == before
 
 
+@without_drawing()
 def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed(
     fuselog: Fuselog, tmp_path: Path
 ) -> None:

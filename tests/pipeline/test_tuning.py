@@ -28,6 +28,8 @@ from replay.engine.streams.sources import memory_source
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 Fuselog = Callable[..., Any]
 NILE = (
     "1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 "
