@@ -20,8 +20,11 @@ import pytest
 
 import fuselog as fl
 from pipeline.exploring.curves import BIN_S, ellipse, extremes, typical_time_s
+from pipeline.exploring.curves import Path as Track
 from pipeline.exploring.newest import NewestFirst
+from pipeline.exploring.plots import blank, show_lens
 from pipeline.exploring.session import Session, open_session
+from pipeline.exploring.sliders import SMALLER, in_words
 from pipeline.exploring.verdict import numbers_of
 from recorders.errors import BadInput
 
@@ -133,6 +136,23 @@ def test_nothing_drawn_is_lost(session: Session) -> None:
     assert np.ptp(outline, axis=0) == pytest.approx(
         [4.0 * np.sqrt(5.9915), 2.0 * np.sqrt(5.9915)], rel=1e-3
     )
+
+
+def test_the_lens_shows_the_truth_near_its_instant(session: Session) -> None:
+    pytest.importorskip("bokeh")
+    plot, scene = blank("lens", ""), blank("scene", "")
+    shown = plot.source(0, "truth", "x", "y")
+    seconds = np.arange(60.0)
+    truth = Track(seconds, np.stack([seconds, -seconds], axis=1))
+    show_lens(plot, scene, {0: session.play("ekf", SURE)}, "robot1", truth, 30.0)
+    assert shown.data["x"].tolist() == [*range(26, 35)]
+    assert shown.data["y"].tolist() == [-each for each in range(26, 35)]
+
+
+def test_numbers_below_zero_are_written_as_those_above() -> None:
+    for unit in SMALLER:
+        for value in (1e-5, 0.003, 0.05, 2.0):
+            assert in_words(-value, unit) == f"-{in_words(value, unit)}"
 
 
 def test_the_newest_work_wins() -> None:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 import fuselog as fl
+from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of
 from pipeline.stressing.partings import Parting, partings, undetermined
 from pipeline.stressing.verdicts import NOT_TESTED
-from recorders.log import Stream
+from recorders.log import RunMetadata, Stream
+from replay.engine.streams.sources import memory_source
 
 VECTOR = fl.schemas.VECTOR_MEASUREMENT
 LINEAR = {"p_m": "linear", "v_mps": "linear"}
@@ -379,3 +381,19 @@ def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> No
     assert verdicts[1]["position_rmse_m"] == "withheld"
     assert not any("is better" in each for each in tested.sentences)
     assert NOT_TESTED in fuselog("compare", logs[0], "-e", "ekf", "-e", "ukf").out
+
+
+def test_changes_go_to_both_sides_and_half_as_far_where_halved() -> None:
+    values = np.linspace(0.1, 0.7, 8)[:, None]
+    stamps_ns = EPOCH_NS + 10**9 * np.arange(1, 9)
+    drive = recording([0.0], [1.0], dict.fromkeys("abc", (stamps_ns, values)))
+    source = memory_source(drive, RunMetadata("three sensors", epoch_ns=EPOCH_NS))
+    topics = ["/car/a", "/car/b", "/car/c"]
+    inputs = inputs_of(source, [*topics, "/car/prior"], ())
+    for size in (1.0, 0.5):
+        moved = CHANGES["stamps"].of_run(source, inputs, size, 3).streams
+        by_ns = [np.unique(moved[topic].publish_time_ns - stamps_ns).tolist() for topic in topics]
+        assert sorted(by_ns) == [[-size * SHIFT_NS], [0], [size * SHIFT_NS]]
+        rounded = CHANGES["single"].of_run(source, inputs, size, 3).streams["/car/a"]["value"]
+        whole = values.astype(np.float32).astype(float) - values
+        assert np.allclose(rounded - values, size * whole, rtol=1e-6, atol=1e-16)

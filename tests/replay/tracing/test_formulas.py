@@ -128,3 +128,13 @@ def test_a_model_of_ones_own_with_a_condition() -> None:
         "  variance of height_m = 0",
         "  variance of speed_mps = duration_s",
     ]
+
+
+def test_names_of_inputs_are_not_given_to_what_stands_between():
+    def function(given: Any) -> Any:
+        x, y = given
+        long = np.sin(x * y + x / y) + np.exp(-x * y) * np.cos(x - 3.0 * y)
+        return (long * long + np.sqrt(1.0 + long * long),)
+
+    assert any(line.startswith("v1 = ") for line in lines_of(function, "a", "b"))
+    assert not any(line.startswith(("v1 = ", "v2 = ")) for line in lines_of(function, "v1", "v2"))

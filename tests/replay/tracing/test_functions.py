@@ -20,6 +20,8 @@ from replay.engine.compiling.compile import compile_over_runs
 from replay.inference.model.checking import check_model
 from replay.inference.model.model import Model
 from replay.tracing.functions import Shape, TracedFunction, traced
+from replay.tracing.graph import Graph
+from replay.tracing.traced import where
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR, VALUE, source
 from tests.replay.tracing.calls import by_compiler, by_python, linearised, over_points
@@ -281,3 +283,16 @@ def test_parameters_are_unpacked_in_the_order_in_which_they_stand():
     values = namedtuple("values", ["offset", "gain"])(7.0, 3.0)
     function = traced(scaled, 1, ("offset", "gain"))
     assert function((2.0,), values) == scaled((2.0,), values) == (13.0,)
+
+
+def test_of_known_numbers_where_is_a_choice():
+    assert (where(True, 1.0, 2.0), where(False, 1.0, 2.0)) == (1.0, 2.0)
+
+
+def test_a_graph_holds_just_as_many_nodes_as_it_says(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("replay.tracing.graph.MOST_NODES", 3)
+    graph = Graph()
+    for value in (1.0, 2.0, 3.0, 2.0):  # the last is known
+        graph.constant(value)
+    with pytest.raises(BadInput, match="more than 3 operations"):
+        graph.constant(4.0)

@@ -70,7 +70,11 @@ def _both_ways(each: Hypothesis) -> Iterator[str]:
 def advice() -> Iterator[str]:
     """What to try: over what is set, in a program of one's own, and with what to do instead."""
     scale, delay = Advice("/fix.x_scale", 2.0), Advice("/fix.delay_s", 0.5)
-    for applied in ({}, {"/fix.x_scale": 3.0, "/fix.delay_s": 0.25}, {"/fix.x_scale": True}):
+    for applied in (
+        {},
+        {"/fix.x_scale": 3.0, "/fix.delay_s": 0.25},
+        {"/fix.x_scale": True, "/fix.delay_s": True},
+    ):
         for is_own in (False, True):
             trying = Trying("mine", applied, is_own)
             yield from (trying.words(trying.over(each)) for each in (scale, delay))

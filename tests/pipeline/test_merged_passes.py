@@ -1,0 +1,69 @@
+"""Sums of passes, orders of failures, limits of settings: boundaries that only a direct look shows."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pipeline.output.outputs import check_outputs
+from pipeline.output.report.kinds import _forest
+from pipeline.runs.ensemble import Pass
+from recorders.errors import BadInput
+from recorders.simulators import landmarks
+from recorders.simulators.landmarks_parameters import LandmarksParameters
+from replay.engine.replaying.late import Late, parse_late
+from replay.engine.replaying.usage import Usage
+from replay.engine.streams.failures import Failure
+from replay.engine.streams.results import failures_by_run
+
+
+def _pass(**used: int) -> Pass:
+    judge: Any = SimpleNamespace(merge=lambda _: None)
+    return Pass(judge, {}, usages={name: Usage(name, used=count) for name, count in used.items()})
+
+
+def test_what_became_of_messages_is_the_sum_over_passes() -> None:
+    first = _pass(ekf=1, ukf=5)
+    first.merge(_pass(ekf=2, iekf=7))
+    assert {name: usage.used for name, usage in first.usages.items()} == {"ekf": 3, "ukf": 5, "iekf": 7}
+
+
+def test_cases_are_named_where_there_are_several() -> None:
+    row = {"first": "ekf", "second": "ukf", "quantity": "position_rmse_m", "margin": 0.1}
+    row |= {"low": -0.2, "difference": -0.1, "high": 0.0}
+    for cases in (["robot1"], ["robot1", "robot2"]):
+        chart = _forest(pd.DataFrame([{**row, "case": case} for case in cases]), 0.1)
+        assert chart is not None
+        ticks = (chart.panels[0].y.ticks or {}).values()
+        assert [text.partition(", robot")[1] != "" for text in ticks] == [len(cases) > 1] * len(cases)
+
+
+def test_a_timeline_is_looked_at_beside_a_result_folder(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.rrd"
+    mine.write_text("not of ours")
+    for folder in (None, tmp_path / "out"):
+        with pytest.raises(BadInput, match=r"mine\.rrd"):
+            check_outputs(folder, mine, {})
+
+
+def test_steps_are_rounded_not_cut() -> None:
+    """0.29 s at 100 Hz are 28.999999999999996 steps."""
+    parameters = LandmarksParameters(robots=1, duration_s=0.29, odometry_rate_hz=100.0)
+    streams = landmarks.simulate(parameters, np.random.default_rng(1)).streams
+    [truth] = [each for each in streams if each.topic == "/robot1/truth"]
+    assert len(truth) == 30
+
+
+def test_zero_seconds_are_a_window() -> None:
+    assert parse_late("wait:0", arrival_order=True) == Late("wait", 0)
+    with pytest.raises(BadInput, match="give seconds from zero on"):
+        parse_late("wait:-0.001", arrival_order=True)
+
+
+def test_failures_are_those_of_their_runs_in_any_order() -> None:
+    found = failures_by_run("/a", {2: Failure(7, "two"), 0: Failure(5, "none")}, 4)
+    assert np.diff(found.offsets).tolist() == [1, 0, 1, 0]
+    assert found.stream.publish_time_ns.tolist() == [5, 7]
