@@ -51,8 +51,13 @@ class Parameters(BaseModel):
 ParametersType = TypeVar("ParametersType", bound=Parameters)
 
 
-def build(kind: type[ParametersType], values: Mapping[str, Any], where: str) -> ParametersType:
-    """Check `values` against a parameter type; raises BadInput that names `where` and the parameter."""
+def build(
+    kind: type[ParametersType], values: Mapping[str, Any], where: str, what: str = "parameter"
+) -> ParametersType:
+    """Check `values` against a parameter type; raises BadInput that names `where` and the parameter.
+
+    `what` is what messages call a parameter.
+    """
     try:
         return kind.model_validate(merge(_nested_defaults(kind), values))
     except ValidationError as error:
@@ -62,14 +67,14 @@ def build(kind: type[ParametersType], values: Mapping[str, Any], where: str) -> 
         if first["type"] == "extra_forbidden":
             *above, last = path
             known = _names_at(kind, above)
-            raise BadInput(f"{where}: no parameter '{name}'; {choices(last, known)}") from None
+            raise BadInput(f"{where}: no {what} '{name}'; {choices(last, known)}") from None
         if first["type"] == "missing":
-            raise BadInput(f"{where}: parameter '{name}' is missing") from None
+            raise BadInput(f"{where}: {what} '{name}' is missing") from None
         message = first["msg"].removeprefix("Value error, ").replace("Input", "it")
         if not name:
             raise BadInput(f"{where}: {message}") from None
         given = shorten(repr(first["input"]), 60)
-        raise BadInput(f"{where}: parameter '{name}' is {given}; {message}") from None
+        raise BadInput(f"{where}: {what} '{name}' is {given}; {message}") from None
     except PydanticUserError as error:  # a type is completed when it is first used, which starts sooner
         why = str(error.message).partition(". ")[0]
         raise BadInput(f"{where}: its parameters, {kind.__name__}, cannot be checked: {why}") from error

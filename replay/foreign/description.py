@@ -191,7 +191,7 @@ def read_description(text: str | bytes, where: str) -> Description:
         raise BadInput(f"{where}: its description is no JSON ({error}); mend what it gives") from None
     if not isinstance(found, dict):
         raise BadInput(f"{where}: its description is no JSON object; give {{...}} with topics and state")
-    made = build(_Described, {"description": found}, where).description
+    made = build(_Described, {"description": found}, where, "entry").description
     names = [each.topic for each in made.topics]
     for name in names:
         if names.count(name) > 1:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recorders.errors import BadInput
-from recorders.log import Topic
+from recorders.log import Schema, Topic, schemas
 from replay.engine.arrays import Floats, Integers
 from replay.engine.replaying.estimator import Bound, Estimator, Recursive
 from replay.engine.streams.blocks import Block, Ragged
@@ -135,10 +135,36 @@ def bind_all(
     """Find everything in a log that a filter can estimate."""
     found = []
     for prefix, read in description.bindings(topics):
-        prior = resolved(description.prior, prefix)
-        prior = prior if prior in topics else ""
-        found.append(FoundFilter(label + prefix, description, prefix, read, prior, parameters))
+        name = label + prefix
+        prior = _named(name, "prior", description.prior, prefix, schemas.GAUSSIAN_ESTIMATE, topics)
+        _named(name, "truth", description.truth, prefix, schemas.TRUTH_STATE, topics)
+        found.append(FoundFilter(name, description, prefix, read, prior, parameters))
     return found
+
+
+def _named(
+    label: str, what: str, name: str, prefix: str, schema: Schema, topics: Mapping[str, Topic]
+) -> str:
+    """Return the topic that a description names as its prior or truth; "" where the log has none.
+
+    Raises BadInput where the log has another one beside what the filter reads: the name is wrong then.
+    """
+    topic = resolved(name, prefix)
+    if not name or topic in topics:
+        return topic if name else ""
+    others = [
+        each
+        for each, of in topics.items()
+        if of.schema_name == schema.full_name
+        and each.startswith(f"{prefix}/")
+        and not each.startswith("/estimates/")
+    ]
+    if others:
+        raise BadInput(
+            f"estimator {label}: its description names the {what} {topic}, which the log lacks; it has "
+            f"{', '.join(others)}"
+        )
+    return ""
 
 
 # --- in this process --------------------------------------------------------------------------------

@@ -13,10 +13,13 @@ UNSOUND = (
     "the estimate is no longer finite",
     "the covariance is no longer positive definite",
     "the stamps of its estimates go back",
+    "the covariance is not symmetric",
 )
-NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK = range(len(UNSOUND))
+NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK, NOT_SYMMETRIC = range(len(UNSOUND))
 # A share of a variance: a covariance that is singular but for rounding, as of one particle, is one.
 INDEFINITE = 1e-9
+# The square of a share of two deviations: filters in single precision differ by less from their transpose.
+ASYMMETRIC = 1e-6
 
 
 def find_unsound(
@@ -61,6 +64,9 @@ def find_unsound(
                 variance = covariance[row, column * size + column]
                 for i in range(column, size):
                     entry = covariance[row, i * size + column]
+                    apart = entry - covariance[row, column * size + i]
+                    if apart * apart > ASYMMETRIC * abs(variance * covariance[row, i * size + i]):
+                        wrong = NOT_SYMMETRIC
                     for k in range(column):
                         entry -= factor[i, k] * factor[column, k]
                     if i == column:

@@ -33,7 +33,7 @@ def match_components(stated: Mapping[str, str], wanted: Components, where: str) 
             raise BadInput(
                 f"{where}: no component {name}: its channel states "
                 f"{', '.join(names) or 'no components'}; {', '.join(wanted)} are needed, in any order; "
-                "name them in the channel's metadata"
+                "name them alike in both"
             )
         if kinds[name] != kind:
             raise BadInput(f"{where}: component {name} is stated as {kinds[name]}; it must be {kind}")

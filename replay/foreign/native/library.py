@@ -14,6 +14,8 @@ from recorders.errors import BadInput
 VERSION = 1
 HEADER = Path(__file__).with_name("fuselog_filter.h")
 WELL, NOTHING, REJECTED = 0, -1, -2  # see the header
+# What glibc says of a file that is there when it is of another CPU.
+NOT_OPENED = "cannot open shared object file: No such file or directory"
 
 
 class Addresses(NamedTuple):
@@ -46,6 +48,8 @@ class Library:
             self._library = ctypes.CDLL(str(path.resolve()))
         except OSError as error:
             why = str(error).removeprefix(f"{path.resolve()}: ")
+            if why.startswith(NOT_OPENED):
+                why = "it is of another CPU or system"
             raise BadInput(
                 f"{path}: cannot be loaded ({why}); compile it as a shared library for this machine, "
                 f"{platform.system()} on {platform.machine()}"

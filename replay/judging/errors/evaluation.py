@@ -303,15 +303,23 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
     what = " ".join(filter(None, split_topic(estimates.stream.topic)))
     if why := unlike(estimates.stream, sources, first):
         return f"{what}: not judged: {why}"
-    names = components_without_truth(estimates, sources)
-    if not names:
+    truth = estimates.stream.metadata.get("truth", "")
+    if not all(truth in source.topics for source in sources):
         return ""
-    verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
-    truth = estimates.stream.metadata["truth"]
-    said = f"{what}: {', '.join(names)} {verb} not judged: {truth} lacks {them}"
-    if len(names) < len(_components(estimates.stream)):
-        return said
-    return f"{said}; it has {', '.join(stated_components(sources[0].topics[truth].metadata, {}, truth))}"
+    names, own = components_without_truth(estimates, sources), _components(estimates.stream)
+    true = stated_components(sources[0].topics[truth].metadata, {}, truth)
+    position = [name for name in own if name in POSITION and name not in names]
+    rest = [name for name in true if name in POSITION and name not in position]
+    said = []
+    if names:
+        verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
+        said.append(f"{', '.join(names)} {verb} not judged: {truth} lacks {them}")
+    if len(names) == len(own):
+        said.append(f"it has {', '.join(true)}")
+    elif position and rest:
+        alone, others = ", ".join(position), ", ".join(rest)
+        said.append(f"position_rmse_m is of {alone} alone, and not of {others}, which {truth} has")
+    return f"{what}: {'; '.join(said)}" if said else ""
 
 
 def _components(stream: Stream) -> dict[str, Any]:

@@ -334,6 +334,8 @@ def test_logs_of_many_blocks_of_runs_keep_each_its_own_reasons(
         ([[1e12, 1e-3], [1e-3, 1e-12]], True),  # units far apart
         ([[4.0, 2.0], [2.0, 1.0]], True),  # singular, as of few particles
         ([[4.0, 2.1], [2.1, 1.0]], False),
+        ([[4.0, 1.9], [1.899, 1.0]], True),  # rounded
+        ([[4.0, 1.9], [1.89, 1.0]], False),  # not symmetric
         ([[4.0, 0.0], [0.0, -1.0]], False),
         ([[0.0, 0.0], [0.0, 1.0]], True),
         ([[0.0, 0.5], [0.5, 1.0]], False),

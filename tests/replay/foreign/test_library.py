@@ -100,11 +100,12 @@ REFUSED = {
         "fuselog_filter_innovation",
     ),
     "no JSON": ({"DESCRIPTION": '"\\"{nothing"'}, "its description is no JSON"),
-    "no topics": ({"DESCRIPTION": '"{}"'}, "parameter 'description.summary' is missing"),
+    "no topics": ({"DESCRIPTION": '"{}"'}, "entry 'description.summary' is missing"),
     "of another log": (
         {"TOPIC": '"/sonar"'},
         "does not fit this log: it needs /sonar; the log has /range",
     ),
+    "of another CPU": ({}, "cannot be loaded (it is of another CPU or system); compile it as a shared"),
 }
 """What a library is, and the sentence on it."""
 
@@ -117,6 +118,12 @@ def test_libraries_that_cannot_be_used(compile_filter: Compile, tmp_path: Path, 
     if case == "is no library":
         path = tmp_path / "text.so"
         path.write_text("no library")
+    elif case == "of another CPU":
+        made = bytearray(compile_filter(MISBEHAVING).read_bytes())
+        if not made.startswith(b"\x7fELF"):
+            pytest.skip("libraries are no ELF files here")
+        made[18:20] = (0xFFFE).to_bytes(2, "little")  # e_machine, a processor that there is not
+        path.write_bytes(made)
     elif defined:
         path = compile_filter(MISBEHAVING, case.replace(" ", "-"), **defined)
     with pytest.raises(BadInput) as raised:

@@ -1,5 +1,6 @@
 """The page on filters of one's own, worked through; and its filter in C++."""
 
+import json
 import shlex
 import shutil
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 import fuselog as fl
 from fuselog import BadInput
 from pipeline.command_line.process import main
-from tests.docs.test_worked_pages import blocks_of
+from tests.docs.test_worked_pages import DOCS, blocks_of
 from tests.replay.foreign.conftest import EXAMPLES, HEADER, Compile
 
 EIGEN = ("/usr/include/eigen3", "/usr/local/include/eigen3", "/opt/homebrew/include/eigen3")
@@ -65,15 +66,52 @@ def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_fil
 def test_a_state_by_other_names_is_told_those_of_the_truth(
     drifter: Path, compile_filter: Compile, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = Path("drifter.c").read_text(encoding="utf-8")
-    for own, other in (("x_m", "east"), ("y_m", "north"), ("prior", "none")):
-        text = text.replace(f'\\"{own}\\":', f'\\"{other}\\":')
-    Path("east.c").write_text(text.replace('\\"none\\": \\"prior\\",', ""), encoding="utf-8")
-    compile_filter(Path("east.c").resolve()).rename("east.so")
     fl.write("run.mcap", fl.record("vehicles", vehicles=1, duration_s=3.0))
-    assert main(["replay", "run.mcap", "-e", "lib:./east.so", "--set", "in_process=true"]) == 0
-    said = "east, north are not judged: /vehicle1/truth lacks them; it has x_m, vx_mps, y_m, vy_mps"
-    assert said in " ".join(capsys.readouterr().err.split())
+    both = "east, north are not judged: /vehicle1/truth lacks them; it has x_m, vx_mps, y_m, vy_mps"
+    one = (
+        "north is not judged: /vehicle1/truth lacks it; position_rmse_m is of x_m alone, and not "
+        "of y_m, which /vehicle1/truth has"
+    )
+    for label, renamed, said in (
+        ("east", {"x_m": "east", "y_m": "north"}, both),
+        ("north", {"y_m": "north"}, one),
+    ):
+        text = Path("drifter.c").read_text(encoding="utf-8").replace('\\"prior\\": \\"prior\\",', "")
+        for own, other in renamed.items():
+            text = text.replace(f'\\"{own}\\":', f'\\"{other}\\":')
+        Path(f"{label}.c").write_text(text, encoding="utf-8")
+        compile_filter(Path(f"{label}.c").resolve()).rename(f"{label}.so")
+        assert main(["replay", "run.mcap", "-e", f"lib:./{label}.so", "--set", "in_process=true"]) == 0
+        assert said in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("what", ["prior", "truth"])
+def test_a_prior_or_truth_by_another_name_is_refused(
+    drifter: Path, compile_filter: Compile, what: str
+) -> None:
+    text = Path("drifter.c").read_text(encoding="utf-8")
+    named = f'\\"{what}\\": \\"'
+    assert named in text
+    Path(f"no_{what}.c").write_text(text.replace(named, named + "my_"), encoding="utf-8")
+    path = str(compile_filter(Path(f"no_{what}.c").resolve()))
+    log = fl.record("vehicles", vehicles=1, duration_s=1.0)
+    said = f"names the {what} /vehicle1/my_{what}, which the log lacks; it has /vehicle1/{what}"
+    with pytest.raises(BadInput, match=said):
+        fl.replay(log, {"mine": {"kind": "lib", "path": path, "in_process": True}})
+
+
+def test_the_page_states_what_messages_were_measured_to_cost() -> None:
+    """By `make bench`, to two digits."""
+    speed = json.loads((DOCS / "speed.json").read_text(encoding="utf-8"))["foreign"]["rows"]
+    loop, around, apart, *programs = (float(row[1].split()[0]) / 1000 for row in speed)
+    page = (DOCS / "your-filter.md").read_text(encoding="utf-8")
+    stated = (
+        f"{loop:.2g} µs in the loop of this process, {around:.2g} µs with all around it; "
+        f"{apart:.2g} µs in a process of its own",
+        f"{min(programs):.2g} to {max(programs):.2g} µs",
+    )
+    for each in stated:
+        assert each in page
 
 
 def test_the_client_in_cpp_gives_the_same(drifter: Path) -> None:

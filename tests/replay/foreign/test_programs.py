@@ -51,6 +51,15 @@ def test_programs_that_fail_end_their_own_runs() -> None:
         assert len(estimates["/estimates/mine/state"]) == (AT if reason else MESSAGES), command
 
 
+def test_a_program_cannot_go_back() -> None:
+    with pytest.raises(
+        BadInput, match=r"a program cannot be copied.*give --late drop or --late wait:SEC"
+    ):
+        fl.replay(
+            run_with(SANE), {"mine": program(python(PROGRAM))}, arrival_order=True, late="rewind:1"
+        )
+
+
 @pytest.mark.paper
 def test_filterpy_as_a_program() -> None:
     """Its own numbers, and those of our filter of the same model; so the verdicts are alike."""
