@@ -111,15 +111,25 @@ class SensorNoise:
         """What other programs are told: N and K of each field, the largest of its axes.
 
         Of Gauss-Markov noise without a walk, the walk is the one that begins as it does: s sqrt(2 / T).
+        Where no axis has a walk, K is the most that it may be: Kalibr refuses a zero, and a covariance
+        of zero cannot be inverted.
         """
         found: dict[str, Density] = {}
+        bounds: dict[str, float] = {}
         for column in self.columns:
             terms = column.fitted.terms
             walk = max(terms.walk, terms.markov * math.sqrt(2 / terms.markov_time_s))
             before = found.get(column.field, Density(0.0, 0.0, column.step_s))
             largest = max(before.white, terms.white), max(before.walk, walk)
             found[column.field] = Density(*largest, column.step_s)
+            if not walk:
+                below = column.numbers["walk"].high
+                bounds[column.field] = max(bounds.get(column.field, 0.0), below)
         doubts = [note for note in self.notes if MISFIT in note]
+        for name, below in bounds.items():
+            if not found[name].walk:
+                found[name] = found[name]._replace(walk=below)
+                doubts.append(f"{name}: no walk was found; K is the most that it may be, with 95 %")
         return Densities(self.columns[0].topic, found, doubts)
 
     @property

@@ -202,9 +202,14 @@ def test_the_command_writes_what_others_read(
     assert sum("times that" in note for note in said.json["notes"]) == 3
     none_found = [note for note in said.json["notes"] if "no walk found; K <" in note]
     assert sum("turn_rate" in note for note in none_found) == 3
-    px4 = dict(line.split() for line in Path("noise/px4.params").read_text().splitlines()[1:])
+    lines = Path("noise/px4.params").read_text().splitlines()
+    px4 = dict(line.split() for line in lines if not line.startswith("#"))
     assert float(px4["EKF2_GYR_NOISE"]) == pytest.approx(10 * white, rel=1e-5)
-    assert f"gyroscope_noise_density: {white:.6g}" in Path("noise/kalibr-imu.yaml").read_text()
+    kalibr = Path("noise/kalibr-imu.yaml").read_text()
+    assert f"gyroscope_noise_density: {white:.6g}" in kalibr
+    walks = (row for row in said.json["numbers"] if row["term"] == "random walk K (rad/s/sqrt(s))")
+    assert f"gyroscope_random_walk: {max(row['high'] for row in walks):.6g}" in kalibr  # no zero
+    assert "# turn_rate_radps: no walk was found; K is the most that it may be, with 95 %" in kalibr
     assert f"setGyroscopeCovariance(I_3x3 * {white**2:.6g})" in Path("noise/gtsam.cpp").read_text()
     shown = fuselog("info", "noise/timeline.rrd", "--json").json["entities"]
     drawn = {name.rpartition("/")[2].replace("\\", "") for name in shown if "/curves/5/" in name}
