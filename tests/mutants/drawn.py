@@ -723,15 +723,15 @@ DRAWN = [
         "tests/pipeline/test_stressing.py tests/pipeline/test_stress_studies.py",
     ),
     Fault(
-        "pipeline/deploying/c_filter.py",
+        "pipeline/deploying/c_source/statements.py",
         'elif array == "P" and place[0] >= place[1]:',
         'elif array == "P" and place[0] > place[1]:',
         "tests/pipeline/test_deploying.py",
     ),
     Fault(
-        "pipeline/deploying/c_filter.py",
-        'find_slope(filter->covariance, a, slope);"',
-        'find_slope(filter->covariance, slope, a);"',
+        "pipeline/deploying/c_source/updates.py",
+        "find_slope(filter->covariance, a, slope);",
+        "find_slope(filter->covariance, slope, a);",
         "tests/pipeline/test_deploying.py",
     ),
     Fault(

@@ -18,7 +18,7 @@ UNSOUND = (
 NOT_FINITE, NOT_POSITIVE_DEFINITE, GOES_BACK, NOT_SYMMETRIC = range(len(UNSOUND))
 # A share of a variance: a covariance that is singular but for rounding, as of one particle, is one.
 INDEFINITE = 1e-9
-# The square of a share of two deviations: filters in single precision differ by less from their transpose.
+# The square of a share of two deviations: rounding in single precision leaves less.
 ASYMMETRIC = 1e-6
 
 
