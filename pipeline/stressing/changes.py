@@ -20,7 +20,7 @@ SHIFT_NS = 1000
 START_SIGMAS = 0.1
 PARAMETER_SHARE = 0.01
 DROPPED_SHARE = 0.01
-PARAMETERS = "parameters"
+PARAMETERS, DROPPED = "parameters", "dropped"
 
 
 class Inputs(NamedTuple):
@@ -195,7 +195,7 @@ CHANGES: Mapping[str, Change] = {
     "ulp": Change("inputs moved by one ulp", _inputs(_by_an_ulp), False),
     "start": Change("the start moved by a tenth of its sigma", _start, True),
     PARAMETERS: Change("parameters changed by 1 %", None, True),
-    "dropped": Change("1 % of the messages dropped", _dropped, False),
+    DROPPED: Change("1 % of the messages dropped", _dropped, False),
     "zero duration": Change("one more prediction of zero duration", _again, False),
 }
 

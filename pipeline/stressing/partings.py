@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recorders.log import Stream, schemas
+from replay.distributions import chi2
 from replay.engine.vectors.covariances import normalized_error_squared
 from replay.engine.vectors.tangent import difference, tangent_components
 
@@ -30,6 +31,7 @@ class Parting(NamedTuple):
         amplification: (n,) A.
         metres, degrees: (n,) of positions and of angles; NaN where the state has none.
         spread: how much the standard deviations differ at most, as a share of them.
+        explained: (n,) how large A may be where the other replay is the same filter with less data.
     """
 
     topic: str
@@ -38,6 +40,7 @@ class Parting(NamedTuple):
     metres: Floats
     degrees: Floats
     spread: float
+    explained: Floats
 
     @property
     def growth(self) -> float:
@@ -82,9 +85,9 @@ def _parting(base: Stream, copy: Stream, within_ns: int) -> Parting:
     kinds = base.metadata["kinds"].split(",")
     names = tangent_components(base.metadata["components"].split(","), kinds)
     apart = difference(there["mean"], here["mean"], kinds)
-    covariance = covariances(here)
+    covariance, other = covariances(here), covariances(there)
     amplification = np.sqrt(normalized_error_squared(apart, covariance) / max(1, apart.shape[1]))
-    sigmas, others = (np.sqrt(np.einsum("rii->ri", covariances(each))) for each in (here, there))
+    sigmas, others = (np.sqrt(np.einsum("rii->ri", each)) for each in (covariance, other))
     with np.errstate(invalid="ignore", divide="ignore"):
         spread = np.abs(others / sigmas - 1.0)
     return Parting(
@@ -94,7 +97,25 @@ def _parting(base: Stream, copy: Stream, within_ns: int) -> Parting:
         _norm(apart, [name in AXES for name, _ in names]),
         np.degrees(_norm(apart, [kind in ("angle", "rotation") for _, kind in names])),
         float(np.max(np.nan_to_num(spread, posinf=0.0), initial=0.0)),
+        _explained(covariance, other),
     )
+
+
+def _explained(covariance: Floats, other: Floats) -> Floats:
+    """How large A may be by chance, at each of (n,) stamps, where one estimate has less data.
+
+    The difference of a consistent estimate with covariance P, and of another with less data and P', has
+    the covariance P' - P. So n A^2 is at most the largest eigenvalue of (P' - P) P^-1 times chi-square
+    of n degrees of freedom, which one of 1000 replays exceeds somewhere.
+    """
+    count, size = covariance.shape[:2]
+    known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(other).all(axis=(1, 2))
+    shares = np.zeros(count)
+    inverse = np.linalg.pinv(covariance[known], hermitian=True)
+    lost = np.linalg.eigvals(inverse @ (other - covariance)[known]).real
+    shares[known] = lost.max(axis=1, initial=0.0)
+    limit = chi2.isf(1e-3 / max(1, count), max(1, size))
+    return np.sqrt(shares * limit / max(1, size))
 
 
 def covariances(stream: Stream) -> Floats:

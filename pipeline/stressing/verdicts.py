@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.stressing.changes import CHANGES
+from pipeline.stressing.changes import CHANGES, DROPPED
 from pipeline.stressing.partings import Parting, Undetermined, undetermined
 from recorders.log import Stream
 
@@ -74,6 +74,16 @@ class Stressed:
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
 
+    def _is_explained(self, name: str) -> bool:
+        """Whether a change without a half moves the estimate no farther than it may.
+
+        A lost message moves it by chance, as far as the covariances say; any other less than a sigma.
+        """
+        parting = self.tried[name].parting
+        if name != DROPPED or parting is None:
+            return self.tried[name].largest < ONE_SIGMA
+        return bool(np.all(parting.amplification <= parting.explained + HARMLESS))
+
     def ratio(self, name: str) -> float:
         """How many times more the whole change does than half of it, in A; NaN where none was halved."""
         half = self.halves.get(name)
@@ -89,7 +99,7 @@ class Stressed:
         if CHANGES[name].is_scaled:
             is_in_proportion = HALVES[0] <= self.ratio(name) <= HALVES[1]
             return "sensitive" if is_in_proportion else "discontinuous or chaotic"
-        return "sensitive" if each.largest < ONE_SIGMA else "discontinuous or chaotic"
+        return "sensitive" if self._is_explained(name) else "discontinuous or chaotic"
 
     @property
     def worst(self) -> Verdict:
@@ -164,7 +174,7 @@ class Stressed:
             how = f"; half the change does {1.0 / self.ratio(name):.2g} of it"
             return begin + (how if name in self.halves else "")
         how = f"; half the change does {1.0 / self.ratio(name):.2g} of it: it does not shrink with it"
-        return begin + (how if name in self.halves else "")
+        return begin + (how if np.isfinite(self.ratio(name)) else "")
 
     @property
     def sentences(self) -> list[str]:

@@ -369,6 +369,16 @@ def test_planted_direction_and_onset() -> None:
             assert abs((found.since_ns - EPOCH_NS) * 1e-9 - 20.0) <= 2.0
 
 
+def test_a_lost_message_moves_a_filter_as_far_as_its_covariance_says() -> None:
+    """What two honest filters are apart is explained; not so of one with a twentieth of the noise."""
+    sure = {"kind": "ekf", "sigma_range_m": 0.005, "sigma_bearing_rad": 0.002, "gate_probability": 1.0}
+    logs = [fl.record("landmarks", seed=seed, duration_s=10.0) for seed in range(3)]
+    verdicts: dict[str, set[str]] = {"ekf": set(), "sure": set()}
+    for each in fl.stress(logs, {"ekf": {}, "sure": sure}).stressed:
+        verdicts[each.estimator].add(each.verdict("dropped"))
+    assert verdicts == {"ekf": {"sensitive"}, "sure": {"discontinuous or chaotic"}}
+
+
 def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> None:
     logs = []
     for seed in range(5):
