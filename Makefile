@@ -36,7 +36,8 @@ fast-replay-lane: .venv/with-test
 	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
-	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py
+	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py \
+		tests/pipeline/test_campaigns.py
 
 inference-lane: .venv/with-test
 	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py \
@@ -44,7 +45,8 @@ inference-lane: .venv/with-test
 
 pipeline-lane: .venv/with-test
 	$(BIN)/pytest tests/pipeline --ignore-glob='*stud*.py' --ignore=tests/pipeline/test_faults.py \
-		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py
+		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py \
+		--ignore=tests/pipeline/test_campaigns.py
 
 rooms-lane: .venv/with-test
 	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \
