@@ -2,6 +2,8 @@
 
 import re
 
+import pytest
+
 from tests.claims.limits import Limit, Made, all_limits
 
 # What only several metrics moved against each other would decide.
@@ -22,6 +24,7 @@ UNDECIDED = (
 OTHERWISE = re.compile(r"==| in |value\(|high\(|low\(|chi_square|consistent")
 
 
+@pytest.mark.paper
 def test_every_claim_has_a_limit() -> None:
     """A claim that no metric moves would be confirmed, or refuted, whatever is found."""
     names = [

@@ -50,6 +50,7 @@ CELLS = [battery.Cell(fault, fault.startswith("compass"), True) for fault in FAU
 @pytest.mark.parametrize(
     "cell", [*CELLS, battery.Cell("nothing", False, False)], ids=lambda cell: cell.name
 )
+@pytest.mark.paper
 def test_the_fault_is_named_first(cell: battery.Cell, seed: int) -> None:
     """Its number, if it has one, within 4 of the sheet's standard deviations."""
     found = battery.tried(cell, seed)
@@ -58,6 +59,7 @@ def test_the_fault_is_named_first(cell: battery.Cell, seed: int) -> None:
 
 
 @pytest.mark.parametrize("faults", battery.PAIRS[:1], ids=" + ".join)
+@pytest.mark.paper
 def test_two_gross_faults_are_named_where_noise_explains_more_than_one(faults: tuple[str, ...]) -> None:
     """With one undone the other is still so large that a noise thousands of times larger fits."""
     assert battery.tried_together(faults, SEED, has_prior=True)["are_named"]
@@ -118,6 +120,7 @@ def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
     assert fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0, **setting}).sentences == []
 
 
+@pytest.mark.paper
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
     log = recorded(faulty(SEED, "E, N exchanged"), has_compass=False)

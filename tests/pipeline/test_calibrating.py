@@ -44,6 +44,7 @@ BY_SHEET[2, 1:3] = B_W / A_W**2, -1.0 / A_W
 USEFUL = np.array([0.01, 0.01, 0.01, 0.2, 0.2, 0.05, 0.02])
 
 
+@pytest.mark.paper
 def test_the_car_of_the_sheet() -> None:
     car = drive(1)
     sums = [car.odometry[:, 0].sum(), car.odometry[:, 1].sum(), car.fix_m.sum(), car.compass_rad.sum()]
@@ -73,6 +74,7 @@ def test_the_car_of_the_sheet() -> None:
         (slalom, [0.142, 6.93, 11.5, 56.4, 123.0, 232.0, 534.0], ["lever_x_m", "fix_delay_s"]),
     ],
 )
+@pytest.mark.paper
 def test_what_the_motion_does_not_determine_is_named_and_held(
     motion: Motion, eigenvalues: list[float], held: list[str]
 ) -> None:
@@ -144,6 +146,7 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         advice(replace(fl.calibrate(log, "ekf"), logs=[without]))
 
 
+@pytest.mark.paper
 def test_the_next_manoeuvre_is_the_sheets() -> None:
     """The prior is the sheet's, in useful units; each manoeuvre has a start of its own."""
     wide = (1000.0, 1000.0, 1.0)

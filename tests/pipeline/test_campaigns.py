@@ -109,6 +109,7 @@ def test_cells_are_merged_into_what_one_pass_gives(whole):
     assert not unfinished(folder).exists()
 
 
+@pytest.mark.paper
 def test_another_way_of_working_gives_the_same_bytes(whole, tmp_path, worked_off):
     place = whole[0]  # the same place, since estimates state where their logs are
     kept = tmp_path / "first"

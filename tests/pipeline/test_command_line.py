@@ -480,6 +480,7 @@ def test_a_stopped_recording_or_replay_leaves_nothing(
 @pytest.mark.parametrize(
     ("number", "again"), [(signal.SIGINT, False), (signal.SIGINT, True), (signal.SIGTERM, False)]
 )
+@pytest.mark.paper
 def test_a_stop_that_falls_into_a_finalizer_is_not_lost(
     number: int, again: bool, here: Path, world: Path, fuselog: Fuselog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -269,6 +269,7 @@ def outcome(line: str, logs: Path, folder: Path) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize("moves", MOVES, ids=lambda moves: moves.usual)
+@pytest.mark.paper
 def test_every_option_changes_what_comes_out(moves: Moves, logs: Path, tmp_path: Path):
     place = tmp_path / "here"
     usual = outcome(moves.usual, logs, place)

@@ -58,6 +58,7 @@ def furthest(program: Path) -> float:
         ("batch-reactor", "ukf", {}),
     ],
 )
+@pytest.mark.paper
 def test_estimates_are_equal_to_the_last_bit(
     tmp_path: Path, scenario: str, label: str, options: dict[str, str]
 ) -> None:
@@ -85,6 +86,7 @@ def test_estimates_are_equal_to_the_last_bit(
 
 @needs_compiler
 @pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+@pytest.mark.paper
 def test_check_says_whether_the_c_is_as_the_golden(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -37,6 +37,7 @@ def test_the_likelihood_over_broad_starts_is_that_of_the_sheet() -> None:
 
 
 @pytest.mark.parametrize(("stated", "factor", "size"), [(4.0, 1.99, "large"), (1 / 16, 4.02, "small")])
+@pytest.mark.paper
 def test_a_covariance_stated_wrongly_is_named_with_its_factor(
     stated: float, factor: float, size: str
 ) -> None:

@@ -22,6 +22,7 @@ def readings(log: fl.MemorySource, field: str = study.FIELD) -> np.ndarray:
 
 
 @pytest.mark.parametrize("unit", study.UNITS)
+@pytest.mark.paper
 def test_what_a_turned_unit_errs_by_is_found(unit: str) -> None:
     """Each number within 3.5 standard errors, by two units."""
     truth = study.UNITS[unit][1]
@@ -32,6 +33,7 @@ def test_what_a_turned_unit_errs_by_is_found(unit: str) -> None:
         assert np.abs((table["value"] - truth) / sigma).max() < 3.5
 
 
+@pytest.mark.paper
 def test_settings_correct_the_log() -> None:
     log = study.recorded("magnetometer", 1)
     found = study.calibrated("magnetometer", 1)

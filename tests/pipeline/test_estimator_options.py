@@ -104,6 +104,7 @@ def counts(tried: Tried, kind: type[Parameters], parameter: Described) -> bool:
 
 
 @pytest.mark.parametrize("tried", TRIED, ids=lambda tried: tried.label)
+@pytest.mark.paper
 def test_every_parameter_changes_the_estimates(tried: Tried):
     estimator, variant = find_estimator(tried.case.kind)
     by_model = estimator.parameters_by_model(tried.case.kind, variant)

@@ -246,6 +246,7 @@ NOW = """() => {
 DRAG = 'place => { Bokeh.documents[0].get_model_by_name("sigma_range_m").value = place; }'
 
 
+@pytest.mark.paper
 def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The newest value wins; the timeline is opened with it, at the instant of the lens."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -296,6 +297,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(os.name != "posix", reason="an interrupt is sent as POSIX has it")
+@pytest.mark.paper
 def test_ctrl_c_ends_everything(log: Path, start_fuselog: Callable[..., subprocess.Popen[str]]) -> None:
     pytest.importorskip("bokeh")
     command = ["explore", str(log), "-e", "ekf", "--no-browser"]

@@ -349,6 +349,7 @@ def test_what_the_command_refuses(world: Path, fuselog: Fuselog, tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.paper
 def test_logs_that_were_meant_to_be_held_out_are_not_tuned_on(
     world: Path, fuselog: Fuselog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -305,6 +305,7 @@ def test_the_share_that_is_lost_is_the_sheets() -> None:
     assert (found.cause, round(found.value, 6)) == ("lost messages", 0.512641)
 
 
+@pytest.mark.paper
 def test_every_setting_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
     """From the file, as the command's --set reads it."""
     advised = 0
@@ -351,6 +352,7 @@ def imported(folder: Path, stream: Stream, advice: str) -> Stream:
     return import_run("table", folder / "log.csv", values)[0].streams[0]
 
 
+@pytest.mark.paper
 def test_every_line_of_a_mapping_that_is_advised_mends_its_finding(tmp_path: Path) -> None:
     advised = []
     for name, (put, topic, cause, words) in FAULTS.items():

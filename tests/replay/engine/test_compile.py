@@ -123,6 +123,7 @@ def started(text: str, *arguments: str | Path) -> subprocess.Popen[str]:
 
 
 @BOTH
+@pytest.mark.paper
 def test_of_two_processes_that_want_a_kernel_one_compiles(
     tmp_path: Path, kernels: Path, monkeypatch: pytest.MonkeyPatch, module: str
 ):
@@ -213,6 +214,7 @@ def test_a_change_in_another_file_is_noticed(tmp_path: Path):
 
 
 @BOTH
+@pytest.mark.paper
 def test_the_order_of_a_named_tuples_fields_is_part_of_a_kernel(tmp_path: Path, module: str):
     cache = tmp_path / "cache"
     head, rest = module.split("class Columns(NamedTuple):")
@@ -278,6 +280,7 @@ EITHER = pytest.mark.parametrize(
         pytest.param(by_numba, "another kernel's", marks=pytest.mark.paper),
     ],
 )
+@pytest.mark.paper
 def test_a_damaged_file_is_compiled_anew_and_replaced(
     kernels: Path, damage: str, found_in_the_cache: Callable[[], bool]
 ):

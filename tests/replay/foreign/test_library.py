@@ -28,6 +28,7 @@ def library(path: Path, **settings: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("golden", "in_process"), [("landmarks", False), ("landmarks", True), ("landmarks-adverse", True)]
 )
+@pytest.mark.paper
 def test_our_ekf_by_hand_in_c(compile_filter: Compile, golden: str, in_process: bool) -> None:
     """Estimates, covariances, innovations and NIS are ours on the goldens' logs."""
     own = library(compile_filter(EXAMPLES / "robot_ekf.c"), in_process=in_process, **GATE)

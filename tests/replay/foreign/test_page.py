@@ -114,6 +114,7 @@ def test_the_page_states_what_messages_were_measured_to_cost() -> None:
         assert each in page
 
 
+@pytest.mark.paper
 def test_the_client_in_cpp_gives_the_same(drifter: Path) -> None:
     if shutil.which("c++") is None:
         pytest.skip("there is no compiler: c++")

@@ -350,6 +350,7 @@ def test_a_measurement_that_leaves_no_covariance_ends_the_run(method: str) -> No
 
 @pytest.mark.usefixtures("uncompiled")
 @pytest.mark.parametrize("method", ["ekf", "iekf", "ukf", "smoother", "particles"])
+@pytest.mark.paper
 def test_what_memory_holds_before_it_is_written_changes_nothing(
     method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
