@@ -309,6 +309,19 @@ def nested(name: str, value: Any) -> dict[str, Any]:
     return {first: nested(rest, value) if rest else value}
 
 
+def flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested tables by their full names.
+
+    >>> dict(flat({"seed": 1, "range": {"rate_hz": 5.0}}))
+    {'seed': 1, 'range.rate_hz': 5.0}
+    """
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name}.{key}", inner) for key, inner in flat(value))
+        else:
+            yield name, value
+
+
 def parse_settings(settings: Iterable[str]) -> dict[str, Any]:
     """Turn `--set` options such as `sensor.rate_hz=5` into nested values; the right side is TOML.
 

@@ -129,9 +129,8 @@ def explore(log: Path, names: tuple[str, ...], **options: Any) -> None:
 @click.option(
     "--by",
     type=click.Choice(["likelihood", "nis", "nees", "rmse"]),
-    default="likelihood",
-    show_default=True,
-    help="What to optimise: the likelihood, NIS or NEES (nearest to their expectation), or RMSE.",
+    help="What to optimise: the likelihood, NIS or NEES (nearest to their expectation), or RMSE. "
+    "[default: likelihood; rmse for an estimator without innovations]",
 )
 @click.option(
     "--bound",

@@ -1,5 +1,6 @@
 """A log in memory and the filters on it: what a change of settings does, without server or browser."""
 
+import json
 import math
 import shlex
 import time
@@ -22,11 +23,11 @@ from pipeline.tuning.objective import Run, in_memory
 from pipeline.tuning.tuning import OPEN, tune
 from recorders.atomic import scratch_folder
 from recorders.errors import BadInput, choices
-from recorders.parameters import merge, nested
-from replay.engine.replaying.estimator import Bound, bind
+from recorders.parameters import flat, merge, nested
+from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import LogSource, MemorySource
-from replay.foreign.naming import allowed
+from replay.foreign.naming import allowed, name_of
 from replay.judging.judge import Judge
 from replay.timeline import viewer
 
@@ -194,10 +195,17 @@ class Session:
         return tomli_w.dumps(tables)
 
     def command(self, values: Values) -> str:
-        """The command that replays the same."""
+        """The command that replays the same; raises BadInput where one is an estimator of one's own."""
         place = self.source.log.path if isinstance(self.source, LogSource) else self.source.name
         words = ["fuselog replay", shlex.quote(str(place))]
-        words += [f"-e {label}" for label in self.filters]
+        for label, own in self.filters.items():
+            name, rest = name_of(label, {"kind": label, **own})
+            words.append(f"-e {shlex.quote(name)}")
+            words += [
+                f"--set {shlex.quote(f'{label}.{key}={_set_to(label, value)}')}"
+                for key, value in flat(rest)
+                if key not in values and value is not None
+            ]
         words += [
             f"--set {shlex.quote(f'{key}={value}')}" for key, value in setting_of(self.source).items()
         ]
@@ -214,6 +222,13 @@ class Session:
     def _takes(self, label: str, name: str) -> bool:
         [names] = parameters_by_label({label: self.filters[label]}).values()
         return name.partition(".")[0] in names
+
+
+def _set_to(label: str, value: Any) -> str:
+    """A setting as `--set` takes it: JSON's texts, numbers and lists are TOML's."""
+    if isinstance(value, Estimator):
+        raise BadInput(f"{label}: is an estimator of your own; a command cannot name it")
+    return json.dumps(value)
 
 
 def open_session(

@@ -11,6 +11,7 @@ from recorders.errors import BadInput
 from recorders.parameters import bounds_of, describe
 from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource
+from replay.foreign.description import ForeignParameters
 from replay.inference.model.parameters import number_fields
 
 STEPS = 400  # between the ends of a slider
@@ -103,7 +104,7 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
     """The parameters of filters that can be dragged, those of one group together.
 
     Of an estimator of a model these are the parameters that its functions read on this log; of any other
-    all its numbers that have a value above zero.
+    all its numbers that have a value above zero, but for how a program is run.
 
     Args:
         source: the log.
@@ -130,7 +131,10 @@ def _groups(bound: Bound) -> dict[str, str]:
     assert bound.parameters is not None
     names = number_fields(type(bound.parameters))
     if not isinstance(bound, Recursive) or bound.reading is None:
-        return dict.fromkeys(names, MOTION)
+        how_run = (
+            ForeignParameters.model_fields if isinstance(bound.parameters, ForeignParameters) else ()
+        )
+        return dict.fromkeys((name for name in names if name not in how_run), MOTION)
     reading = bound.reading()
     found = {name: topic or MOTION for name, topic in reading.noises.items()}
     for name, (_, topics) in reading.augmentable.items():

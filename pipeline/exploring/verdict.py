@@ -1,7 +1,7 @@
 """What a person is told of a filter on a log: one sentence, and what it rests on."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -36,9 +36,8 @@ def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> 
     own = [each for each in alarms if each.case in ("", case.name)]
     if not own:
         return Verdict("good", "Nothing speaks against it.", _evidence(case))
-    ratio, of_what = _ratio(case)
-    about = {each.kind for each in own}
-    if not about & {"innovations", "errors"} or math.isnan(ratio):
+    ratio, of_what = _ratio(case, {each.kind for each in own})
+    if math.isnan(ratio):
         return Verdict("doubtful", "Doubtful.", own[0].words)
     if ratio > 1.0:
         return Verdict(
@@ -47,17 +46,18 @@ def verdict_of(case: Case, alarms: Sequence[Alarm], failures: Sequence[str]) -> 
     return Verdict("doubtful", "Too careful.", f"Its {of_what} are {ratio:.2g} of what it claims.")
 
 
-def _ratio(case: Case) -> tuple[float, str]:
+def _ratio(case: Case, about: Set[str]) -> tuple[float, str]:
     """How many times larger errors or innovations are than stated, and which of them it is of.
 
-    The one that is farther from one: a filter may be right on what it measures and wrong on the rest.
+    Of those that alarms are about the one that is farther from one: a filter may be right on what it
+    measures and wrong on the rest. NaN where no alarm is about either, or there are no numbers.
     """
     found = []
-    if case.errors is not None and np.isfinite(case.errors.nees).any():
+    if "errors" in about and case.errors is not None and np.isfinite(case.errors.nees).any():
         nees = float(np.nanmean(case.errors.nees))
         found.append((math.sqrt(nees / len(case.errors.components)), "errors"))
-    if case.nis is not None and len(case.nis.mean):
-        found.append((math.sqrt(mean_nis(case)), "innovations"))
+    if "innovations" in about and not math.isnan(nis := mean_nis(case)):
+        found.append((math.sqrt(nis), "innovations"))
     return max(found, key=lambda each: abs(math.log(max(each[0], 1e-12))), default=(math.nan, ""))
 
 

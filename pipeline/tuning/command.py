@@ -25,7 +25,7 @@ def tune_logs(
     label: str,
     free: Sequence[str] = (),
     search: Callable[..., Tuning] | None = None,
-    by: By = "likelihood",
+    by: By | None = None,
     bounds: Sequence[str],
     grid: int = 1,
     held_out: Sequence[Path],

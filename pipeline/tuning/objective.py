@@ -78,10 +78,15 @@ def in_memory(source: Source, bound: Iterable[Bound]) -> Run:
     return Run(Ensemble([held]), source.name)
 
 
+def is_innovation(rows: Ragged) -> bool:
+    """Tell whether an output is a stream of innovations."""
+    return rows.stream.schema.full_name == INNOVATION
+
+
 def innovations_in(outputs: Mapping[str, Ragged]) -> Iterator[tuple[str, Stream]]:
     """The innovation streams of one log's outputs, by topic."""
     for topic, rows in outputs.items():
-        if rows.stream.schema.full_name == INNOVATION and len(rows):
+        if is_innovation(rows) and len(rows):
             yield topic, rows.stream
 
 

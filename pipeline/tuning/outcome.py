@@ -248,6 +248,11 @@ class Tuning:
 
     def _notes_of_innovations(self) -> Iterator[str]:
         rows = self.whiteness.to_dict("records")
+        if not rows:
+            yield (
+                f"{self.label} gives no innovations, so that these values are those with which its "
+                "estimates are nearest to the truth; what the measurements say of them is not known"
+            )
         for row in (each for each in rows if each["estimator"] == TUNED):
             if row["probability"] < IMPROBABLE:
                 what = " ".join(filter(None, (row["case"], row["component"])))

@@ -27,6 +27,7 @@ from pipeline.tuning.objective import (
     Objective,
     Run,
     in_memory,
+    is_innovation,
     silent,
     with_values,
 )
@@ -42,6 +43,7 @@ from pipeline.tuning.search import (
 from recorders.errors import BadInput, choices
 from recorders.parameters import bounds_of, merge
 from replay.engine.replaying.estimator import Bound, Recursive, bind
+from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.channels import stated
 from replay.foreign.naming import allowed
 
@@ -57,7 +59,7 @@ def tune(
     estimator: Named,
     free: str | Sequence[str],
     *,
-    by: By = "likelihood",
+    by: By | None = None,
     set: Mapping[str, Any] | None = None,  # noqa: A002
     bounds: Mapping[str, tuple[float, float]] | None = None,
     grid: int = 1,
@@ -76,7 +78,8 @@ def tune(
         estimator: a registered name, or a label of your own with what it stands for; see `replay`.
         free: the parameters to search for, by their full names.
         by: "likelihood" of the measurements, which needs no truth; "nis", mean squares of the normalised
-            innovations of one; "nees" of one; or the least "rmse".
+            innovations of one; "nees" of one; or the least "rmse". By default the likelihood, and "rmse"
+            for an estimator that gives no innovations.
         set: other parameters, and where the search starts; by default what the log's channels state.
             And how topics are altered; see `replay`.
         bounds: between what values a parameter lies; where both are positive, so is the parameter.
@@ -98,7 +101,7 @@ def tune(
     >>> found.parameters["value"].round(1).tolist()
     [0.1]
     """
-    if by not in CRITERIA:
+    if by is not None and by not in CRITERIA:
         raise BadInput(f"--by {by}: {choices(by, CRITERIA)}")
     alterations, given = split_settings(set or {})
     sources = sources_of(logs, alterations)
@@ -114,10 +117,11 @@ def tune(
     settings = {"kind": label, **merge(own, allowed(given))}
     bound = bind(label, sources, settings)
     sources = [until_last_measured(each, bound) for each in sources]
+    runs = [in_memory(source, bound) for source in sources]
+    by = by or _criterion(runs[0], bound)
     searched = _searched([free] if isinstance(free, str) else free, bounds or {}, by, sources[0], bound)
     _refuse_random(label, bound, by)
     start = np.array([each.start for each in searched])
-    runs = [in_memory(source, bound) for source in sources]
     others = [in_memory(each, bind(label, held_out, settings)) for each in held_out]
     opened = merge(settings, OPEN) if CRITERIA[by].is_smooth and _gate(bound) < 1.0 else settings
     names = [each.name for each in searched]
@@ -163,6 +167,12 @@ def _pool(
     if workers is None and scheduler is None and executor is None:
         return nullcontext()
     return pool_for(workers, scheduler, 1, executor)()
+
+
+def _criterion(run: Run, bound: Sequence[Bound]) -> By:
+    """By what an estimator is tuned: its likelihood, or its errors where it gives no innovations."""
+    outputs = collect(replay(run.ensemble, bound))
+    return "likelihood" if any(is_innovation(rows) for rows in outputs.values()) else "rmse"
 
 
 def _gate(bound: Sequence[Bound]) -> float:

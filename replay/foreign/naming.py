@@ -44,6 +44,25 @@ def shorthand(name: str) -> tuple[str, dict[str, Any]]:
     return _label(kind, rest), {"kind": kind, KINDS[kind]: Allowed(rest)}
 
 
+def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return the name that stands for an estimator, and the settings that it does not stand for.
+
+    >>> name_of("mine", {"kind": "lib", "path": "./mine.so", "speed": 2.0})
+    ('lib:./mine.so', {'speed': 2.0})
+    >>> name_of("other", {"kind": "ekf"}), name_of("ekf", {"kind": "ekf"})
+    (('other', {'kind': 'ekf'}), ('ekf', {}))
+    """
+    kind = settings["kind"]
+    if kind == label:
+        return label, {name: value for name, value in settings.items() if name != "kind"}
+    if isinstance(kind, str) and kind in KINDS:
+        name = f"{kind}:{settings[KINDS[kind]]}"
+        if shorthand(name)[0] == label:
+            stood_for = ("kind", KINDS[kind])
+            return name, {key: value for key, value in settings.items() if key not in stood_for}
+    return label, dict(settings)
+
+
 def _label(kind: str, rest: str) -> str:
     """The stem of a library or program; of a script where an interpreter comes first."""
     words = [rest]

@@ -83,6 +83,18 @@ def test_saved_settings_replay_to_the_same_numbers(
         assert json.loads(said.out)["metrics"]["ekf.position_rmse_m.robot1"] == pytest.approx(error_m)
 
 
+def test_the_command_names_what_was_set_before(log: Path) -> None:
+    """Settings of a filter's own, but for those that a slider changed since."""
+    own = {"kind": "ekf", "sigma_range_m": 0.2, "sigma_bearing_rad": 0.1, "estimate": ["bias_range_m"]}
+    own |= {"estimate_sigma": {"bias_range_m": 0.1}}
+    found = open_session(log, {"ekf": own, "mine": {"kind": "ukf"}})
+    assert found.command({"sigma_bearing_rad": 0.05}) == (
+        f"fuselog replay {log} -e ekf --set ekf.sigma_range_m=0.2 "
+        "--set 'ekf.estimate=[\"bias_range_m\"]' --set ekf.estimate_sigma.bias_range_m=0.1 "
+        "-e mine --set 'mine.kind=\"ukf\"' --set sigma_bearing_rad=0.05"
+    )
+
+
 def test_sliders_are_of_what_the_log_is_read_by(session: Session) -> None:
     found = {each.name: each for each in session.sliders}
     assert {

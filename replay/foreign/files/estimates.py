@@ -83,6 +83,12 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
     clock = "time_ns" if "time_ns" in table else "time_s"
     if clock not in table or not len(table):
         raise BadInput("the program's estimates have no rows with time_ns or time_s")
+    for name in map(str, table):
+        if missing := np.flatnonzero(~np.isfinite(numbers[name])).tolist():
+            raise BadInput(
+                f"the program's estimates have no number as {name} in row {missing[0] + 1} "
+                f"({len(missing)} in all); write one, or leave the row out"
+            )
     whole = table[clock].to_numpy()
     time_ns = whole.astype(np.int64) if clock == "time_ns" else np.rint(whole * 1e9).astype(np.int64)
     names = [name for name in map(str, table) if name != clock and not name.startswith("cov_")]

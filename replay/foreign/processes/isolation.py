@@ -1,11 +1,9 @@
 """Runs filters in processes of their own: a crash, a loop or a leak ends one run, with its reason."""
 
 import json
-import os
 import queue
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +22,7 @@ from replay.engine.streams.failures import Failure
 from replay.foreign.description import Description, ForeignParameters
 from replay.foreign.native.following import Followed, followed, offsets_of, reason_of_code
 from replay.foreign.native.library import Library
+from replay.foreign.processes.orphans import GUARD, family, kill_family, start_module
 from replay.foreign.processes.tasks import LOADING, RunGiven, follow_given, mapped, sizes_of
 from replay.foreign.processes.worker import IDLE
 from replay.foreign.results import begun, results
@@ -70,14 +69,6 @@ class Watch:
             raise Ended(f"took more than {self._limits.memory_mb:g} MB of memory (memory_limit_mb)")
 
 
-def family(process: psutil.Process) -> list[psutil.Process]:
-    """Return a process and all that it started."""
-    try:
-        return [process, *process.children(recursive=True)]
-    except psutil.Error:
-        return [process]
-
-
 def _memory(process: psutil.Process) -> int:
     try:
         return int(process.memory_info().rss)
@@ -89,9 +80,7 @@ def end(process: "subprocess.Popen[bytes]") -> None:
     """End a process and all that it started."""
     if process.poll() is None:  # else its number may be another's
         with suppress(psutil.Error):
-            for each in family(psutil.Process(process.pid)):
-                with suppress(psutil.Error):
-                    each.kill()
+            kill_family(psutil.Process(process.pid))
         process.wait()
     for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
@@ -111,15 +100,8 @@ class Worker:
     """Represents a process that takes runs through filters of libraries, one after another."""
 
     def __init__(self) -> None:
-        root = str(Path(__file__).parents[3])  # what we are imported from, whatever the folder is
-        paths = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "replay.foreign.processes.worker"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": paths, "NUMBA_NUM_THREADS": "1"},
-        )
+        self._process = start_module("replay.foreign.processes.worker", stdout=subprocess.PIPE)
+        GUARD.tell(self._process.pid)
         self.is_over = False
         self._answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         threading.Thread(target=self._listen, daemon=True).start()

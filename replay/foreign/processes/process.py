@@ -9,6 +9,7 @@ import psutil
 
 from recorders.errors import BadInput, printable
 from replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
+from replay.foreign.processes.orphans import GUARD
 
 TOLD_BYTES = 300  # of what a program says on standard error
 
@@ -26,6 +27,7 @@ class Program:
             raise BadInput(
                 f"exec:{words[0]}: cannot be started ({error.strerror}); give a program that there is"
             ) from None
+        GUARD.tell(self.process.pid)
         self.tail = b""
         self._told = threading.Thread(target=self._keep_tail, daemon=True)
         self._told.start()

@@ -1,6 +1,10 @@
 """What a filter breaks ends its own run: the others are judged, and nothing is left running."""
 
+import subprocess
+import sys
+
 import numpy as np
+import psutil
 import pytest
 
 import fuselog as fl
@@ -64,6 +68,31 @@ def test_failures_in_this_process(compile_filter: Compile) -> None:
     for command, estimates in zip(commands, done.estimates, strict=True):
         assert len(estimates["/estimates/mine/failure"]) == bool(RUNS[command])
         assert sum(RUNS[command] in each for each in done.failures) == (1 if RUNS[command] else 3)
+
+
+@pytest.mark.unix
+def test_a_program_ends_when_we_are_killed() -> None:
+    """It reads nothing and listens to no signal; a program that it started ends with it."""
+    deaf = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(600)"
+    starts = (
+        "import subprocess, sys; "
+        f"child = subprocess.Popen([sys.executable, '-c', {deaf!r}]); "
+        f"print(child.pid, flush=True); {deaf}"
+    )
+    ours = (
+        "import sys, time; from replay.foreign.processes.process import Program; "
+        f"program = Program([sys.executable, '-c', {starts!r}]); "
+        "print(program.process.pid, int(program.process.stdout.readline()), flush=True); time.sleep(600)"
+    )
+    with subprocess.Popen([sys.executable, "-c", ours], stdout=subprocess.PIPE) as killed:
+        assert killed.stdout is not None
+        started = [psutil.Process(int(pid)) for pid in killed.stdout.readline().split()]
+        assert [each.is_running() for each in started] == [True, True]
+        killed.kill()
+    gone, left = psutil.wait_procs(started, timeout=20.0)
+    for each in left:
+        each.kill()
+    assert len(gone) == 2
 
 
 def test_no_process_is_taken_out_once_they_were_ended() -> None:

@@ -13,6 +13,8 @@ import pytest
 import fuselog as fl
 from fuselog import BadInput
 from pipeline.command_line.process import main
+from pipeline.exploring.session import open_session
+from pipeline.exploring.verdict import numbers_of
 from tests.docs.test_worked_pages import DOCS, blocks_of
 from tests.replay.foreign.conftest import EXAMPLES, HEADER, Compile
 
@@ -43,7 +45,7 @@ def test_the_page_is_worked_through(drifter: Path) -> None:
 
 
 def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_filter: Compile) -> None:
-    """Then by the likelihood is refused, and by RMSE it gives what it gives with them."""
+    """It is said; what it gives is what RMSE gives with them, and by the likelihood is refused."""
     said = ' \\"innovation\\": {\\"x_m\\": \\"linear\\", \\"y_m\\": \\"linear\\"},'
     text = Path("drifter.c").read_text(encoding="utf-8")
     assert said in text
@@ -51,16 +53,33 @@ def test_without_innovations_it_is_tuned_by_the_truth(drifter: Path, compile_fil
     silent = compile_filter(Path("silent.c").resolve())
     log = fl.record("vehicles", seed=7, vehicles=1, duration_s=4.0)
     given = {"kind": "lib", "in_process": True}
-    tuned = [
-        fl.tune(log, {"mine": given | {"path": str(path)}}, "drift_density", by="rmse").parameters[
-            "value"
-        ]
-        for path in (drifter, silent)
+    loud, mute = ({"mine": given | {"path": str(path)}} for path in (drifter, silent))
+    tuned = [fl.tune(log, loud, "drift_density", by="rmse"), fl.tune(log, mute, "drift_density")]
+    values = [each.parameters["value"].tolist() for each in tuned]
+    assert values[0] == values[1]
+    notes = [[each for each in of.notes if "mine gives no innovations" in each] for of in tuned]
+    assert [len(each) for each in notes] == [0, 1]
+    with pytest.raises(
+        BadInput, match="mine gives no innovations with a likelihood there; tune by another"
+    ):
+        fl.tune(log, mute, "drift_density", by="likelihood")
+    assert 1.0 < values[0][0] < 100.0
+
+
+def test_it_is_explored(drifter: Path) -> None:
+    """Sliders are of its own parameters alone; the command that does the same names the library."""
+    log = fl.record("vehicles", seed=7, vehicles=1, duration_s=4.0)
+    session = open_session(log, f"lib:{drifter}")
+    assert [each.name for each in session.sliders] == ["drift_density"]
+    played = [session.play("drifter", {"drift_density": each}).cases["vehicle1"] for each in (5.0, 50.0)]
+    replayed = [
+        fl.replay(log, f"lib:{drifter}", set={"drift_density": each}).metrics.set_index("quantity")
+        for each in (5.0, 50.0)
     ]
-    assert tuned[0].tolist() == tuned[1].tolist()
-    assert 1.0 < tuned[0].iloc[0] < 100.0
-    with pytest.raises(BadInput, match="innovations"):
-        fl.tune(log, {"mine": given | {"path": str(silent)}}, "drift_density")
+    for case, metrics in zip(played, replayed, strict=True):
+        assert numbers_of(case)["error, RMS"][0] == pytest.approx(metrics["value"]["position_rmse_m"])
+    assert played[0].log_likelihood != played[1].log_likelihood
+    assert f" -e lib:{drifter} --set drift_density=5.0" in session.command({"drift_density": 5.0})
 
 
 def test_a_state_by_other_names_is_told_those_of_the_truth(

@@ -126,6 +126,8 @@ elif how == "fail":
     sys.exit("no such road")
 elif how == "table":
     Path(out).write_text("time_ns,z_m\\n0,1\\n")
+elif how == "gap":
+    Path(out).write_text("time_ns,x_m\\n0,1\\n1,\\n2,nan\\n")
 """
 
 
@@ -170,6 +172,7 @@ def test_a_program_that_writes_mcap(tmp_path: Path) -> None:
     [
         ("fail", "the program ended with exit code 1: no such road"),
         ("nothing", "the program wrote no estimates"),
+        ("gap", r"have no number as x_m in row 2 \(2 in all\); write one, or leave the row out"),
         ("table", "have a column z_m, which /robot1/truth does not have; it has x_m, y_m, heading_rad"),
     ],
 )
