@@ -164,13 +164,13 @@ def recentring(kinds: tuple[str, ...]) -> Function:
                     values[index, t] = change
             else:
                 x, y, z = shift[t], shift[t + 1], shift[t + 2]
-                if max(abs(x), abs(y), abs(z)) > 1e-15:
+                if max(abs(x), abs(y), abs(z)) > 1e-15:  # else they are where they were
                     again = True
-                turned_back = conjugate(from_vector(x, y, z))
-                for index in range(len(values)):
-                    q = from_vector(values[index, t], values[index, t + 1], values[index, t + 2])
-                    turn = to_vector(*product(turned_back, q))
-                    values[index, t], values[index, t + 1], values[index, t + 2] = turn
+                    turned_back = conjugate(from_vector(x, y, z))
+                    for index in range(len(values)):
+                        q = from_vector(values[index, t], values[index, t + 1], values[index, t + 2])
+                        turn = to_vector(*product(turned_back, q))
+                        values[index, t], values[index, t + 1], values[index, t + 2] = turn
         return again
 
     return recentre
@@ -193,9 +193,10 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 def from_vector(x: float, y: float, z: float) -> Quaternion:
     """Make the unit quaternion of a rotation vector."""
-    half = 0.5 * np.sqrt(x * x + y * y + z * z)
-    scale = 0.5 * np.sinc(half / np.pi)
-    return np.cos(half), scale * x, scale * y, scale * z
+    half = 0.5 * np.sqrt(x * x + y * y + z * z + 1e-300)  # not zero, where sine / half is one
+    cosine, sine = np.cos(half), np.sin(half)  # of one number: libm gives both at once
+    scale = 0.5 * sine / half
+    return cosine, scale * x, scale * y, scale * z
 
 
 def to_vector(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:

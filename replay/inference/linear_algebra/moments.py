@@ -10,6 +10,7 @@ from replay.engine.arrays import Floats, Function
 from replay.inference.linear_algebra.tuples import total
 
 Numbers = tuple[float, ...]
+REGISTERS = 32  # of a processor: sums beyond these are kept in memory
 
 
 @lru_cache(maxsize=64)
@@ -39,32 +40,58 @@ def offset_of(size: int) -> Function:
 
 @lru_cache(maxsize=64)
 def moments_of(states: int, values: int) -> Function:
-    """Make `moments(weights, offsets, found, shift, spread, cross)`: weighted covariances, in one loop.
+    """Make `moments(weights, offsets, found, shift, spread, cross)`: weighted covariances.
 
     Of the values `found` (L, v) less `shift` (v,) with themselves, and with the offsets (L, >= t).
     """
-    pairs = tuple((i, j) for i in range(values) for j in range(i + 1))
-    mixed = tuple((row, i) for row in range(states) for i in range(values))
+    parts = tuple(_moments_of_some(states, chosen) for chosen in _in_parts(states, values))
 
     def moments(
         weights: Floats, offsets: Floats, found: Floats, shift: Floats, spread: Floats, cross: Floats
     ) -> None:
-        centre = tuple(shift[i] for i in range(values))
+        for fill in parts:
+            fill(weights, offsets, found, shift, spread, cross)
+
+    return moments
+
+
+def _in_parts(states: int, values: int) -> list[range]:
+    """The values in parts: each has sums for as many registers as there are, or is one value."""
+    parts = [range(0)]
+    for i in range(values):
+        own = range(parts[-1].start, i + 1)
+        fits = sum(states + each + 1 for each in own) <= REGISTERS
+        parts[-1:] = [own] if fits or not parts[-1] else [parts[-1], range(i, i + 1)]
+    return parts
+
+
+def _moments_of_some(states: int, chosen: range) -> Function:
+    """Make `moments` of some values: with themselves and those before, in one loop."""
+    pairs = tuple((i, j) for i in chosen for j in range(i + 1))
+    mixed = tuple((row, i) for row in range(states) for i in chosen)
+    size, first = chosen.stop, chosen.start
+
+    def fill(
+        weights: Floats, offsets: Floats, found: Floats, shift: Floats, spread: Floats, cross: Floats
+    ) -> None:
+        centre = tuple(shift[i] for i in range(size))
         own, joint = (0.0,) * len(pairs), (0.0,) * len(mixed)
         for k in range(len(weights)):
-            y = tuple(found[k, i] - centre[i] for i in range(values))
-            weighed = tuple(weights[k] * each for each in y)
+            y = tuple(found[k, i] - centre[i] for i in range(size))
+            weighed = tuple(weights[k] * y[i] for i in chosen)
             x = tuple(offsets[k, row] for row in range(states))
-            own = tuple(sofar + weighed[i] * y[j] for sofar, (i, j) in zip(own, pairs, strict=True))
+            own = tuple(
+                sofar + weighed[i - first] * y[j] for sofar, (i, j) in zip(own, pairs, strict=True)
+            )
             joint = tuple(
-                sofar + x[row] * weighed[i] for sofar, (row, i) in zip(joint, mixed, strict=True)
+                sofar + x[row] * weighed[i - first] for sofar, (row, i) in zip(joint, mixed, strict=True)
             )
         for entry, (i, j) in zip(own, pairs, strict=True):
             spread[i, j] = spread[j, i] = entry
         for entry, (row, i) in zip(joint, mixed, strict=True):
             cross[row, i] = entry
 
-    return moments
+    return fill
 
 
 @lru_cache(maxsize=64)
