@@ -73,7 +73,7 @@ def test_metrics_get_what_they_judge_and_keys_name_estimator_quantity_and_case()
 
 
 def test_consistency_is_of_state_and_position_where_there_is_a_nees() -> None:
-    """One covariance of four is singular, of the others one too small and one too large for its error."""
+    """One covariance of four is singular, of the others one is too small and one too large."""
     errors = make_errors(
         np.array([[1.0, 1.0, 1.0], [3.0, 3.0, 3.0], [0.01, 0.01, 0.01], [9.0, 9.0, 9.0]]),
         ("x_m", "y_m", "heading_rad"),
