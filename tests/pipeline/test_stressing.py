@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of
+from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of, parameters_changed
 from pipeline.stressing.partings import Parting, partings, undetermined
 from pipeline.stressing.verdicts import NOT_TESTED
 from recorders.log import RunMetadata, Stream
@@ -407,3 +407,29 @@ def test_changes_go_to_both_sides_and_half_as_far_where_halved() -> None:
         rounded = CHANGES["single"].of_run(source, inputs, size, 3).streams["/car/a"]["value"]
         whole = values.astype(np.float32).astype(float) - values
         assert np.allclose(rounded - values, size * whole, rtol=1e-6, atol=1e-16)
+        [start] = CHANGES["start"].of_run(source, inputs, size, 3).streams["/car/prior"]["mean"]
+        assert abs(start) == pytest.approx(size * 0.1)  # sigmas, as the words say
+        given = {"a": 2.0, "of": [4.0, 3, True, 0.0], "gate_probability": 0.9, "low_probability": 0.1}
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            changed: Any = parameters_changed(given, size, rng)
+            shares = [changed["a"] / 2, changed["of"][0] / 4, changed["low_probability"] / 0.1]
+            shares.append((1 - changed["gate_probability"]) / 0.1)
+            assert np.abs(np.array(shares) - 1) == pytest.approx(size * 0.01)
+            assert changed["of"][1:] == [3, True, 0.0]
+
+
+def test_of_a_thousand_messages_ten_are_dropped_and_what_drives_comes_twice() -> None:
+    stamps_ns, values = EPOCH_NS + np.arange(10_000), np.arange(10_000.0)[:, None]
+    drive = recording([0.0], [1.0], dict.fromkeys("ab", (stamps_ns, values)))
+    source = memory_source(drive, RunMetadata("two sensors", epoch_ns=EPOCH_NS))
+    inputs = inputs_of(source, ["/car/a", "/car/b", "/car/prior"], ["/car/b"])
+    dropped = CHANGES["dropped"].of_run(source, inputs, 1.0, 3).streams
+    for topic in ("/car/a", "/car/b"):
+        assert 0.007 < 1 - len(dropped[topic]) / 10_000 < 0.013
+    left = [set(dropped[topic]["value"].ravel().tolist()) for topic in ("/car/a", "/car/b")]
+    assert left[0] != left[1]
+    again = CHANGES["zero duration"].of_run(source, inputs, 1.0, 3).streams
+    np.testing.assert_array_equal(again["/car/b"]["value"], np.repeat(values, 2, axis=0))
+    assert len(again["/car/a"]) == 10_000
+    assert len(dropped["/car/prior"]) == 1
