@@ -3,24 +3,24 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from pipeline.output.alarms import Verdict
 from pipeline.stressing.changes import CHANGES, DROPPED
 from pipeline.stressing.partings import Parting, Undetermined, undetermined
 from recorders.log import Stream
 
-Verdict = Literal["harmless", "sensitive", "discontinuous or chaotic", "not tried"]
 ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
 HARMLESS = 0.1  # A below this
 MARGIN = 0.02  # of the metric, as compare's
 HALVES = (1.9, 2.1)  # how many times less half of a change does, where it is in proportion
+SQUARED = 4.2  # where it goes by the change's square; what shrinks by more has jumped
 ONE_SIGMA = 1.0  # A of a change that has no half: beyond it the copies are two results
 PER_PREDICTION = 1e-4  # the share by which moved stamps change a sigma, from which on half is tried
 SHRINKS = 1.5  # of a sigma: noise per prediction does not shrink with the shift, 1; per second 2
-NOT_TESTED = "not stress-tested: --stress says whether changes that should not matter change a verdict"
 
 
 class Tried(NamedTuple):
@@ -63,7 +63,8 @@ class Stressed:
         epoch_ns: the run's time zero.
         tried: each change, whole; halves: those that were halved.
         sensors: the stamps of each topic that was sensed.
-        estimates: those of the unchanged replay.
+        estimates: those of the unchanged replay, by topic.
+        copies: those of each change, whole.
     """
 
     run: str
@@ -73,6 +74,7 @@ class Stressed:
     halves: Mapping[str, Tried]
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
+    copies: Mapping[str, Mapping[str, Stream]]
 
     def _is_explained(self, name: str) -> bool:
         """Whether a change without a half moves the estimate no farther than it may.
@@ -97,8 +99,8 @@ class Stressed:
         if each.largest < HARMLESS and not each.is_beyond:
             return "harmless"
         if CHANGES[name].is_scaled:
-            is_in_proportion = HALVES[0] <= self.ratio(name) <= HALVES[1]
-            return "sensitive" if is_in_proportion else "discontinuous or chaotic"
+            shrinks = HALVES[0] <= self.ratio(name) <= SQUARED
+            return "sensitive" if shrinks else "discontinuous or chaotic"
         return "sensitive" if self._is_explained(name) else "discontinuous or chaotic"
 
     @property
@@ -171,10 +173,14 @@ class Stressed:
         if self.worst == "harmless":
             return f"{begin}; so does every other change that was tried less"
         if self.worst == "sensitive":
-            how = f"; half the change does {1.0 / self.ratio(name):.2g} of it"
-            return begin + (how if name in self.halves else "")
-        how = f"; half the change does {1.0 / self.ratio(name):.2g} of it: it does not shrink with it"
-        return begin + (how if np.isfinite(self.ratio(name)) else "")
+            if name not in self.halves:
+                return begin
+            more = ": it shrinks faster than the change" if self.ratio(name) > HALVES[1] else ""
+            return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it{more}"
+        if not np.isfinite(self.ratio(name)):
+            return begin
+        how = "it jumps" if self.ratio(name) > SQUARED else "it does not shrink with it"
+        return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it: {how}"
 
     @property
     def sentences(self) -> list[str]:
@@ -216,20 +222,6 @@ class Stress:
         """Return the verdicts in words, the worst first."""
         by_weight = sorted(self.stressed, key=lambda each: -ORDER.index(each.worst))
         return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
-
-    def moved(self, estimator: str, quantity: str, case: str | None) -> float:
-        """The largest change of a metric, as a mean over runs; of all cases where none is named."""
-        own = [each for each in self.stressed if each.estimator == estimator]
-        largest = 0.0
-        for name in CHANGES:
-            found = [
-                by
-                for each in own
-                for key, by in each.tried.get(name, Tried(name)).moved.items()
-                if key[1] == quantity and case in (None, key[0])
-            ]
-            largest = max(largest, abs(float(np.mean(found)))) if found else largest
-        return largest
 
     def __repr__(self) -> str:
         return "\n".join(self.sentences)

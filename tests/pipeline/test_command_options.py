@@ -205,7 +205,7 @@ COMMANDS_ELSEWHERE = {
     "noise": ("test_noise", "test_outputs"),
     "replay": ("test_spans", "test_command_line"),
     "report": ("test_report", "test_outputs"),
-    "run": ("test_experiments", "test_late", "test_report"),
+    "run": ("test_experiments", "test_late", "test_report", "test_stressing"),
     "stress": ("test_stressing",),
     "sweep": ("test_sweeps", "test_campaigns", "test_outputs"),
     "tune": ("test_tuning",),
