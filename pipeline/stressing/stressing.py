@@ -89,7 +89,7 @@ def stress(
     if given:
         settings = with_settings(settings, allowed(given))
     sources = [_in_memory(source) for source in sources_of(logs, alterations)]
-    return Stress(stress_runs(sources, settings, How(seed, gap_limit_s)))
+    return Stress(stress_runs(sources, settings, How(seed, gap_limit_s)), gap_limit_s)
 
 
 def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -> list[Stressed]:
@@ -244,9 +244,8 @@ def _stressed(
             halves[run][PARAMETERS] = _tried(PARAMETERS, done, run, less, row, base[run])
     return [
         Stressed(
-            source.name,
+            source,
             label,
-            source.epoch_ns,
             found[run],
             halves[run],
             {t: np.sort(source.streams[t].publish_time_ns) for t in inputs[run].sensed},

@@ -1,17 +1,22 @@
 """What changes that should not matter did to a result: harmless, sensitive, discontinuous or chaotic."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pipeline.output.alarms import Verdict
+from pipeline.output.outputs import TIMELINE, check_files
 from pipeline.stressing.changes import CHANGES, DROPPED
 from pipeline.stressing.partings import Parting, Undetermined, undetermined
 from recorders.log import Stream
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource
+from replay.judging.judge import Judge
 
 ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
 HARMLESS = 0.1  # A below this
@@ -58,23 +63,26 @@ class Stressed:
     """One estimator over one run, stressed.
 
     Attributes:
-        run: the run's name.
+        source: the run.
         estimator: the label.
-        epoch_ns: the run's time zero.
         tried: each change, whole; halves: those that were halved.
         sensors: the stamps of each topic that was sensed.
         estimates: those of the unchanged replay, by topic.
         copies: those of each change, whole.
     """
 
-    run: str
+    source: MemorySource
     estimator: str
-    epoch_ns: int
     tried: Mapping[str, Tried]
     halves: Mapping[str, Tried]
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
     copies: Mapping[str, Mapping[str, Stream]]
+
+    @property
+    def run(self) -> str:
+        """The run's name."""
+        return self.source.name
 
     def _is_explained(self, name: str) -> bool:
         """Whether a change without a half moves the estimate no farther than it may.
@@ -144,7 +152,7 @@ class Stressed:
                 row["growth"] = each.parting.growth
                 if (at := each.parting.parted) is not None:
                     stamp_ns = int(each.parting.stamps_ns[at])
-                    row["parted_s"] = (stamp_ns - self.epoch_ns) * 1e-9
+                    row["parted_s"] = (stamp_ns - self.source.epoch_ns) * 1e-9
                     row["topic"] = self._message_at(stamp_ns)
             found.append(row)
         return found
@@ -193,7 +201,7 @@ class Stressed:
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined
-            since_s = (least.since_ns - self.epoch_ns) * 1e-9
+            since_s = (least.since_ns - self.source.epoch_ns) * 1e-9
             said.append(
                 f"from {since_s:.1f} s on {least.words} is not determined: its sigma is "
                 f"{least.sigma:.3g}, across it {least.next_sigma:.3g}"
@@ -208,9 +216,13 @@ def _largest(values: Any) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stress:
-    """Estimators over runs, stressed: one of `Stressed` for each."""
+    """Estimators over runs, stressed: one of `Stressed` for each run and estimator.
+
+    `gap_limit_s` is over which gaps the truth was not interpolated.
+    """
 
     stressed: Sequence[Stressed]
+    gap_limit_s: float = 0.2
 
     @property
     def table(self) -> pd.DataFrame:
@@ -222,6 +234,30 @@ class Stress:
         """Return the verdicts in words, the worst first."""
         by_weight = sorted(self.stressed, key=lambda each: -ORDER.index(each.worst))
         return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
+
+    def draw(self, save: str | Path) -> None:
+        """Write the timeline of the first run, an .rrd file: copies fan out from the estimates.
+
+        Raises BadInput where the file cannot be written.
+        """
+        from replay.timeline.fanning import Fan  # which takes long to import
+        from replay.timeline.show import Drawing
+
+        check_files([(Path(save), TIMELINE)], {})
+        source, outputs, fans = self.stressed[0].source, dict[str, Stream](), list[Fan]()
+        for each in (each for each in self.stressed if each.source is source):
+            outputs |= each.estimates
+            for name, copies in each.copies.items():
+                for topic, stream in copies.items():
+                    renamed = topic.replace(f"/{each.estimator}/", f"/{each.estimator}, {name}/", 1)
+                    outputs[renamed] = replace(stream, topic=renamed)
+                if (parting := each.tried[name].parting) is not None:
+                    fans.append(Fan(each.estimator, name, parting.stamps_ns, parting.amplification))
+        judge = Judge([source], {}, gap_limit_s=self.gap_limit_s)
+        judged = judge.add({topic: gather([stream]) for topic, stream in outputs.items()})
+        identity = "; ".join(each.estimator for each in self.stressed)
+        with Drawing(source, identity=identity, save=Path(save), fans=fans) as drawing:
+            drawing.add(outputs, judged.errors)
 
     def __repr__(self) -> str:
         return "\n".join(self.sentences)

@@ -70,7 +70,12 @@ MOVES = [
     ),
     Moves(
         "stress run.mcap -e ekf",
-        {"--json": "--json", "--seed": "--seed 1", "--set": "--set ekf.sigma_range_m=0.3"},
+        {
+            "--json": "--json",
+            "--seed": "--seed 1",
+            "--set": "--set ekf.sigma_range_m=0.3",
+            "--save": "--save fan.rrd",
+        },
     ),
     Moves(
         "deploy run.mcap -e ekf --model robot -o robot_ekf",

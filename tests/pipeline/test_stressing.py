@@ -17,6 +17,7 @@ from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
 from recorders.log import RunMetadata, Stream
 from replay.engine.streams.sources import memory_source
+from tests.replay.timeline.reading import picture_of
 
 VECTOR = fl.schemas.VECTOR_MEASUREMENT
 LINEAR = {"p_m": "linear", "v_mps": "linear"}
@@ -449,6 +450,24 @@ def test_pages_withhold_what_stress_moves_further() -> None:
     assert "is withheld" in said[2].draws[0]
     assert said[1].differences
     assert not said[2].differences
+
+
+def test_copies_fan_out_in_the_timeline(tmp_path: Any) -> None:
+    """Beside the estimate's way each copy's, and below how many sigmas it is away."""
+    found = fl.stress(fl.record("landmarks", duration_s=1.0, landmarks=3), "ekf")
+    found.draw(tmp_path / "fan.rrd")
+    moving = {
+        each.replace("\\", ""): rows for each, rows in picture_of(tmp_path / "fan.rrd").moving.items()
+    }
+    [stressed] = found.stressed
+    for name, each in stressed.tried.items():
+        assert each.parting is not None
+        curve = moving[f"/plots/stress/ekf/{name}"]["Scalars:scalars"]
+        assert np.ravel(curve) == pytest.approx(each.parting.amplification)
+        arrows = moving[f"/map/robot1/ekf, {name}/pose"]["Arrows2D:origins"]
+        [copy] = stressed.copies[name].values()
+        assert np.reshape(arrows, (-1, 2)) == pytest.approx(copy["mean"][:, :2], rel=1e-6)
+    assert len(stressed.tried) == len(CHANGES)
 
 
 def test_changes_go_to_both_sides_and_half_as_far_where_halved() -> None:
