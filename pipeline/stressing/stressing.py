@@ -316,10 +316,12 @@ def _parameters(done: _Replayed, label: str) -> dict[str, Any]:
     """All parameters of an estimator: those that it has, and those that one channel states."""
     stated = {}
     for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
-        number = words.partition(" (")[0]
+        number, _, topics = words.partition(" (")
+        if "(" in topics:  # channels that state different ones
+            continue
         try:
             stated[name] = float(number)
-        except ValueError:  # channels that state different ones
+        except ValueError:
             continue
     return stated | parameters_of(done.bound).get(label, {})
 

@@ -87,12 +87,13 @@ class Stressed:
     def _is_explained(self, name: str) -> bool:
         """Whether a change without a half moves the estimate no farther than it may.
 
-        A lost message moves it by chance, as far as the covariances say; any other less than a sigma.
+        It is less than a sigma, or, as a lost message moves it by chance, what the covariances say.
         """
         parting = self.tried[name].parting
         if name != DROPPED or parting is None:
             return self.tried[name].largest < ONE_SIGMA
-        return bool(np.all(parting.amplification <= parting.explained + HARMLESS))
+        limit = np.maximum(parting.explained + HARMLESS, ONE_SIGMA)
+        return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
         """How many times more the whole change does than half of it, in A; NaN where none was halved."""
@@ -115,6 +116,12 @@ class Stressed:
     def worst(self) -> Verdict:
         """The worst of all verdicts."""
         return max((self.verdict(name) for name in self.tried), key=ORDER.index)
+
+    @property
+    def deciding(self) -> str:
+        """Which change decides the worst verdict: of those that have it what moves most."""
+        own = [name for name in self.tried if self.verdict(name) == self.worst]
+        return max(own, key=lambda name: self.tried[name].largest)
 
     @property
     def is_per_prediction(self) -> bool:
@@ -169,10 +176,9 @@ class Stressed:
     @property
     def sentence(self) -> str:
         """The verdict, with the numbers of the change that decides it."""
-        own = [name for name in self.tried if self.verdict(name) == self.worst]
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
-        name = max(own, key=lambda each: self.tried[each].largest)
+        name = self.deciding
         each, parting = self.tried[name], self.tried[name].parting
         far = "the metric moves" if parting is None else f"at most {each.largest:.3g} sigma"
         sizes = () if parting is None else ((parting.metres, "m"), (parting.degrees, "deg"))
