@@ -29,6 +29,7 @@ from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.runs.ensemble import Progress, judge_logs, no_progress
 from pipeline.runs.estimates import hash_files
 from pipeline.stressing.stressing import stress as stress_logs
+from pipeline.stressing.sums import verdicts_of
 from pipeline.stressing.verdicts import Stress
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
@@ -149,6 +150,8 @@ class Differences:
             key = f"{each.second}.{each.quantity}_difference"
             outcome.metrics[f"{key}.{each.case}" if each.case else key] = each.found.difference
         outcome.input_sha256 = hash_files([path for path in inputs if path.is_file()])
+        if self.stress is not None:
+            outcome.stress = [*verdicts_of(self.stress.stressed).values()]
         settings = {
             "title": "; ".join(" against ".join(reversed(each)) for each in names),
             "sides": names,
@@ -267,7 +270,7 @@ def compare(
             )
         sources = [LogSource(open_log(path, recover=recover)) for path in paths]
         found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
-        paired = under_stress(paired, found)
+        paired = under_stress(paired, verdicts_of(found.stressed))
     notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
     return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
 

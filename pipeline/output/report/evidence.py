@@ -14,6 +14,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
+from pipeline.output.alarms import Stressing
 from pipeline.output.results import MetricTable, Result, metric_tables
 from pipeline.output.words import is_error
 from replay.judging.errors.differences import (
@@ -35,6 +36,7 @@ FAR = 1.25  # times larger than claimed: errors of that are no matter of a few p
 MANY_RUNS = 500
 MARGIN = 0.02  # as `fuselog compare` has it
 
+Relation = Literal["draw", "unclear", "withheld", "beyond chance", "untold"]
 State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
 
 
@@ -132,6 +134,7 @@ class Findings:
         rows: a row per estimator, case and run, with quantities; may be empty.
         runs: how many runs there were.
         labels: the estimators in their order, bounds left out.
+        stress: what changes do that should not matter, by estimator; nothing where nobody asked.
     """
 
     tables: list[MetricTable]
@@ -139,6 +142,7 @@ class Findings:
     runs: int
     labels: list[str]
     bounds: list[str] = field(default_factory=list)
+    stress: Mapping[str, Stressing] = field(default_factory=dict)
 
     @cached_property
     def main(self) -> str:
@@ -168,6 +172,11 @@ class Findings:
             return None
         values = both.to_numpy(dtype=float)
         return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
+
+    def stressed(self, *labels: str) -> float:
+        """How far changes that should not matter move the main error, of any of these at most."""
+        own = [self.stress[label].moved.get(self.main, 0.0) for label in labels if label in self.stress]
+        return max(own, default=0.0)
 
     def values(self, label: str, key: str) -> list[float]:
         """An estimator's metric in every case that has it."""
@@ -242,6 +251,29 @@ class Findings:
         return float(min(sizes, key=lambda size: abs(chi_square_interval(size, runs)[1] - honest[1])))
 
 
+def relation(found: Findings, first: str, second: str) -> Relation:
+    """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
+    difference = found.difference(first, second, found.main, "low")
+    if difference is not None and math.isfinite(difference.low):
+        if difference.verdict == "no difference":
+            return "draw"
+        if difference.verdict == "unclear":
+            return "unclear"
+        return (
+            "withheld" if is_withheld(found, first, second, difference.difference) else "beyond chance"
+        )
+    errors = [found.of[label].error for label in (first, second)]
+    one, other = (each.value if each else math.nan for each in errors)
+    if abs(other - one) <= MARGIN * abs(one):
+        return "draw"
+    return "withheld" if is_withheld(found, first, second, other - one) else "untold"
+
+
+def is_withheld(found: Findings, first: str, second: str, difference: float) -> bool:
+    """Whether changes that should not matter move one of two estimators farther than they differ."""
+    return abs(difference) < found.stressed(first, second)
+
+
 def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
     """Where the mean of runs lies with 95 %, by Student's distribution; NaN of few runs."""
     runs = len(values)
@@ -278,7 +310,9 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
     labels = cases[0].estimators if cases else []
     found = Findings(cases, rows, runs_of(result, tables), labels)
     bounds = [label for label in labels if found.values(label, "over_ensemble")]
-    return Findings(cases, rows, found.runs, [each for each in labels if each not in bounds], bounds)
+    stress = {each.estimator: each for each in result.stress}
+    own = [each for each in labels if each not in bounds]
+    return Findings(cases, rows, found.runs, own, bounds, stress)
 
 
 def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:

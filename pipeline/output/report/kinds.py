@@ -191,7 +191,8 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
             of.setdefault(str(row[side]), Measured(float(row[f"{side}_mean"]), bounds))
     tables_of = [MetricTable(case, labels, of) for case, of in quantities.items()]
     rows = tables.get("runs", pd.DataFrame())
-    return Findings(tables_of, rows, runs_of(result, tables), labels)
+    stress = {each.estimator: each for each in result.stress}
+    return Findings(tables_of, rows, runs_of(result, tables), labels, stress=stress)
 
 
 def _difference_sentence(row: Mapping[Any, Any]) -> str:

@@ -8,8 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from pipeline.output.alarms import Cause
-from pipeline.output.report.evidence import MARGIN, Evidence, Findings, Spread, Timings
+from pipeline.output.alarms import Cause, Stressing
+from pipeline.output.report.evidence import (
+    MARGIN,
+    Evidence,
+    Findings,
+    Spread,
+    Timings,
+    is_withheld,
+    relation,
+)
 from pipeline.output.report.gauge import Gauge, gauge, numbers_of
 from pipeline.output.words import MISSING, Scale, count, interval, listed, number, quantity, scale
 from replay.judging.diagnostics import LEAST_SHARE
@@ -20,7 +28,6 @@ CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
 
 Look = Literal["broken", "careful", "best", "fair"]
-Relation = Literal["draw", "unclear", "beyond chance", "untold"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +45,7 @@ class Card:
     gauge: Gauge | None = None
     numbers: str = ""
     cause: Cause | None = None
+    stress: Stressing | None = None
     notes: list[str] = field(default_factory=list)
     foot: list[str] = field(default_factory=list)
 
@@ -102,19 +110,9 @@ def _choice(found: Findings) -> tuple[str, list[str]]:
         return "", []
     best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
     others = [each.estimator for each in sound if each.estimator != best]
-    return best, [label for label in others if relation(found, best, label) in ("draw", "unclear")]
-
-
-def relation(found: Findings, first: str, second: str) -> Relation:
-    """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
-    difference = found.difference(first, second, found.main, "low")
-    if difference is not None and math.isfinite(difference.low):
-        if difference.verdict == "no difference":
-            return "draw"
-        return "unclear" if difference.verdict == "unclear" else "beyond chance"
-    errors = [found.of[label].error for label in (first, second)]
-    one, other = (each.value if each else math.nan for each in errors)
-    return "draw" if abs(other - one) <= MARGIN * abs(one) else "untold"
+    return best, [
+        label for label in others if relation(found, best, label) in ("draw", "unclear", "withheld")
+    ]
 
 
 def _in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
@@ -189,6 +187,11 @@ def _advice(
         either = "either" if len(equal) == 1 else "any of them"
         if all(relation(found, take, each) == "draw" for each in equal):
             return f"{both} tie in {main}: take {either}{_cheapest([take, *equal], timings)}."
+        if any(relation(found, take, each) == "withheld" for each in equal):
+            return (
+                f"No verdict between {both}: changes that should not matter move the {main} "
+                "farther than they differ."
+            )
         return f"A tie so far: {runs} do not tell {both} apart; take {either}."
     if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
@@ -275,7 +278,8 @@ def _card(
 ) -> Card:
     look, mark, chip = _chip(found, each, take, equal)
     claim = _claim(each, found.runs)
-    card = Card(each.estimator, look, mark, chip, cause=cause, notes=_notes(found, each, take, equal))
+    notes, stress = _notes(found, each, take, equal), found.stress.get(each.estimator)
+    card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
         about = quantity(found.main).name
         if each.error.is_told:
@@ -378,6 +382,13 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
         elif difference.verdict == "unclear":
             runs = count(difference.runs, "run")
             draws.append(f"In {main}, {runs} do not tell {take} and {label} apart: {ends}.")
+        elif is_withheld(found, take, label, size):
+            moved = near.with_unit(found.stressed(take, label))
+            draws.append(
+                f"In {main}, the verdict on {take} and {label} is withheld: they differ by "
+                f"{near.with_unit(size)} on average, and changes that should not matter move one by "
+                f"{moved}."
+            )
         else:
             more = "more" if difference.difference > 0 else "less"
             errs = f"{near.with_unit(size)} {more} than {take}"
