@@ -29,11 +29,7 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
     settings = result.settings.get("estimators") or {}
     causes = []
     for label, evidence in found.of.items():
-        if (
-            not logs
-            or label not in settings
-            or evidence.state(found.runs) not in ("too sure", "too careful")
-        ):
+        if not logs or label not in settings or evidence.state not in ("too sure", "too careful"):
             continue
         own = {"kind": label, **settings[label]}
         gap_limit_s = float(result.settings.get("gap_limit_s", 0.2))

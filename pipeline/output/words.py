@@ -136,7 +136,8 @@ def label_of(key: str) -> str:
 
 def is_error(key: str) -> bool:
     """Whether less of a quantity is better, so that estimators may be compared by it."""
-    return any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
+    is_less_better = any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
+    return is_less_better and not key.startswith("standard_error")  # which says how sure a number is
 
 
 class Scale(NamedTuple):

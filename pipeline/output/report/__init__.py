@@ -21,7 +21,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
-from pipeline.output.alarms import Alarm, Cause
+from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
 from pipeline.output.report.colours import text_colours
 from pipeline.output.report.evidence import Timings
@@ -30,10 +30,10 @@ from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
 from pipeline.output.report.naming import distinct_names, title_of
 from pipeline.output.report.scene import lens, nis_chart, plan
-from pipeline.output.report.sheet import Sheet, sheets
+from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
-from pipeline.output.words import listed
+from pipeline.output.words import TRACKING, quantity
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
@@ -43,6 +43,7 @@ from recorders.parsing import parse_json
 USUAL = ("dead-reckoning", "ekf", "ukf")
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
+MOST_DOUBTS = 3  # on the first screen; more are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
@@ -74,6 +75,7 @@ class Section:
     text: Markup
     looks: list[Shown]
     over_time: list[Shown]
+    legend: str
     sheet: Sheet | None
     sheets: list[Sheet]
     tables: dict[str, pd.DataFrame]
@@ -116,9 +118,9 @@ def write_report(
         "hashes": _hashes,
         "named": _named,
         "hues": _hues,
-        "doubts": _doubts,
     }
     text = environment.get_template("page.html").render(
+        MOST_DOUBTS=MOST_DOUBTS,
         text_colours=text_colours(),
         sections=sections,
         style=_asset("page.css"),
@@ -161,22 +163,13 @@ def _hues(labels: Sequence[str]) -> dict[str, str]:
     return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
 
 
-def _doubts(alarms: Sequence[Alarm]) -> str:
-    """What is doubtful of whom, in a few words."""
-    of: dict[str, list[str]] = {}
-    for each in alarms:
-        of.setdefault(each.kind, []).append(each.estimator)
-    whose = {kind: listed(list(dict.fromkeys(filter(None, each)))) for kind, each in of.items()}
-    return "; ".join(f"{kind} of {each}" if each else kind for kind, each in whose.items())
-
-
 def _named(text: str, labels: Sequence[str]) -> Markup:
     """A sentence in which estimators have their colours."""
     hues = _hues(labels)
     if not hues:
         return escape(text)
     longest = sorted(map(re.escape, hues), key=len, reverse=True)
-    parts = re.split(rf"(?<![\w:.-])({'|'.join(longest)})(?![\w:-]|\.\w)", text)
+    parts = re.split(rf"(?<![\w:.-])({'|'.join(longest)})(?![\w-]|[:.]\w)", text)
     return Markup("").join(
         Markup('<b class="{}">{}</b>').format(hues[part], part) if place % 2 else escape(part)
         for place, part in enumerate(parts)
@@ -211,6 +204,8 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         for key, table in tables.items()
         if len(table) <= LONGEST_TABLE and key not in ("summary", "runs")
     }
+    if begun.found.pairs:
+        short["differences of pairs, 95 % over the runs"] = table_of_pairs(begun.found)
     keys = {split_metric(key)[1] for key in result.metrics} | {
         row.key for rows in (sheet.groups.values() if sheet else ()) for row in rows
     }
@@ -223,12 +218,19 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         Markup(_MARKDOWN.render(str(result.settings.get("text") or ""))),  # which lets no HTML through
         looks,
         [*over_time, *([_chart("nis", nis)] if nis else [])],
+        _legend(begun),
         sheet,
         each_case,
         short,
         figures,
         glossary(keys, draws=bool(begun.story.draws)),
     )
+
+
+def _legend(begun: Opening) -> str:
+    """What estimators are compared by, where that is no plain error."""
+    by = quantity(begun.found.main) if begun.found.compared else None
+    return f"{by.name}: {by.meaning} Less is better." if by and by.group == TRACKING else ""
 
 
 def _timings(folder: Path, result: Result) -> Timings:
