@@ -299,6 +299,86 @@ def test_failures_are_counted_over_all_cases() -> None:
     assert "a, which failed in 6 of 10 runs" in told.doubts
 
 
+SIGMAS = (0.05, 0.1, 0.2, 0.4)
+
+
+def _swept(
+    of_ekf: Sequence[float], nees: Sequence[float] = (3.0,) * 4, key: str = "ekf.sigma_range_m"
+) -> tuple[Result, dict[str, pd.DataFrame]]:
+    """A sweep of the EKF, whose errors at each point are given; the UKF errs 1 m at all of them."""
+    points = [{key: sigma} for sigma in SIGMAS]
+    errors = {"ekf": of_ekf, "ukf": (1.0,) * 4}
+    table, rows = [], []
+    for point, each in enumerate(points):
+        for label, of in errors.items():
+            about = {"point": point, **each, "estimator": label, "case": "robot1"}
+            runs = of[point] * (1.0 + 0.3 * NOISE[0])
+            if label == "ekf":
+                runs = runs + 1e-3 * NOISE[1 + point % 2]
+            rms = float(np.sqrt(np.mean(runs**2)))
+            table.append({**about, "quantity": "position_rmse_m", "value": rms})
+            own = nees[point] if label == "ekf" else 3.0
+            ends = {"aim": 3.0, "bound_low": 2.0, "bound_high": 4.2}
+            table.append({**about, "quantity": "nees", "value": own, **ends})
+            rows += [{**about, "run": run, "position_rmse_m": value} for run, value in enumerate(runs)]
+    settings = {
+        "estimators": {"ekf": {"sigma_range_m": 0.05}, "ukf": {}},
+        "runs": 20,
+        "record": {"scenario": "landmarks"},
+        "sweep": points,
+        "meanings": {key: "standard deviation of a range"} if key.startswith("ekf") else {},
+    }
+    result = Result(
+        experiment="x", fuselog="1", settings=settings, input_sha256="", metrics={}, claims=[]
+    )
+    return result, {"sweep": pd.DataFrame(table), "sweep-runs": pd.DataFrame(rows)}
+
+
+def test_a_sweep_says_whom_to_take_at_which_point_with_an_interval_over_runs() -> None:
+    """The point in words; where else it is as good; who was not swept has a card too."""
+    begun = opening(*_swept([0.9, 0.5, 0.5, 0.8]))
+    assert begun.tried.startswith(
+        "Standard deviation of a range (ekf.sigma_range_m) from 0.05 to 0.4 m: 4 points, 20 runs"
+    )
+    first, where, still = begun.story.verdict
+    assert re.fullmatch(r"Take ekf: it has the least position error, [\d.]+ cm\.", first)
+    assert re.fullmatch(r"ekf errs least with standard deviation of a range = 0\.[12] m\.", where)
+    assert still == "ukf does not depend on it."
+    ekf, ukf = begun.story.cards
+    assert (ekf.chip, ukf.chip) == ("Take this one", "Honest, less accurate")
+    found = re.fullmatch(r"position error, RMS; 95 % ([\d.]+) to ([\d.]+)", ekf.about)
+    assert found
+    low, high = map(float, found.groups())
+    assert low < float(ekf.value) < high < low + 4.0
+    assert re.fullmatch(r"As good, but for chance or 2 %: 0\.[12] m\.", ekf.notes[1])
+    [doubt] = begun.story.doubts
+    assert re.fullmatch(r"which point is best for ekf, as 0\.[12] m may be as good", doubt)
+
+
+def test_a_sweep_takes_no_point_at_which_the_estimator_is_overconfident() -> None:
+    """It errs least at the first point, and states a third of that error; the best left is the last."""
+    begun = opening(*_swept([0.3, 0.9, 0.8, 0.5], nees=(27.0, 3.0, 3.0, 3.0)))
+    assert begun.story.verdict[1] == "ekf errs least with standard deviation of a range = 0.4 m."
+    assert begun.story.doubts == [
+        "ekf at 0.05 m, where it is overconfident",
+        "whether ekf errs less beyond 0.4 m, where the range ends",
+    ]
+
+
+def test_where_the_scenario_is_swept_no_point_is_advised() -> None:
+    """Nobody chooses how many robots there are: the points are cases."""
+    begun = opening(*_swept([0.5, 0.5, 0.5, 1.9], key="robots"))
+    assert begun.story.verdict == [
+        "Take ukf: it has the least position error, 0.997 m (RMS of 4 cases)."
+    ]
+    assert begun.story.cards[0].estimator == "ukf"
+    assert begun.story.cards[0].notes[0] == "Least in 1 of 4 cases."
+    assert begun.story.doubts == [
+        "that ukf is best everywhere, as in 3 of 4 cases another one has the least position error "
+        "(ekf in 3)"
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "names"),
     [

@@ -31,6 +31,7 @@ from pipeline.output.report.kinds import Opening, opening
 from pipeline.output.report.naming import distinct_names, title_of
 from pipeline.output.report.scene import lens, nis_chart, plan
 from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
+from pipeline.output.report.sweeps import RUNS_TABLE
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
 from pipeline.output.words import TRACKING, quantity
@@ -202,7 +203,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     short = {
         key: table
         for key, table in tables.items()
-        if len(table) <= LONGEST_TABLE and key not in ("summary", "runs")
+        if len(table) <= LONGEST_TABLE and key not in ("summary", "runs", RUNS_TABLE)
     }
     if begun.found.pairs:
         short["differences of pairs, 95 % over the runs"] = table_of_pairs(begun.found)

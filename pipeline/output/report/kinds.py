@@ -16,7 +16,7 @@ from pipeline.output.charts import Axis, Chart, Panel, Series, curve
 from pipeline.output.claims import NO_VERDICT
 from pipeline.output.report.evidence import MARGIN, Findings, Timings, findings, runs_of
 from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
-from pipeline.output.report.sweeps import story_of_sweep
+from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
 from pipeline.output.words import count, is_error, listed, number, quantity, scale
 from replay.judging.errors.evaluation import chi_square_interval
@@ -26,7 +26,7 @@ Tables = Mapping[str, pd.DataFrame]
 MOST_NAMED = 6
 MOST_CLAIMS = 2
 # The tables that sentences are made of.
-TOLD_BY = ("runs", "times", "differences", "sweep", "parameters")
+TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class Opening:
         found: what is known of the estimators.
         also: further sentences, in a list below the cards.
         chart: a picture of this kind of result alone.
+        numbers_of: what the table of numbers is of, where that is not all that was run.
     """
 
     tried: str
@@ -46,6 +47,7 @@ class Opening:
     found: Findings
     also: list[str] = field(default_factory=list)
     chart: Chart | None = None
+    numbers_of: str = ""
 
 
 def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
@@ -53,9 +55,7 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     if "sides" in result.settings:
         return _of_comparison(result, tables)
     if "sweep" in result.settings:
-        tried, told = story_of_sweep(result, tables)
-        labels = [str(each) for each in tables["sweep"]["estimator"].unique()]
-        return Opening(tried, told, Findings([], pd.DataFrame(), runs_of(result, tables), labels))
+        return Opening(*story_of_sweep(result, tables), numbers_of="Each estimator where it errs least.")
     found = findings(result, tables)
     told = story(found, result.causes, timings, result.alarms)
     notes = [str(each) for each in result.settings.get("notes", [])]
