@@ -140,6 +140,15 @@ def is_error(key: str) -> bool:
     return is_less_better and not key.startswith("standard_error")  # which says how sure a number is
 
 
+def meaning_alone(text: str) -> str:
+    """A sentence that begins with a parameter's name, with what that means in its place.
+
+    >>> meaning_alone("sigma_range_m (standard deviation of a range) is too small")
+    'the standard deviation of a range is too small'
+    """
+    return re.sub(r"^[\w.]+ \(([^()]+)\)", r"the \1", text)
+
+
 class Scale(NamedTuple):
     """Gives numbers a unit that suits their size: what they are multiplied by, and the unit's sign."""
 

@@ -237,6 +237,11 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     write_report([compare, sweep], tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert page.texts["h1"] == ["2 results"]
+    titles = [chart["title"] for chart in page.charts]
+    forest, scene, lens = titles[:3]  # several logs, and estimates that the folder does not keep
+    assert forest.startswith("Every difference with its interval")
+    assert scene.startswith("robot1, first run from above")
+    assert lens.startswith("Lens: 1 s of the first run")
     axes = {panel["x"]["label"] for chart in page.charts for panel in chart["panels"]}
     assert "standard deviation of a range (m)" in axes
     assert not re.search(r"\de[-+]\d", " ".join(page.texts["h3"]))

@@ -299,6 +299,31 @@ def test_failures_are_counted_over_all_cases() -> None:
     assert "a, which failed in 6 of 10 runs" in told.doubts
 
 
+def test_headings_say_what_a_parameter_means() -> None:
+    """Of a diagnosis and of a tuning; the name stays where it is needed to set it."""
+    words = "sigma_range_m (standard deviation of a range) is 4 times too small, so that R is too small"
+    notes = [f"1. {words}; try --set sigma_range_m=0.1"]
+    diagnosed = Result(
+        experiment="diagnose",
+        fuselog="1",
+        settings={"notes": notes},
+        input_sha256="",
+        metrics={},
+        claims=[],
+    )
+    first, second = opening(diagnosed, {}).story.verdict
+    assert first.startswith("The standard deviation of a range is 4 times too small")
+    assert second == "Try --set sigma_range_m=0.1."
+    settings = {"meanings": {"sigma_range_m": "standard deviation of a range"}}
+    tuned = diagnosed.model_copy(update={"experiment": "tune", "settings": settings})
+    row = {"parameter": "sigma_range_m", "start": 1.0, "value": 0.1, "low": 0.09, "high": 0.11}
+    [sentence] = opening(tuned, {"parameters": pd.DataFrame([row])}).story.verdict
+    assert sentence == (
+        "The standard deviation of a range (sigma_range_m) is likeliest 0.100 (95 % 0.0900 to 0.110), "
+        "where the search began at 1."
+    )
+
+
 SIGMAS = (0.05, 0.1, 0.2, 0.4)
 
 

@@ -44,6 +44,7 @@ from recorders.parsing import parse_json
 USUAL = ("dead-reckoning", "ekf", "ukf")
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
+SCENES = ("scene", "lens")  # figures that a comparison keeps, which has no logs to draw
 MOST_DOUBTS = 3  # on the first screen; more are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
@@ -194,6 +195,8 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     looks = [_chart("", begun.chart)] if begun.chart else []
     order = [card.estimator for card in begun.story.cards] or labels
     looks += _first_run(folder, order, viewer=viewer)
+    looks += [each for name in SCENES for each in figures if each.name == name]
+    figures = [each for each in figures if each.name not in SCENES]
     if "sweep" in result.settings or not looks:
         looks, figures = [*looks, *figures[:2]], figures[2:]
     over_time = [each for each in figures if each.name.startswith("errors")][:1]
@@ -272,7 +275,7 @@ def _chart(name: str, chart: Chart) -> Shown:
     axes = [f"{panel.y.label} over {panel.x.label}" for panel in chart.panels]
     titles = filter(None, (panel.title for panel in chart.panels))
     what = f"Chart: {'; '.join(dict.fromkeys([*axes, *titles]))}; {', '.join(chart.colours())}"
-    return Shown(name, chart.title or name, what, chart)
+    return Shown(name, chart.title or re.sub("[-_]", " ", name), what, chart)
 
 
 def _first_run(folder: Path, order: Sequence[str], *, viewer: bool) -> list[Shown]:

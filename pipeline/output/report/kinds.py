@@ -18,7 +18,7 @@ from pipeline.output.report.evidence import MARGIN, Findings, Timings, findings,
 from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
 from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
-from pipeline.output.words import count, is_error, listed, number, quantity, scale
+from pipeline.output.words import count, is_error, listed, meaning_alone, number, quantity, scale
 from replay.judging.errors.evaluation import chi_square_interval
 
 Tables = Mapping[str, pd.DataFrame]
@@ -63,7 +63,8 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     if result.experiment == "diagnose":
         return Opening(tried, _of_diagnosis(told, notes), found, notes[1:])
     if result.experiment == "tune":
-        return Opening(tried, _of_tuning(told, tables), found, notes)
+        meanings = result.settings.get("meanings", {})
+        return Opening(tried, _of_tuning(told, tables, meanings), found, notes)
     if result.claims:
         told = _with_claims(told if found.compared else Story([], doubts=told.doubts), result)
     return Opening(tried, told, found, notes)
@@ -142,13 +143,13 @@ def claims_sentences(result: Result) -> list[str]:
 def _of_diagnosis(told: Story, notes: Sequence[str]) -> Story:
     """What is wrong comes first; that an estimator is inconsistent is on its card."""
     first = notes[0].removeprefix("1. ") if notes else ""
-    what, _, advice = first.partition("; try ")
+    what, _, advice = meaning_alone(first).partition("; try ")
     is_name = "_" in what.split(" ")[0]
     verdict = [f"{what if is_name else what[:1].upper() + what[1:]}."] if what else []
     return replace(told, verdict=[*verdict, *([f"Try {advice}."] if advice else [])] or told.verdict)
 
 
-def _of_tuning(told: Story, tables: Tables) -> Story:
+def _of_tuning(told: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
     """The values that were found, then whether they change what the estimator is worth."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
@@ -158,7 +159,9 @@ def _of_tuning(told: Story, tables: Tables) -> Story:
         begun = (
             "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
         )
-        sentences.append(f"{row['parameter']} is likeliest {number(row['value'])}{told_by}{begun}.")
+        meaning = meanings.get(row["parameter"], "")
+        what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
+        sentences.append(f"{what} is likeliest {number(row['value'])}{told_by}{begun}.")
     return replace(told, verdict=[*sentences, *told.verdict])
 
 
@@ -179,7 +182,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
         summary = f"{runs} give no interval: whether the differences are chance is open."
     elif differ.empty:
         summary = f"Over {runs} none of {len(rows)} metrics differs by more than chance and {margin}"
-        summary += f"; in {len(unclear)} ({', '.join(unclear)}) they do not decide." if unclear else "."
+        summary += f"; in {len(unclear)} they do not decide." if unclear else "."
     else:
         summary = (
             f"Over {runs} {len(differ)} of {len(rows)} metrics differ by more than chance and {margin}."
@@ -188,8 +191,9 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
-    verdict = [*told.verdict[:2], summary]
-    return Opening(tried, replace(told, verdict=verdict), found, [*also, *notes], chart)
+    doubts = [f"{listed(unclear)}, in which {runs} do not decide"] if unclear else []
+    told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
+    return Opening(tried, told, found, [*also, *notes], chart)
 
 
 def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:
