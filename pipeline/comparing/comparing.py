@@ -22,6 +22,7 @@ from pipeline.comparing.groups import (
     unlike_runs,
 )
 from pipeline.comparing.paired import ALL, Paired, under_stress
+from pipeline.comparing.scenes import scene_of, side_by_side
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -32,9 +33,9 @@ from pipeline.stressing.stressing import stress as stress_logs
 from pipeline.stressing.sums import verdicts_of
 from pipeline.stressing.verdicts import Stress
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, open_log
+from recorders.log import open_log
 from replay.engine.replaying.usage import Row
-from replay.engine.streams.sources import LogSource, MemorySource
+from replay.engine.streams.sources import LogSource
 from replay.judging.errors.differences import (
     NATS,
     Difference,
@@ -119,13 +120,7 @@ class Differences:
         if not self.drawable:
             raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
-        source = candidates[0].pairs[first][0]
-        of_candidates = (candidate.estimates(first) for candidate in candidates)
-        streams = {
-            topic: stream for own in of_candidates for topic, stream in own.read([*own.topics]).items()
-        }
-        run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-        estimates = MemorySource(streams, run, source.name)
+        source, estimates = side_by_side(candidates, first)
         names = [candidate.name for candidate in candidates]
         identity = json.dumps([source.name, names])
         with Drawing(source.whole(), identity=identity, save=save, sides=names) as drawing:
@@ -142,6 +137,8 @@ class Differences:
         names = [[candidate.name for candidate in candidates] for candidates in self.groups]
         tables = {"differences": self.table, "runs": table_of_runs(self.groups)}
         outcome = Outcome(tables=tables, figures=dict(self.charts()))
+        for run in self.drawable[:1]:
+            outcome.figures |= scene_of(self.groups[0], run, self.gap_limit_s)
         if self.coverage:
             outcome.tables["coverage"] = coverage_table(self.coverage)
         if len(self.times):
