@@ -165,6 +165,7 @@ def test_text(made: CFilter) -> str:
             if control
             else "        default:\n            break;\n"
         )
+    gap = "        if (outcome == NAME_NOT_DRIVEN)\n            continue;\n" if made.has_gaps else ""
     return filled(
         made,
         """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
@@ -209,11 +210,12 @@ int main(int argc, char **argv)
     NAME_init(&filter, start_ns, prior_mean, prior_covariance);
     for (int event = 0; event < VECTORS_EVENTS; event++) {
         const REAL *data = event_data[event];
-        int outcome = NAME_WELL;
+        int outcome;
         if (event_time_ns[event] < filter.time_ns)
             continue;
         const unsigned long begin = INSTRUCTIONS();
-        if (PREDICT != NAME_WELL) {
+        outcome = PREDICT;
+GAP        if (outcome != NAME_WELL) {
             printf("event %d: the covariance is no longer positive definite\\n", event);
             return 1;
         }
@@ -245,5 +247,7 @@ CASES        }
         printf("%lu instructions for a message, at most %lu\\n", taken / (unsigned long)messages, most);
     return furthest <= limit ? 0 : 1;
 }
-""".replace("PREDICT", predict).replace("CASES", "".join(cases)),
+""".replace("GAP", gap)
+        .replace("PREDICT", predict)
+        .replace("CASES", "".join(cases)),
     )

@@ -72,6 +72,11 @@ def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
         f"| `{name}_update_{each}` | {sensor.topic} | {', '.join(data_of(sensor))} |"
         for each, sensor in made.sensors
     ]
+    gap = (
+        f" In a gap of\nwhat drives it the prediction returns `{upper}_NOT_DRIVEN`."
+        if made.has_gaps
+        else ""
+    )
     why_not = why_no_replay(made)
     back = (
         f"fuselog cannot replay it: {why_not}."
@@ -101,8 +106,9 @@ C99 and libm: no heap, no recursion, no arrays of varying length. The filter is 
 {chr(10).join(updates)}
 
 An update is at the filter's time, so predict to a message's stamp first. They return `{upper}_WELL`,
-`{upper}_NOTHING_MEASURED`, or `{upper}_NOT_POSITIVE_DEFINITE`: then start again. Angles of the state
-are not wrapped. The numbers that it was tuned with are in `{name}_as_tuned`; copy it to change them.
+`{upper}_NOTHING_MEASURED`, or `{upper}_NOT_POSITIVE_DEFINITE`: then start again.{gap}
+Angles of the state are not wrapped. The numbers that it was tuned with are in `{name}_as_tuned`; copy
+it to change them.
 
 ## Test
 

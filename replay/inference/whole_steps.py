@@ -68,6 +68,7 @@ class WholeSteps(NamedTuple):
         direction: of the state: `a` (t), along which the correction bends; None where it does not.
         correct: of (..., step, slope), it gives the mean, and F where covariances go with it by that.
         is_iterated: whether updates are.
+        gap: in a gap of the control it gives N, added to the covariance; None where it ends there.
     """
 
     predict: Step
@@ -75,6 +76,7 @@ class WholeSteps(NamedTuple):
     direction: Step | None
     correct: Step
     is_iterated: bool = False
+    gap: Step | None = None
 
 
 EXTENDED, ITERATED, SAMPLED = "extended", "iterated", "sampled"
@@ -124,7 +126,11 @@ def whole_steps(filtering: Filter, kind: str) -> WholeSteps:
         direction = _traced(
             "the correction", lambda mean, _: (True, {"a": np.array(along(read_state(mean)))}), gaussian
         )
-    return WholeSteps(predict, tuple(innovations), direction, correct, kind == ITERATED)
+    gap = None
+    if motion.gap_noise is not None:
+        given = (*gaussian, Shape((model.controls,)), None, names)
+        gap = _traced("the prediction in a gap", _gap_noise(model, motion), given)
+    return WholeSteps(predict, tuple(innovations), direction, correct, kind == ITERATED, gap)
 
 
 # --- what is traced: functions that return whether all is well, and arrays by name ------------------
@@ -153,6 +159,19 @@ def _linear_motion(model: Model, motion: Motion, memory: Callable[[], Any]) -> F
         return True, {**found, "N": noise}
 
     return predict
+
+
+def _gap_noise(model: Model, motion: Motion) -> Function:
+    noise_of, read_state, t = motion.gap_noise, tuple_of(model.size), model.tangent
+    assert noise_of is not None
+    add = adding_noise(t)
+
+    def widen(mean: Any, _: Any, __: Any, duration_s: Any, parameters: Any) -> Any:
+        noise = _zeros(t, t)
+        add(noise, noise_of(read_state(mean), duration_s, parameters))
+        return True, {"N": noise}
+
+    return widen
 
 
 def _sampled_motion(stage: Stage, memory: Callable[[], Any]) -> Function:

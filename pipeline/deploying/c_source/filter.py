@@ -19,6 +19,7 @@ from pipeline.deploying.c_source.statements import (
     guards,
     jacobian_loops,
     moved_state,
+    noise_loops,
     turned_axes,
 )
 from pipeline.deploying.c_source.updates import algebra_text, correcting_text, update_text
@@ -41,6 +42,7 @@ def source(made: CFilter) -> str:
         *helpers_of(every, made.precision),
         *_products(made),
         _init(made),
+        *([] if made.steps.gap is None else [_pass_gap(made)]),
         _predict(made),
         *correcting_text(made),
         *algebra_text(made),
@@ -81,6 +83,7 @@ def _init(made: CFilter) -> str:
     )
     if made.is_interpolated:  # what drives it from the prior on is not known before its first message
         driven = "".join(f"    filter->control[{index}] = NAN;\n" for index in range(len(control)))
+        driven += "    filter->is_in_gap = 0;\n" if made.has_gaps else ""
     return filled(
         made,
         """void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance)
@@ -130,9 +133,9 @@ _BETWEEN_CONTROLS = """{
     if (time_ns < filter->time_ns)
         return NAME_WELL;
     if (time_ns > filter->time_ns) {
-        if (!isnan(filter->control[0]))
-            for (int k = 0; k < NAME_CONTROLS; k++)
-                filter->control[k] = 0.5_S * (filter->control[k] + control[k]);
+GAP        for (int k = 0; k < NAME_CONTROLS; k++) /* the first control holds from the start on */
+            filter->control[k] =
+                isnan(filter->control[k]) ? control[k] : 0.5_S * (filter->control[k] + control[k]);
         outcome = predict(filter, time_ns, parameters);
     }
     for (int k = 0; k < NAME_CONTROLS; k++)
@@ -141,6 +144,53 @@ _BETWEEN_CONTROLS = """{
     return outcome;
 }
 """
+_INTO_A_GAP = """\
+        if (isnan(control[0]))
+            filter->is_in_gap = 1;
+        if (LOST)
+            return NAME_NOT_DRIVEN;
+"""
+_OUT_OF_A_GAP = """\
+        if (filter->is_in_gap) {
+            pass_gap(filter, time_ns, parameters);
+            for (int k = 0; k < NAME_CONTROLS; k++)
+                filter->control[k] = control[k];
+            return NAME_WELL;
+        }
+"""
+
+
+def _span(made: CFilter) -> str:
+    """Declare how long a prediction goes."""
+    real, span = made.precision.real, "(double)(time_ns - filter->time_ns) * 1e-9"
+    return f"const {real} duration_s = " + (f"({real})({span});" if real != "double" else f"{span};")
+
+
+def _between_controls(made: CFilter) -> str:
+    """Write the prediction of a filter whose control is interpolated."""
+    gap = ""
+    if made.has_gaps:
+        lost = "isnan(control[0])" if made.steps.gap is not None else "filter->is_in_gap"
+        gap = _INTO_A_GAP.replace("LOST", lost) + (_OUT_OF_A_GAP if made.steps.gap is not None else "")
+    return filled(made, f"{predict_signature(made)}\n{_BETWEEN_CONTROLS.replace('GAP', gap)}")
+
+
+def _pass_gap(made: CFilter) -> str:
+    """Write the prediction over a gap of the control, after which it goes on."""
+    step = made.steps.gap
+    assert step is not None
+    names, declared = Inputs(made, "motion").names(step, "control")
+    loops = noise_loops(step, made.tangent, "P", "states")
+    declared = _declares_covariance(made, declared, loops.calls)
+    declared += [_span(made)] if "duration_s" in names.values() else []
+    declared += [] if "parameters->" in "".join(declared) else ["(void)parameters;"]
+    head = """/* Over a gap of what drives it: the mean stays, the covariance widens. */
+static void pass_gap(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)
+{
+"""
+    lines = [*c_lines(loops.named, names, made.precision), *loops.calls]
+    text = filled(made, head) + body(declared) + body(lines)
+    return text + "    filter->is_in_gap = 0;\n    filter->time_ns = time_ns;\n}\n"
 
 
 def _predict(made: CFilter) -> str:
@@ -154,15 +204,10 @@ def _predict(made: CFilter) -> str:
         declared = [*(filled(made, each) for each in loops.declared), *declared]
         assigned = [*loops.calls, *assigned]
     declared = _declares_covariance(made, declared, assigned)
-    real = made.precision.real
-    span = "(double)(time_ns - filter->time_ns) * 1e-9"
-    if "duration_s" in names.values():
-        declared.append(
-            f"const {real} duration_s = " + (f"({real})({span});" if real != "double" else f"{span};")
-        )
+    declared += [_span(made)] if "duration_s" in names.values() else []
     begin = ["if (time_ns <= filter->time_ns)\n        return NAME_WELL;"]
     if made.is_interpolated:
-        outer = filled(made, f"{predict_signature(made)}\n{_BETWEEN_CONTROLS}")
+        outer = _between_controls(made)
         signature = (
             "static int predict(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"
         )

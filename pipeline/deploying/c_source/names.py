@@ -57,6 +57,12 @@ class CFilter(NamedTuple):
         return control is not None and control.interpolated
 
     @property
+    def has_gaps(self) -> bool:
+        """Tell whether its control may be silent for so long that nothing is known meanwhile."""
+        control = self.filtering.stage.model.control
+        return control is not None and bool(control.gap)
+
+    @property
     def sensors(self) -> list[tuple[str, Sensor]]:
         """List the sensors with their names in C."""
         found: dict[str, Sensor] = {}
@@ -79,17 +85,16 @@ class CFilter(NamedTuple):
     def values(self) -> dict[str, dict[str, float]]:
         """Return the parameters that motion and sensors read, by part, with their values."""
         names = number_fields(self.filtering.stage.model.parameters)
-        parts = [
-            ("motion", self.steps.predict),
-            *zip(dict(self.sensors), self.steps.innovate, strict=True),
-        ]
+        gap = [] if self.steps.gap is None else [self.steps.gap]
+        sensors = ([each] for each in self.steps.innovate)
+        parts = [("motion", [self.steps.predict, *gap]), *zip(dict(self.sensors), sensors, strict=True)]
         return {
             part: {
                 name: float(self.filtering.settings[row, names.index(name)])
                 for name in names
-                if name in _read(step)
+                if any(name in _read(step) for step in steps)
             }
-            for row, (part, step) in enumerate(parts)
+            for row, (part, steps) in enumerate(parts)
         }
 
     def robustness(self, row: int) -> dict[str, float]:
@@ -104,8 +109,9 @@ class CFilter(NamedTuple):
     @property
     def all_steps(self) -> list[Step]:
         """List the steps."""
-        predict, innovate, direction, correct, _ = self.steps
-        return [predict, *innovate, *([] if direction is None else [direction]), correct]
+        predict, innovate, direction, correct, _, gap = self.steps
+        there = [each for each in (direction, gap) if each is not None]
+        return [predict, *innovate, *there, correct]
 
     @property
     def digest(self) -> str:

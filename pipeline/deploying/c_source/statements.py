@@ -83,7 +83,7 @@ def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
 
 
 class Loops(NamedTuple):
-    """Holds what loops over a Jacobian go by: declarations, what the graph gives, and the calls."""
+    """Holds what is done in loops: declarations, what the graph gives for it, and the calls."""
 
     declared: list[str]
     named: dict[str, Node]
@@ -102,10 +102,21 @@ def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: st
         what: `states` or `components`, for the size of that matrix.
     """
     size = "T" if what == "states" else "M"
-    declared = [f"REAL {jacobian}[{size}][T];"]
-    declared.insert(0, columns_text(f"columns_of_{jacobian}", step.columns(jacobian, rows), size))
-    named = entries(step, jacobian)
-    calls = [multiply]
+    columns = columns_text(f"columns_of_{jacobian}", step.columns(jacobian, rows), size)
+    noise = noise_loops(step, rows, into, what)
+    return Loops(
+        [columns, f"REAL {jacobian}[{size}][T];", *noise.declared],
+        entries(step, jacobian) | noise.named,
+        [multiply, *noise.calls],
+    )
+
+
+def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
+    """Write what adds a step's noise, given as G and u and as N, to a matrix; see `jacobian_loops`."""
+    size = "T" if what == "states" else "M"
+    declared: list[str] = []
+    named: dict[str, Node] = {}
+    calls: list[str] = []
     gains = count_gains(step)
     if gains:
         declared.append(f"REAL G[{size}][GAINS] = {{{{0}}}}, u[GAINS];")
