@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.api.planning import Named, settings_of
 from pipeline.api.planning import open as open_source
-from pipeline.api.planning import settings_of
 from pipeline.checking.checking import Runs
 from pipeline.checking.stored import Golden
 from pipeline.deploying.c_replay import replay_text, why_no_replay
@@ -33,7 +33,7 @@ KINDS = {"ekf": EXTENDED, "iekf": ITERATED, "ukf": SAMPLED}
 
 def deploy(
     log: str | Path,
-    estimator: str | Mapping[str, Any],
+    estimator: Named,
     out: str | Path,
     /,
     *,
@@ -48,7 +48,8 @@ def deploy(
     Args:
         log: a log that the filter fits: its sensors are those of the C, its channels state what is not
             given, and its first messages are the test.
-        estimator: `ekf`, `iekf` or `ukf`, or a table of settings by its label.
+        estimator: `ekf`, `iekf` or `ukf`, what `modelled` makes of a model of your own and one of
+            these, or a table of settings by its label.
         out: the folder to write, which must not be there or be empty; its name is the filter's in C.
         single: use single precision, `float`.
         parameters: of the estimator, such as `model="robot"`.
@@ -142,7 +143,8 @@ def _check_empty(folder: Path) -> None:
 def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, Filter, str]:
     """Bind the filter; raises BadInput where it is none that can be written."""
     configure(label, settings)
-    name = str(settings.get("kind", label))
+    kind = settings.get("kind", label)
+    name = kind if isinstance(kind, str) else label
     found = bind(label, [run], settings)
     [first, *others] = found
     filtering = getattr(getattr(first, "run", None), "__self__", None)
