@@ -256,7 +256,7 @@ int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns, const 
 {{
     const Own *own = filter;
     memcpy(mean, own->filter.mean, sizeof own->filter.mean);
-    memcpy(covariance, own->filter.covariance, sizeof own->filter.covariance);
+    COVARIANCE
 {angles}    return FUSELOG_FILTER_WELL;
 }}
 
@@ -270,7 +270,13 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
     return own->outcome;
 }}
 """
-    return filled(made, text).replace("DESCRIPTION", _literal(_description(made)))
+    covariance = (
+        "NAME_covariance(&own->filter, (double (*)[NAME_TANGENT])covariance);"
+        if made.is_root
+        else "memcpy(covariance, own->filter.covariance, sizeof own->filter.covariance);"
+    )
+    text = filled(made, text.replace("COVARIANCE", covariance))
+    return text.replace("DESCRIPTION", _literal(_description(made)))
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:

@@ -80,10 +80,12 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
     rows = np.searchsorted(stamps, time_ns).clip(max=max(len(stamps) - 1, 0))
     is_there = last & (stamps[rows] == time_ns)
     first = begun[0]
+    covariance = first.belief.covariance[0].copy()
+    filtering.form.to_covariance(covariance)
     return Vectors(
         int(first.time_ns[0]),
         first.belief.mean[0],
-        first.belief.covariance[0],
+        covariance,
         time_ns[chosen],
         sources[chosen],
         data[chosen],
@@ -166,6 +168,12 @@ def test_text(made: CFilter) -> str:
             else "        default:\n            break;\n"
         )
     gap = "        if (outcome == NAME_NOT_DRIVEN)\n            continue;\n" if made.has_gaps else ""
+    factor = (
+        "            REAL covariance[NAME_TANGENT][NAME_TANGENT];\n"
+        "            NAME_covariance(&filter, covariance);\n"
+        if made.is_root
+        else ""
+    )
     return filled(
         made,
         """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
@@ -234,9 +242,9 @@ CASES        }
             estimates++;
             for (int i = 0; i < NAME_STATES; i++)
                 compare(event, filter.mean[i], expected_mean[event_estimate[event]][i]);
-            for (int row = 0; row < NAME_TANGENT; row++)
+COVARIANCE            for (int row = 0; row < NAME_TANGENT; row++)
                 for (int column = 0; column < NAME_TANGENT; column++)
-                    compare(event, filter.covariance[row][column],
+                    compare(event, ENTRY[row][column],
                             expected_covariance[event_estimate[event]][row * NAME_TANGENT + column]);
         }
     }
@@ -248,6 +256,8 @@ CASES        }
     return furthest <= limit ? 0 : 1;
 }
 """.replace("GAP", gap)
+        .replace("COVARIANCE", factor)
+        .replace("ENTRY", "covariance" if made.is_root else "filter.covariance")
         .replace("PREDICT", predict)
         .replace("CASES", "".join(cases)),
     )

@@ -23,12 +23,20 @@ from replay.engine.replaying.estimator import Recursive, bind, configure
 from replay.foreign.filters import description_of_library
 from replay.foreign.naming import shorthand
 from replay.foreign.native.library import HEADER
-from replay.inference.kalman.methods import FILTERS
+from replay.inference.kalman.methods import FILTERS, filter_with
 from replay.inference.run.filtering import Filter
 from replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
 from replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
-KINDS = {"ekf": EXTENDED, "iekf": ITERATED, "ukf": SAMPLED}
+# by what makes a method's steps
+KINDS = {
+    FILTERS["ekf"].steps: EXTENDED,
+    FILTERS["iekf"].steps: ITERATED,
+    FILTERS["ukf"].steps: SAMPLED,
+    filter_with("sqrt", "ekf").steps: EXTENDED,
+    filter_with("sqrt", "ukf").steps: SAMPLED,
+}
+DEPLOYABLE = "ekf, iekf, ukf, lrkf:SAMPLING, sqrt:ekf or sqrt:ukf"
 
 
 def deploy(
@@ -48,8 +56,8 @@ def deploy(
     Args:
         log: a log that the filter fits: its sensors are those of the C, its channels state what is not
             given, and its first messages are the test.
-        estimator: `ekf`, `iekf` or `ukf`, what `modelled` makes of a model of your own and one of
-            these, or a table of settings by its label.
+        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`, what `modelled` makes
+            of a model of your own and one of these, or a table of settings by its label.
         out: the folder to write, which must not be there or be empty; its name is the filter's in C.
         single: use single precision, `float`.
         parameters: of the estimator, such as `model="robot"`.
@@ -149,15 +157,11 @@ def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, F
     [first, *others] = found
     filtering = getattr(getattr(first, "run", None), "__self__", None)
     if not isinstance(first, Recursive) or type(filtering) is not Filter:
-        raise BadInput(
-            f"estimator {label}: is no filter that can be written as C; give -e ekf, iekf or ukf"
-        )
-    kind = next((KINDS[each] for each in KINDS if filtering.method is FILTERS[each]), None)
-    if kind is None:
-        raise BadInput(
-            f"estimator {label}: {name} cannot be written as C yet; give -e ekf or iekf, or ukf for a "
-            "state without angles"
-        )
+        raise BadInput(f"estimator {label}: is no filter that can be written as C; give -e {DEPLOYABLE}")
+    kind = KINDS.get(filtering.method.steps)
+    if kind is None or filtering.is_random:
+        why = "draws its samples anew for every step" if kind else "cannot be written as C"
+        raise BadInput(f"estimator {label}: {name} {why}; give -e {DEPLOYABLE}")
     if others:
         several = ", ".join(each.name for each in found)
         raise BadInput(

@@ -4,8 +4,10 @@ from pipeline.deploying.c_replay import why_no_replay
 from pipeline.deploying.c_source.header import data_of
 from pipeline.deploying.c_source.names import CFilter
 from pipeline.deploying.c_target import target_lines
-from pipeline.deploying.certificate import OPTIONS, Certificate, Cost
+from pipeline.deploying.certificate import OPTIONS, Certificate
+from pipeline.deploying.costs import Cost
 from replay.inference.kalman.iterated_update import ITERATIONS
+from replay.inference.kalman.regression import MEANS
 
 
 def cmake_text(made: CFilter) -> str:
@@ -48,13 +50,16 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
         else f"{memory.compiler}, {' '.join(OPTIONS)}: {memory.text} bytes of code and\nconstants, "
         f"and {memory.stack} bytes of stack in the deepest chain of calls, without those of libm's own."
     )
+    of = "F L and H L of the\nfactor L" if made.is_root else "F P F', P H' and\nH P H'"
     saved = (
-        f" Of the products F P F', P H' and\nH P H', {certificate.sparse} flops are left of "
+        f" Of the products {of}, {certificate.sparse} flops are left of "
         f"{certificate.dense}: the others have known zeros and ones."
         if certificate.dense
         else ""
     )
     iterated = f", and all {ITERATIONS} iterates of an update" if made.steps.is_iterated else ""
+    bent = any(each is not None and each.recentre is not None for each in made.steps.sampled)
+    iterated += f",\nand all {MEANS} rounds to a mean of angles or orientations" if bent else ""
     return f"""| function | flops | square roots | other calls of libm |
 |---|---|---|---|
 {table}

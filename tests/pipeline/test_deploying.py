@@ -19,12 +19,10 @@ from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
 from replay.estimators.models.reactor import REACTOR
+from tests.deployed.building import COMPILERS, compiled, furthest
 from tests.pipeline.conftest import run_here
 from tests.replay.estimators.test_attitude import carried
 
-COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
-WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
-STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler here")
 
 
@@ -32,19 +30,6 @@ def recorded(tmp_path: Path, scenario: str, **parameters: Any) -> Path:
     log = tmp_path / f"{scenario}.mcap"
     fl.write(log, fl.record(scenario, seed=7, **parameters))
     return log
-
-
-def compiled(folder: Path, *options: str, compiler: str = "") -> Path:
-    """Build the test program, or with `-shared` the library."""
-    name = folder.name
-    is_library = "-shared" in options
-    out = folder.parent / (f"{name}.so" if is_library else f"test_{name}")
-    first = f"{name}_replay.c" if is_library else f"test_{name}.c"
-    files = [str(folder / each) for each in (first, f"{name}.c")]
-    subprocess.run(
-        [compiler or COMPILERS[0], *STRICT, *options, *files, "-lm", "-o", str(out)], check=True
-    )
-    return out
 
 
 @cache
@@ -57,19 +42,14 @@ def sanitizes(compiler: str) -> bool:
         return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
-def furthest(program: Path) -> float:
-    """How far the program finds its estimates from fuselog's."""
-    said = subprocess.run([program, "1e300"], capture_output=True, text=True, check=True)
-    assert not said.stderr
-    return float(said.stdout.partition("furthest ")[2].partition(",")[0])
-
-
 @needs_compiler
 @pytest.mark.parametrize(
     ("scenario", "label", "options"),
     [
         ("landmarks", "ekf", {"model": "robot"}),
         ("landmarks", "iekf", {"model": "robot"}),
+        ("landmarks", "ukf", {"model": "robot"}),
+        ("landmarks", "sqrt:ukf", {"model": "robot"}),
         ("batch-reactor", "ekf", {}),
         ("batch-reactor", "ukf", {}),
     ],
@@ -101,16 +81,20 @@ def test_estimates_are_equal_to_the_last_bit(
 
 
 @needs_compiler
-def test_a_gap_of_the_control_widens_the_estimate(tmp_path: Path) -> None:
+@pytest.mark.parametrize("label", ["ekf", pytest.param("sqrt:ukf", marks=pytest.mark.paper)])
+def test_a_gap_of_the_control_widens_the_estimate(tmp_path: Path, label: str) -> None:
+    """Of an orientation, whose mean is found in rounds where it is sampled."""
     samples, _ = carried()
     stamps_s = (samples.publish_time_ns - samples.publish_time_ns[0]) * 1e-9
     log = tmp_path / "carried.mcap"
     fl.write(log, [samples.take((stamps_s < 4.0) & ~((stamps_s > 1.5) & (stamps_s < 2.2)))])
-    folder = fl.deploy(log, "ekf", tmp_path / "filter_c", model="orientation")
+    folder = fl.deploy(log, label, tmp_path / "filter_c", model="orientation")
     assert furthest(compiled(folder)) < 1e-12
     source = folder / "filter_c.c"
     text = source.read_text()
-    source.write_text(text.replace("pass_gap(filter, time_ns, parameters);", "filter->is_in_gap = 0;"))
+    source.write_text(
+        text.replace("return pass_gap(filter, time_ns, parameters);", "filter->is_in_gap = 0;")
+    )
     assert furthest(compiled(folder, "-Wno-unused-function")) > 0.1
 
 
@@ -173,8 +157,7 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "robot_ekf"
     for label, options, sentence in (
         ("smoother:ekf", {"model": "robot"}, "smoother:ekf: is no filter that can be written as C"),
-        ("sqrt:ekf", {"model": "robot"}, "sqrt:ekf cannot be written as C yet; give -e ekf"),
-        ("ukf", {"model": "robot"}, "the prediction cannot be written as C: samples of an angle"),
+        ("lrkf:rukf-10", {"model": "robot"}, "lrkf:rukf-10 draws its samples anew for every step"),
         ("ekf", {"model": "robot", "sigma_range_m": -1.0}, "sigma_range_m"),
     ):
         with pytest.raises(BadInput, match=sentence):
@@ -184,11 +167,14 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     def by_float(*_: Any) -> Any:
         return float(_[0][0]), 0.0
 
+    reactor = recorded(tmp_path, "batch-reactor")
+    with pytest.raises(BadInput, match="analytic cannot be written as C; give -e ekf, iekf, ukf"):
+        fl.deploy(reactor, "analytic", out)
     model = replace(REACTOR, motion=fl.Motion(by_float))
     with pytest.raises(
         BadInput, match=r"by_float \(test_deploying.py, line \d+\): it uses float\(\) of"
     ):
-        fl.deploy(recorded(tmp_path, "batch-reactor"), fl.modelled(model, "ekf"), out)
+        fl.deploy(reactor, fl.modelled(model, "ekf"), out)
     assert not out.exists()
     out.mkdir()
     (out / "mine.c").write_text("mine")

@@ -8,6 +8,12 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.inference.formulas import reference_names
 from replay.inference.model.model import Sensor
 
+_COVARIANCE = """\
+/* The covariance, of the lower factor L that the filter carries: L L'. */
+void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANGENT]);
+
+"""
+
 
 def header(made: CFilter) -> str:
     """Write NAME.h."""
@@ -50,7 +56,7 @@ typedef struct {
             """typedef struct {
     int64_t time_ns;
     REAL mean[NAME_STATES];
-    REAL covariance[NAME_TANGENT][NAME_TANGENT];
+    REAL CARRIED[NAME_TANGENT][NAME_TANGENT];
     REAL control[NAME_CONTROLS + 1];
     int64_t accepted_ns[NAME_SENSORS + 1]; /* when a measurement was last used */
 GAP} NAME;
@@ -66,7 +72,9 @@ typedef struct {
 /* Starts at a prior, undriven. */
 void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance);
 
-""".replace(
+FACTOR""".replace("CARRIED", "factor" if made.is_root else "covariance")
+            .replace("FACTOR", _COVARIANCE if made.is_root else "")
+            .replace(
                 "GAP",
                 "    int is_in_gap; /* whether what drives it is silent */\n" if made.has_gaps else "",
             ),
