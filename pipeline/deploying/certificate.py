@@ -1,6 +1,7 @@
 """What a step of a filter in C costs: operations, counted in its graphs, and memory, by the compiler."""
 
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -31,6 +32,23 @@ class Memory(NamedTuple):
     stack: int
 
 
+class Single(NamedTuple):
+    """Holds what single precision costs over the recorded log that is the filter's test.
+
+    Attributes:
+        estimates: how many were compared with those in double precision.
+        furthest: how far means and covariances are from these, in units of the number itself, or of one
+            where that is larger.
+        lost_event, lost_s: from which event on, and how long after the start, the covariance is no
+            longer positive definite where that in double precision is; None where it stays so.
+    """
+
+    estimates: int
+    furthest: float
+    lost_event: int | None
+    lost_s: float | None
+
+
 class Certificate(NamedTuple):
     """Holds what a filter costs.
 
@@ -40,6 +58,7 @@ class Certificate(NamedTuple):
         dense, sparse: flops of the products F P F', P H' and H P H' of all steps, or of F L and H L of a
             factor L, with all entries of F and H, and without those that are known to be zero or one.
         memory: None without a compiler that tells it.
+        single: None in double precision, and without a compiler.
     """
 
     steps: Mapping[str, Cost]
@@ -47,60 +66,90 @@ class Certificate(NamedTuple):
     dense: int
     sparse: int
     memory: Memory | None
+    single: Single | None
 
 
-def certificate_of(made: CFilter, source: str, header: str) -> Certificate:
-    """Count what a filter costs, and have its C compiled where there is a compiler.
+def certificate_of(made: CFilter, files: Mapping[str, str]) -> Certificate:
+    """Count what a filter costs, and have its C compiled, and tried in single precision.
 
     Args:
         made: the filter.
-        source: its C.
-        header: its header.
+        files: its C and its test, by name.
     """
     steps, products = costs_of(made)
     updates = [cost for name, cost in steps.items() if name != "predict"]
     worst = added(steps["predict"], max(updates, default=NOTHING))
     dense, sparse = (sum(each[place].flops for each in products) for place in (0, 1))
-    return Certificate(steps, worst, dense, sparse, _memory(made.name, source, header))
+    memory, single = _compiled(made, files)
+    return Certificate(steps, worst, dense, sparse, memory, single)
 
 
 def certificate_text(made: CFilter, certificate: Certificate) -> str:
     """Write certificate.json."""
-    memory = certificate.memory
+    memory, single = certificate.memory, certificate.single
     text = {
         "filter": made.name,
         "digest": made.digest,
+        "is_root": made.is_root,
         "steps": {name: cost._asdict() for name, cost in certificate.steps.items()},
         "worst": certificate.worst._asdict(),
         "products": {"dense_flops": certificate.dense, "flops": certificate.sparse},
         "memory": None if memory is None else memory._asdict(),
+        "single": None if single is None else single._asdict(),
     }
     return json.dumps(text, indent=2) + "\n"
 
 
-def _memory(name: str, source: str, header: str) -> Memory | None:
-    """Compile a filter; None without a GCC that tells what its functions call and need (10 or newer)."""
+def _compiled(made: CFilter, files: Mapping[str, str]) -> tuple[Memory | None, Single | None]:
+    """Compile a filter, and run its test in single precision; None each without a compiler that can."""
     compiler = shutil.which("gcc")
     if compiler is None:
-        return None
+        return None, None
     with TemporaryDirectory() as place:
         folder = Path(place)
-        (folder / f"{name}.c").write_text(source, encoding="utf-8")
-        (folder / f"{name}.h").write_text(header, encoding="utf-8")
+        for name, text in files.items():
+            (folder / name).write_text(text, encoding="utf-8")
+        memory = _memory(compiler, folder, made.name)
+        return memory, _single(compiler, folder, made.name) if made.precision.ending else None
 
-        def said(*command: str) -> str:
-            return subprocess.run(
-                command, cwd=folder, capture_output=True, text=True, check=True, encoding="utf-8"
-            ).stdout
 
-        try:
-            said(compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
-            version, target = said(compiler, "-dumpfullversion"), said(compiler, "-dumpmachine")
-            sizes = said("size", f"{name}.o").splitlines()[1].split()
-            calls = next(folder.glob("*.ci")).read_text(encoding="utf-8")
-        except (OSError, subprocess.CalledProcessError, IndexError, StopIteration):
-            return None
+def _said(folder: Path, *command: str | Path, check: bool = True) -> str:
+    return subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, check=check, encoding="utf-8"
+    ).stdout
+
+
+def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
+    """Compile a filter; None where GCC, before 10, does not tell what its functions call and need."""
+    try:
+        _said(folder, compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
+        version, target = (
+            _said(folder, compiler, "-dumpfullversion"),
+            _said(folder, compiler, "-dumpmachine"),
+        )
+        sizes = _said(folder, "size", f"{name}.o").splitlines()[1].split()
+        calls = next(folder.glob("*.ci")).read_text(encoding="utf-8")
+    except (OSError, subprocess.CalledProcessError, IndexError, StopIteration):
+        return None
     return Memory(f"gcc {version.strip()} for {target.strip()}", int(sizes[0]), deepest_stack(calls))
+
+
+def _single(compiler: str, folder: Path, name: str) -> Single | None:
+    """Run a filter's test; None where it cannot be built here."""
+    program = folder / "tried"
+    try:
+        _said(folder, compiler, *OPTIONS, f"test_{name}.c", f"{name}.c", "-lm", "-o", program)
+        said = _said(folder, program, check=False)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    compared = re.search(r"(\d+) estimates: furthest ([^,]+),", said)
+    lost = re.search(r"event (\d+), after ([^ ]+) s: the covariance is no longer", said)
+    return Single(
+        int(compared[1]) if compared else 0,
+        float(compared[2]) if compared else math.inf,
+        int(lost[1]) if lost else None,
+        float(lost[2]) if lost else None,
+    )
 
 
 def deepest_stack(calls: str) -> int:

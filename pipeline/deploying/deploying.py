@@ -77,19 +77,18 @@ def deploy(
     precision = SINGLE if single else DOUBLE
     bound, made = _made(name, label, {**settings, **parameters}, run, precision)
     vectors = vectors_of(run, bound, made.filtering)
-    own_header, own_source = header(made), source(made)
-    certificate = certificate_of(made, own_source, own_header)
     files = {
-        f"{made.name}.h": own_header,
-        f"{made.name}.c": own_source,
+        f"{made.name}.h": header(made),
+        f"{made.name}.c": source(made),
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
         "cortex_m4f.c": STARTING,
         "cortex_m4f.ld": LINKED,
         "CMakeLists.txt": cmake_text(made),
-        "README.md": readme_text(made, Path(log).name, certificate),
-        CERTIFICATE: certificate_text(made, certificate),
     }
+    certificate = certificate_of(made, files)
+    files["README.md"] = readme_text(made, Path(log).name, certificate)
+    files[CERTIFICATE] = certificate_text(made, certificate)
     if not why_no_replay(made):
         files[f"{made.name}_replay.c"] = replay_text(made)
         files["fuselog_filter.h"] = HEADER.read_text(encoding="utf-8")
@@ -126,7 +125,7 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
     found = description_of_library(label, program).digest if program["kind"] == "lib" else ""
     for run in runs.values() if found else ():
         _, made = _made("filter", label, settings, run, DOUBLE)
-        if made.digest != found:
+        if found not in (made.digest, made._replace(precision=SINGLE).digest):
             raise BadInput(
                 f"{program['path']}: was deployed from another filter ({found}) than the golden's "
                 f"{label} is in {run.name} ({made.digest}); deploy that one, with the same settings"

@@ -1,5 +1,9 @@
 """What stands beside a filter in C: how to build it, and what it is."""
 
+from collections.abc import Mapping
+from textwrap import fill
+from typing import Any
+
 from pipeline.deploying.c_replay import why_no_replay
 from pipeline.deploying.c_source.header import data_of
 from pipeline.deploying.c_source.names import CFilter
@@ -67,6 +71,39 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
 At most: both sides of every condition count{iterated}.{saved}
 
 {bytes_said}"""
+
+
+def _single(made: CFilter, certificate: Certificate, log: str) -> str:
+    """Write what single precision costs."""
+    if not made.precision.ending:
+        return ""
+    single = certificate.single
+    if single is None:
+        told = f"No GCC was there to run the test; `test_{made.name}` says what it costs."
+    elif single.lost_event is not None:
+        lost = lost_sentence(single._asdict(), is_root=made.is_root)
+        told = f"{lost[0].upper()}{lost[1:]}."
+    else:
+        told = (
+            f"Over the first {single.estimates} estimates of {log} means and covariances are within "
+            f"{single.furthest:.1g} of those in double precision, in units of the state or, of larger "
+            "numbers, as a share of them."
+        )
+    more = (
+        "What the libraries of both precisions differ in over whole logs, with intervals, "
+        "`fuselog compare LOG ... -e lib:A.so -e lib:B.so` tells."
+    )
+    text = fill(f"{told} {more}", 100, break_on_hyphens=False, break_long_words=False)
+    return f"\n## What single precision costs\n\n{text}\n"
+
+
+def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
+    """Say from when on single precision has no covariance any more, and what to take."""
+    mend = "" if is_root else "; take the square-root form, sqrt:ekf or sqrt:ukf"
+    return (
+        f"from event {single['lost_event']} of the test on, after {single['lost_s']:g} s, the "
+        f"covariance in single precision is no longer positive definite, where that in double is{mend}"
+    )
 
 
 def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
@@ -137,4 +174,4 @@ takes as well. QEMU knows no cycles.
 ## What it costs
 
 {_costs(made, certificate)}
-"""
+{_single(made, certificate, log)}"""

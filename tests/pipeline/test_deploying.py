@@ -140,6 +140,90 @@ def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
     assert found["products"]["dense_flops"] == 9 * 5 + 6 * 5 + 6 * 5 + 3 * 5
 
 
+class CartParameters(fl.ModelParameters):
+    """What a cart's camera and pushes are."""
+
+    sigma_m: float = 0.01
+    push_density: float = 0.001
+
+
+def roll(state: Any, _: Any, duration_s: Any, __: Any) -> Any:
+    return state[0] + duration_s * state[1], state[1]
+
+
+CART = fl.Model(
+    "a cart that rolls past a camera",
+    {"x_m": "linear", "v_mps": "linear"},
+    CartParameters,
+    (
+        fl.Sensor(
+            "camera",
+            fl.schemas.VECTOR_MEASUREMENT,
+            {"x_m": "linear"},
+            lambda state, *_: (state[0],),
+            lambda parameters: (parameters.sigma_m**2,),
+            vector="value",
+        ),
+    ),
+    fl.Motion(roll, lambda _, duration_s, parameters: (0.0, parameters.push_density**2 * duration_s)),
+)
+
+
+@needs_compiler
+@pytest.mark.usefixtures("uncompiled")
+def test_single_precision_says_where_it_breaks_and_the_square_root_holds(tmp_path: Path) -> None:
+    """The prior is 1e5 times as wide as a measurement: squared that is more than float's digits."""
+    stamps = fl.simulation_stamps_ns(0.01 * np.arange(150))
+    noise = 0.01 * np.random.default_rng(1).standard_normal((150, 1))
+    log = tmp_path / "cart.mcap"
+    prior = {"components": "x_m,v_mps", "kinds": "linear,linear"}
+    streams = [
+        fl.make_stream(
+            "/cart/prior",
+            fl.schemas.GAUSSIAN_ESTIMATE,
+            stamps[:1],
+            metadata=prior,
+            mean=np.zeros((1, 2)),
+            covariance=np.diag([1e6, 1e6]).reshape(1, 4),
+        ),
+        fl.make_stream(
+            "/cart/camera",
+            fl.schemas.VECTOR_MEASUREMENT,
+            stamps,
+            metadata={"components": "x_m"},
+            value=5.0 + 0.02 * np.arange(150)[:, None] + noise,
+        ),
+    ]
+    fl.write(log, streams)
+    costs = {}
+    for kind in ("ekf", "sqrt:ekf"):
+        folder = fl.deploy(log, fl.modelled(CART, kind), tmp_path / kind.replace(":", "_"), single=True)
+        costs[kind] = json.loads((folder / "certificate.json").read_text())["single"]
+    assert costs["ekf"]["lost_event"] > 0
+    assert "take the square-root form" in (tmp_path / "ekf/README.md").read_text()
+    assert costs["sqrt:ekf"]["lost_event"] is None
+    assert costs["sqrt:ekf"]["furthest"] < 1e-4
+    assert costs["sqrt:ekf"]["estimates"] == 150
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+@pytest.mark.paper
+def test_both_precisions_are_compared_with_intervals(tmp_path: Path) -> None:
+    logs = [tmp_path / f"{run}.mcap" for run in range(5)]
+    for run, log in enumerate(logs):
+        fl.write(log, fl.record("landmarks", seed=run, duration_s=5.0))
+    sides = []
+    for precision in ("double", "single"):
+        folder = tmp_path / precision
+        fl.deploy(logs[0], "ekf", folder, model="robot", single=precision == "single")
+        sides += ["-e", f"lib:{compiled(folder, '-shared', '-fPIC')}"]
+    said = run_here("compare", *logs, *sides)
+    assert said.code == 0, said.err
+    [row] = [line for line in said.out.splitlines() if line.startswith(" position_rmse_m ")]
+    assert "no difference" in row
+
+
 def test_stack_is_that_of_the_deepest_chain() -> None:
     node = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:5\\n{1} bytes (static)" }}\n'
     edge = 'edge: {{ sourcename: "{0}" targetname: "{1}" label: "x.c:2:3" }}\n'
