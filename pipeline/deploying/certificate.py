@@ -91,6 +91,7 @@ def certificate_text(made: CFilter, certificate: Certificate) -> str:
         "filter": made.name,
         "digest": made.digest,
         "is_root": made.is_root,
+        "states": made.states,
         "steps": {name: cost._asdict() for name, cost in certificate.steps.items()},
         "worst": certificate.worst._asdict(),
         "products": {"dense_flops": certificate.dense, "flops": certificate.sparse},

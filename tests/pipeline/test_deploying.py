@@ -1,8 +1,6 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
 import json
-import re
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,11 +13,13 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
 from replay.estimators.models.reactor import REACTOR
-from tests.deployed.building import COMPILERS, compiled, furthest
+from tests.claims.pages import DEPLOYED
+from tests.deployed.building import COMPILERS, compiled, furthest, missing_of_target, on_target
+from tests.deployed.models import Tried, deployed, robot_log
+from tests.deployed.own_models import own_models
 from tests.pipeline.conftest import run_here
 from tests.replay.estimators.test_attitude import carried
 
@@ -267,32 +267,34 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     assert [each.name for each in out.iterdir()] == ["mine.c"]
 
 
-def missing_of_target() -> str:
-    """What is missing of that which builds for the target and runs it, as Debian's packages."""
-    needed = {"gcc-arm-none-eabi": "arm-none-eabi-gcc", "qemu-system-arm": "qemu-system-arm"}
-    missing = [package for package, program in needed.items() if not shutil.which(program)]
-    if "gcc-arm-none-eabi" not in missing:
-        asked = ("arm-none-eabi-gcc", "-print-file-name=rdimon.specs")
-        said = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
-        missing += [] if Path(said.strip()).is_file() else ["libnewlib-arm-none-eabi"]
-    return ", ".join(missing)
-
-
-@pytest.mark.parametrize(("single", "away", "row"), [(False, 1e-12, "double"), (True, 2e-6, "float")])
-def test_an_emulated_cortex_m4f_gives_the_estimates(
-    tmp_path: Path, single: bool, away: float, row: str
-) -> None:
+@pytest.mark.parametrize(("single", "away"), [(False, 1e-12), (True, 2e-6)])
+def test_an_emulated_cortex_m4f_gives_the_estimates(tmp_path: Path, single: bool, away: float) -> None:
     if missing := missing_of_target():
         pytest.skip(f"there is no {missing} here")
-    log = recorded(tmp_path, "landmarks", duration_s=10.0)
-    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", single=single)
-    build, run = (line.split() for line in target_lines("robot_ekf", argument=str(away)))
-    subprocess.run(build, cwd=folder, check=True)
-    found = subprocess.run(run, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
-    assert found.returncode == 0, found.stdout + found.stderr
-    taken = re.search(r"(\d+) instructions for a message, at most (\d+)", found.stdout)
-    page = (Path(__file__).parents[2] / "docs/deploy.md").read_text()
-    stated = re.search(rf"\| `{row}`[^|]*\| (\d+) \| (\d+) \|", page)
-    assert taken is not None
-    assert stated is not None
-    assert [*map(int, taken.groups())] == pytest.approx([*map(int, stated.groups())], rel=0.1)
+    tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot"})
+    taken = on_target(deployed(tried, "ekf", tmp_path, single=single), away)
+    kept = json.loads(DEPLOYED.read_text())["target"]["ekf float" if single else "ekf double"]
+    assert [taken.average, taken.most] == pytest.approx([kept["average"], kept["most"]], rel=0.1)
+
+
+def test_the_costs_that_are_kept_are_those_of_now(tmp_path: Path) -> None:
+    """`python -m tests.deployed --keep` keeps them."""
+    tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot"})
+    kept = json.loads(DEPLOYED.read_text())["pairs"]["robot"]
+    for method in ("ekf", "sqrt:ukf"):
+        folder = deployed(tried, method, tmp_path)
+        found = json.loads((folder / "certificate.json").read_text())["worst"]
+        assert found == {name: kept[method][name] for name in found}
+
+
+@needs_compiler
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.paper
+def test_models_of_the_pages_deploy_as_they_stand_there(tmp_path: Path) -> None:
+    """`python -m tests.deployed` has them by every method."""
+    found = []
+    for name, model, log, settings in own_models(tmp_path):
+        folder = deployed(Tried(name, log, model, settings), "sqrt:ukf", tmp_path)
+        assert furthest(compiled(folder)) <= 1e-12
+        found.append(name)
+    assert found == ["pendulum", "pendulum with its length", "ball", "walker"]
