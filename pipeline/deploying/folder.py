@@ -127,7 +127,7 @@ def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
 
 ```
 cc -std=c99 -O2 -ffp-contract=off -shared -fPIC {name}_replay.c {name}.c -lm -o {name}.so
-fuselog replay {log} -e lib:./{name}.so
+fuselog replay PATH/{log} -e lib:./{name}.so
 ```"""
     )
     return f"""# {name}

@@ -95,7 +95,7 @@ static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
 static int whiten(int size, REAL v[M], REAL S[M][M], REAL *nis)
 {
     *nis = 0.0_S;
-    if (!cholesky(&S[0][0], NAME_MOST, size))
+    if (!cholesky(&S[0][0], M, size))
         return 0;
     for (int i = 0; i < size; i++) {
         for (int k = 0; k < i; k++)

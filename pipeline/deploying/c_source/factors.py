@@ -88,9 +88,9 @@ static int factorise(factorisation *found, int size, int columns, int noises, RE
 /* Rows from `first` on become the state's factor, whose columns weigh one. */
 static void add_factor(const NAME *filter, int first, factorisation *found)
 {
-    for (int k = 0; k < NAME_TANGENT; k++) {
+    for (int k = 0; k < T; k++) {
         found->weights[k] = 1.0_S;
-        for (int row = 0; row < NAME_TANGENT; row++)
+        for (int row = 0; row < T; row++)
             found->rows[first + row][k] = filter->factor[row][k];
     }
 }
@@ -98,8 +98,8 @@ static void add_factor(const NAME *filter, int first, factorisation *found)
 /* The first rows that were factorised become the state's factor. */
 static void take_factor(NAME *filter, const factorisation *found)
 {
-    for (int row = 0; row < NAME_TANGENT; row++)
-        for (int column = 0; column < NAME_TANGENT; column++)
+    for (int row = 0; row < T; row++)
+        for (int column = 0; column < T; column++)
             filter->factor[row][column] = found->factor[row][column];
 }
 
@@ -115,16 +115,16 @@ static void square(const REAL *factor, int stride, int size, REAL *covariance, i
         }
 }
 
-void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANGENT])
+void NAME_covariance(const NAME *filter, REAL covariance[T][T])
 {
-    square(&filter->factor[0][0], NAME_TANGENT, NAME_TANGENT, &covariance[0][0], NAME_TANGENT);
+    square(&filter->factor[0][0], T, T, &covariance[0][0], T);
 }
 """
 
 START = """\
-    for (int column = 0; column < NAME_TANGENT; column++) /* by Cholesky; NAN where there is none */
-        for (int row = 0; row < NAME_TANGENT; row++) {
-            REAL entry = covariance[row * NAME_TANGENT + column];
+    for (int column = 0; column < T; column++) /* by Cholesky; NAN where there is none */
+        for (int row = 0; row < T; row++) {
+            REAL entry = covariance[row * T + column];
             for (int k = 0; k < column; k++)
                 entry -= filter->factor[row][k] * filter->factor[column][k];
             if (row < column)
@@ -142,7 +142,7 @@ CARRYING = """\
 static void carry(const NAME *filter, REAL (*J)[T], const signed char (*columns)[T + 1], int size,
                   factorisation *found)
 {
-    for (int k = 0; k < NAME_TANGENT; k++) {
+    for (int k = 0; k < T; k++) {
         found->weights[k] = 1.0_S;
         for (int i = 0; i < size; i++) {
             REAL entry = 0.0_S;
@@ -162,7 +162,7 @@ static void start_samples(const NAME *filter, drawn_samples *samples)
     for (int row = 0; row < DRAWN; row++)
         for (int column = 0; column < DRAWN; column++)
             samples->factor[row][column] =
-                row < NAME_TANGENT && column < NAME_TANGENT ? filter->factor[row][column] : 0.0_S;
+                row < T && column < T ? filter->factor[row][column] : 0.0_S;
 }
 
 /* Rows become the values at samples, and behind them so many components of the samples themselves. */
@@ -185,7 +185,7 @@ static void retriangulate(NAME *filter)
 {
     factorisation found;
     add_factor(filter, 0, &found);
-    orthogonalise(&found, NAME_TANGENT, NAME_TANGENT);
+    orthogonalise(&found, T, T);
     take_factor(filter, &found);
 }
 """
@@ -211,9 +211,9 @@ static int update(NAME *filter, int sensor, int components, int columns, const i
             noise[i][k] = noise[k][i] = 0.0_S;
         noise[i][i] = 1.0_S;
     }
-    if (!factorise(found, components + NAME_TANGENT, columns, components, &noise[0][0], NAME_MOST))
+    if (!factorise(found, components + T, columns, components, &noise[0][0], M))
         return NAME_NOT_POSITIVE_DEFINITE;
-    square(&found->factor[0][0], ROWS, components, &S[0][0], NAME_MOST);
+    square(&found->factor[0][0], ROWS, components, &S[0][0], M);
     keep(innovation, components, places, v, S);
     for (int i = 0; i < components; i++) {
         if (!(found->factor[i][i] > 0.0_S))
@@ -232,16 +232,16 @@ static int update(NAME *filter, int sensor, int components, int columns, const i
     if (!innovation->is_accepted)
         return NAME_WELL;
     wider = inflation(nis, size, gate);
-    for (int row = 0; row < NAME_TANGENT; row++) {
+    for (int row = 0; row < T; row++) {
         step[row] = 0.0_S;
         for (int i = 0; i < components; i++)
             step[row] += found->factor[components + row][i] * v[i] / wider;
-        for (int k = 0; k < components + NAME_TANGENT; k++)
+        for (int k = 0; k < components + T; k++)
             found->rows[row][k] = found->factor[components + row][k];
     }
-    for (int k = 0; k < components + NAME_TANGENT; k++)
+    for (int k = 0; k < components + T; k++)
         found->weights[k] = k < components ? 1.0_S - 1.0_S / wider : 1.0_S;
-    orthogonalise(found, NAME_TANGENT, components + NAME_TANGENT);
+    orthogonalise(found, T, components + T);
     take_factor(filter, found);
     FIND_SLOPE;
     correct(filter, step, slope);

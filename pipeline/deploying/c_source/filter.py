@@ -42,6 +42,7 @@ def source(made: CFilter) -> str:
         f"/* {made.origin} Made by fuselog deploy; see {made.name}.h.\n"
         " * Compile it with -ffp-contract=off to have fuselog's bits. */",
         f'#include "{made.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n',
+        filled(made, "enum { T = NAME_TANGENT, M = NAME_MOST };\n"),
         _as_tuned(made),
         *helpers_of(every, made.precision),
         *_products(made),
@@ -94,9 +95,9 @@ def repr_double(value: float) -> str:
 
 
 _COPY = """\
-    for (int row = 0; row < NAME_TANGENT; row++)
-        for (int column = 0; column < NAME_TANGENT; column++)
-            filter->covariance[row][column] = covariance[row * NAME_TANGENT + column];
+    for (int row = 0; row < T; row++)
+        for (int column = 0; column < T; column++)
+            filter->covariance[row][column] = covariance[row * T + column];
 """
 
 

@@ -154,7 +154,4 @@ def filled(made: CFilter, template: str) -> str:
     """Fill the names and sizes of a filter into a template."""
     text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", template)
     text = re.sub(r"\bNAME(?=_|\b)", made.name, text)
-    upper = made.name.upper()
-    text = re.sub(r"(?<=\[)T\b|(?<=< )T\b", f"{upper}_TANGENT", text)
-    text = re.sub(r"(?<=\[)M\b", f"{upper}_MOST", text)
     return made.precision.text(text)

@@ -86,7 +86,7 @@ def _step(made: CFilter) -> str:
         first.append(
             f"spread(&samples, {weighed(sampled)}, {t}, 0, &found);"
             if made.is_root
-            else f"find_moments(&samples, {weighed(sampled)}, {t}, &P[0][0], NAME_TANGENT, NULL);"
+            else f"find_moments(&samples, {weighed(sampled)}, {t}, &P[0][0], T, NULL);"
         )
         assigned = [f"filter->mean[{i}] = samples.centre[{i}];" for i in range(made.states)]
     if made.is_root:
@@ -108,7 +108,7 @@ def _factorising(made: CFilter, columns: int) -> list[str]:
     """Write how a prediction's factor is found of so many columns and its noise."""
     t = made.tangent
     return [
-        f"if (!factorise(&found, {t}, {columns}, {t}, &noise[0][0], NAME_TANGENT))",
+        f"if (!factorise(&found, {t}, {columns}, {t}, &noise[0][0], T))",
         "    return NAME_NOT_POSITIVE_DEFINITE;",
         "take_factor(filter, &found);",
     ]
@@ -134,7 +134,7 @@ def _whole(made: CFilter, declared: list[str], lines: list[str]) -> str:
     used = {
         r"\bduration_s\b": f"const {real} duration_s = "
         + (f"({real})({span});" if real != "double" else f"{span};"),
-        r"\bP[\[,]": "REAL (*const P)[NAME_TANGENT] = filter->covariance;",
+        r"\bP[\[,]": "REAL (*const P)[T] = filter->covariance;",
         r"&noise\b": "REAL noise[T][T] = {{0}};",
         r"&found\b": "factorisation found;",
         r"&samples\b": "drawn_samples samples;",

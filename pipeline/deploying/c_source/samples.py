@@ -54,8 +54,8 @@ static int start_samples(const NAME *filter, drawn_samples *samples)
     for (int row = 0; row < DRAWN; row++)
         for (int column = 0; column < DRAWN; column++)
             samples->factor[row][column] =
-                row < NAME_TANGENT && column <= row ? filter->covariance[row][column] : 0.0_S;
-    return cholesky(&samples->factor[0][0], DRAWN, NAME_TANGENT);
+                row < T && column <= row ? filter->covariance[row][column] : 0.0_S;
+    return cholesky(&samples->factor[0][0], DRAWN, T);
 }
 
 /* The covariance of the values, and where `cross` is not NULL that of the state with them. */
@@ -70,7 +70,7 @@ static void find_moments(const drawn_samples *samples, int count, const REAL *we
                          (samples->values[k][j] - samples->shift[j]);
             spread[i * stride + j] = spread[j * stride + i] = entry;
         }
-    for (int row = 0; cross != NULL && row < NAME_TANGENT; row++)
+    for (int row = 0; cross != NULL && row < T; row++)
         for (int i = 0; i < size; i++) {
             REAL entry = 0.0_S;
             for (int k = 0; k < count; k++)

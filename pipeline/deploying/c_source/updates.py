@@ -151,7 +151,7 @@ def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
         else:
             first = ["if (!start_samples(filter, &samples))", "    return NAME_NOT_POSITIVE_DEFINITE;"]
             first.append(call)
-            first.append(f"find_moments(&samples, {weighed(sampled)}, {m}, &S[0][0], NAME_MOST, C);")
+            first.append(f"find_moments(&samples, {weighed(sampled)}, {m}, &S[0][0], M, C);")
     named = entries(step, "v") | loops.named
     lines = [*first, *c_lines(named, names, made.precision), *loops.calls]
     return loops._replace(declared=[*loops.declared, *declared]), lines
