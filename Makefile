@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no
 # commands are started some hundred times: what they import is compiled once, whatever is usual here
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast coverage fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench faults docs docs-claims format clean
+.PHONY: demo test test-fast coverage fast-replay-lane fast-rooms-lane estimators-lane inference-lane pipeline-lane rooms-lane lint wheel mutants bench deployed faults docs docs-claims format clean
 
 demo: .venv/with-fuselog
 	$(BIN)/fuselog run landmarks --runs 20 --out demo/landmarks
@@ -70,6 +70,10 @@ mutants: .venv/with-test
 
 bench: .venv/with-bench
 	$(BIN)/python -m tests.bench
+
+# every model by every method that deploys, in C beside its replay
+deployed: .venv/with-test
+	$(BIN)/python -m tests.deployed
 
 faults: .venv/with-test
 	$(BIN)/python -m tests.faults

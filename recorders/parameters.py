@@ -153,6 +153,11 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
     return told
 
 
+def in_few_words(meaning: str) -> str:
+    """Return the first words of what a parameter means."""
+    return re.split("[,.:;]", meaning)[0]
+
+
 def _prose(kind: type[BaseModel]) -> str:
     """What a type and its bases say of their parameters as a whole."""
     told = [

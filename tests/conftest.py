@@ -7,7 +7,9 @@ import tarfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
@@ -34,8 +36,19 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Loops in plain Python: the reference, which a debugger can follow."""
+    """Loops in plain Python: the reference, which a debugger can follow.
+
+    Memory holds what shows where it is read before it is written.
+    """
     monkeypatch.setenv("FUSELOG_UNCOMPILED", "1")
+    monkeypatch.setattr(np, "empty", _unwritten)
+
+
+def _unwritten(shape: Any, dtype: Any = float, **options: Any) -> np.ndarray:
+    made = np.zeros(shape, dtype, **options)
+    if made.dtype.kind == "f":
+        made[...] = np.nan
+    return made
 
 
 @contextmanager

@@ -10,10 +10,16 @@ from pipeline.altering.sources import setting_of
 from pipeline.api.trajectories import ComparedLogs, compare_logs
 from pipeline.output.coverage import recounted
 from pipeline.output.outputs import check_folder
-from pipeline.output.results import ErrorTables, result_folder, write_outcome
+from pipeline.output.results import result_folder, write_outcome
 from pipeline.output.summary import summarise, summary_table
 from pipeline.runs.ensemble import judge_logs
-from pipeline.runs.estimates import hash_files, log_of_estimates, source_of_estimates, stated_estimators
+from pipeline.runs.estimates import (
+    ErrorTables,
+    hash_files,
+    log_of_estimates,
+    source_of_estimates,
+    stated_estimators,
+)
 from pipeline.runs.initial_states import check_same_run
 from recorders.errors import BadInput
 from recorders.log import NotMcap, open_log

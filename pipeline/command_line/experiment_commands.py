@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.api.api import run, sweep
-from pipeline.output.results import RESULT_FILE, RUNS, keep_causes, read_table, split_metric
+from pipeline.output.alarms import NOT_TESTED
+from pipeline.output.results import RESULT_FILE, RUNS, keep, read_table, split_metric
 from pipeline.output.terminal import (
     has_many_cases,
     print_claims,
@@ -45,6 +46,7 @@ def run_named(
     workers: int | None,
     scheduler: str | None,
     diagnose: bool,
+    stress: bool,
     tells_parameters: bool,
     as_json: bool,
     settings_file: Path | None,
@@ -78,7 +80,13 @@ def run_named(
     if diagnose:
         from pipeline.diagnosing.likeliest import likeliest_causes
 
-        result = keep_causes(done.folder, result, likeliest_causes(done.folder, result))
+        result = keep(done.folder, result, causes=likeliest_causes(done.folder, result))
+    if stress:
+        from pipeline.stressing.experiments import stress_result
+
+        result = keep(
+            done.folder, result, stress=stress_result(result, workers=workers, progress=progress)
+        )
     if as_json:
         print_json(result.model_dump(mode="json"))
         return
@@ -97,6 +105,10 @@ def run_named(
     print_metrics(result.metrics, result.bounds, table, str(details))
     print_others(result.alarms)
     print_claims(result.claims)
+    for words in [word for each in result.stress for word in each.words]:
+        say(words)
+    if not result.stress and result.settings.get("estimators"):
+        say(NOT_TESTED)
     say(f"{done.folder}: {', '.join(result.contents)}")
 
 

@@ -26,6 +26,12 @@ from recorders.errors import printable
 diagnose_option = click.option(
     "--diagnose", is_flag=True, help="Say why an estimator is inconsistent, by its first run."
 )
+stress_option = click.option(
+    "--stress",
+    is_flag=True,
+    help="Say of each estimator whether changes that should not matter decide what it gives; verdicts "
+    "below what they do are withheld.",
+)
 
 
 @command(
@@ -49,6 +55,7 @@ diagnose_option = click.option(
 @workers_option
 @scheduler_option
 @diagnose_option
+@stress_option
 @parameters_alone_option
 @json_option
 @settings_option

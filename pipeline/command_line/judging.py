@@ -201,6 +201,9 @@ def diagnose(logs: tuple[Path, ...], **options: Any) -> None:
 )
 @click.option("--model", help="The model to estimate, where several fit the logs.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Of signs, and of what is dropped.")
+@click.option(
+    "--save", type=TIMELINE, help="A timeline (.rrd) of the first log to write: copies fan out in it."
+)
 @recover_option
 @gap_option
 @json_option

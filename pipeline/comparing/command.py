@@ -7,10 +7,10 @@ import numpy as np
 
 from pipeline.comparing.comparing import compare
 from pipeline.comparing.groups import recorded_labels
+from pipeline.output.alarms import NOT_TESTED
 from pipeline.output.outputs import check_outputs
 from pipeline.output.terminal import print_json, print_table, progress, say, warn
 from pipeline.runs.settings import settings_of_estimators, split_texts
-from pipeline.stressing.verdicts import NOT_TESTED
 
 COLUMNS = {
     "quantity": "metric",

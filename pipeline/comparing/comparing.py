@@ -22,6 +22,7 @@ from pipeline.comparing.groups import (
     unlike_runs,
 )
 from pipeline.comparing.paired import ALL, Paired, under_stress
+from pipeline.comparing.scenes import scene_of, side_by_side
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, level
 from pipeline.output.coverage import coverage_table, sentences
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -29,11 +30,12 @@ from pipeline.output.results import Outcome, result_folder, write_outcome
 from pipeline.runs.ensemble import Progress, judge_logs, no_progress
 from pipeline.runs.estimates import hash_files
 from pipeline.stressing.stressing import stress as stress_logs
+from pipeline.stressing.sums import verdicts_of
 from pipeline.stressing.verdicts import Stress
 from recorders.errors import BadInput
-from recorders.log import RunMetadata, open_log
+from recorders.log import open_log
 from replay.engine.replaying.usage import Row
-from replay.engine.streams.sources import LogSource, MemorySource
+from replay.engine.streams.sources import LogSource
 from replay.judging.errors.differences import (
     NATS,
     Difference,
@@ -118,13 +120,7 @@ class Differences:
         if not self.drawable:
             raise BadInput(f"{save}: no run has estimates of both sides to draw; leave out --save")
         first = self.drawable[0]
-        source = candidates[0].pairs[first][0]
-        of_candidates = (candidate.estimates(first) for candidate in candidates)
-        streams = {
-            topic: stream for own in of_candidates for topic, stream in own.read([*own.topics]).items()
-        }
-        run = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
-        estimates = MemorySource(streams, run, source.name)
+        source, estimates = side_by_side(candidates, first)
         names = [candidate.name for candidate in candidates]
         identity = json.dumps([source.name, names])
         with Drawing(source.whole(), identity=identity, save=save, sides=names) as drawing:
@@ -141,6 +137,8 @@ class Differences:
         names = [[candidate.name for candidate in candidates] for candidates in self.groups]
         tables = {"differences": self.table, "runs": table_of_runs(self.groups)}
         outcome = Outcome(tables=tables, figures=dict(self.charts()))
+        for run in self.drawable[:1]:
+            outcome.figures |= scene_of(self.groups[0], run, self.gap_limit_s)
         if self.coverage:
             outcome.tables["coverage"] = coverage_table(self.coverage)
         if len(self.times):
@@ -149,6 +147,8 @@ class Differences:
             key = f"{each.second}.{each.quantity}_difference"
             outcome.metrics[f"{key}.{each.case}" if each.case else key] = each.found.difference
         outcome.input_sha256 = hash_files([path for path in inputs if path.is_file()])
+        if self.stress is not None:
+            outcome.stress = [*verdicts_of(self.stress.stressed).values()]
         settings = {
             "title": "; ".join(" against ".join(reversed(each)) for each in names),
             "sides": names,
@@ -267,7 +267,7 @@ def compare(
             )
         sources = [LogSource(open_log(path, recover=recover)) for path in paths]
         found = stress_logs(sources, estimators, gap_limit_s=gap_limit_s, set=set)
-        paired = under_stress(paired, found)
+        paired = under_stress(paired, verdicts_of(found.stressed))
     notes += sentences([row for group in groups for candidate in group for row in candidate.coverage])
     return Differences(groups, margin, gap_limit_s, list(dict.fromkeys(notes)), paired, table, found)
 

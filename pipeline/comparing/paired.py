@@ -1,12 +1,12 @@
 """A metric of two candidates, and the verdict on it; withheld where stress moves it further."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.comparing.groups import runs_of
-from pipeline.stressing.verdicts import Stress
+from pipeline.output.alarms import Stressing
 from replay.judging.errors.differences import FEWEST_RUNS, Difference, Target
 
 ALL = "all"
@@ -69,14 +69,11 @@ class Paired(NamedTuple):
         return f"{self.quantity}{of}: {verdict}: {values}; {interval} ({margin}){when}"
 
 
-def under_stress(paired: Sequence[Paired], stress: Stress) -> list[Paired]:
+def under_stress(paired: Sequence[Paired], verdicts: Mapping[str, Stressing]) -> list[Paired]:
     """Each metric with the largest change that stress makes to it, of either candidate."""
-    return [
-        each._replace(
-            stressed=max(
-                stress.moved(name, each.quantity, None if each.case == ALL else each.case)
-                for name in (each.first, each.second)
-            )
-        )
-        for each in paired
-    ]
+    found = []
+    for each in paired:
+        key = each.quantity if each.case in ("", ALL) else f"{each.quantity}.{each.case}"
+        own = [verdicts[name].moved.get(key, 0.0) for name in (each.first, each.second)]
+        found.append(each._replace(stressed=max(own)))
+    return found

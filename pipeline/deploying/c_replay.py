@@ -11,8 +11,6 @@ from replay.inference.model.model import Map, Sensor
 def why_no_replay(made: CFilter) -> str:
     """Explain why fuselog cannot replay the C; empty where it can."""
     stage, found = made.filtering.stage, made.filtering.found
-    if made.precision.ending:
-        return "it is in single precision, and the interface in double"
     if made.is_interpolated:
         return "its control is interpolated, so that messages wait for the next one of it"
     if found.fallbacks or (stage.model.control is not None and stage.model.control.read is not None):
@@ -43,7 +41,7 @@ def _fields(sensor: Sensor) -> list[str]:
 
 def _description(made: CFilter) -> str:
     stage = made.filtering.stage
-    model = stage.model
+    model, single = stage.model, " in single precision" if made.precision.ending else ""
     topics: list[dict[str, Any]] = [
         {
             "topic": each.topic,
@@ -70,7 +68,7 @@ def _description(made: CFilter) -> str:
         )
     return json.dumps(
         {
-            "summary": f"{made.origin.rstrip('.')}, in C",
+            "summary": f"{made.origin.rstrip('.')}, in C{single}",
             "digest": made.digest,
             "topics": topics,
             "prior": model.prior,
@@ -117,7 +115,7 @@ def replay_text(made: CFilter) -> str:
     maps = _maps(made)
     parameters = _parameters(made)
     sets = "".join(
-        f"    own->parameters.{place} = parameters[{index}];\n"
+        f"    own->parameters.{place} = (REAL)parameters[{index}];\n"
         for index, (_, places, _) in enumerate(parameters)
         for place in places
     )
@@ -140,7 +138,7 @@ def replay_text(made: CFilter) -> str:
             f"    if (topic == {topic}) {{ /* what drives it */\n"
             "        for (int k = 0; k < NAME_CONTROLS; k++)\n"
             "            if (!isnan(fields[k]))\n"
-            "                own->filter.control[k] = fields[k];\n"
+            "                own->filter.control[k] = (REAL)fields[k];\n"
             "        return FUSELOG_FILTER_WELL;\n    }\n"
         )
         topic += 1
@@ -193,6 +191,20 @@ typedef struct {{
     int32_t outcome; /* of the last message */
 {points}}} Own;
 
+/* Numbers of the interface become the filter's. */
+static void take(REAL *to, const double *from, int count)
+{{
+    for (int i = 0; i < count; i++)
+        to[i] = (REAL)from[i];
+}}
+
+/* And back. */
+static void give(double *to, const REAL *from, int count)
+{{
+    for (int i = 0; i < count; i++)
+        to[i] = from[i];
+}}
+
 int32_t fuselog_filter_version(void) {{ return FUSELOG_FILTER_VERSION; }}
 
 const char *fuselog_filter_describe(void)
@@ -223,9 +235,12 @@ void *fuselog_filter_copy(const void *filter)
 int32_t fuselog_filter_start(void *filter, int64_t time_ns, const double *mean, const double *covariance)
 {{
     Own *own = filter;
+    REAL state[NAME_STATES], spread[NAME_TANGENT * NAME_TANGENT];
     if (mean == NULL)
         return NEEDS_PRIOR;
-    NAME_init(&own->filter, time_ns, mean, covariance);
+    take(state, mean, NAME_STATES);
+    take(spread, covariance, NAME_TANGENT * NAME_TANGENT);
+    NAME_init(&own->filter, time_ns, state, spread);
     return FUSELOG_FILTER_WELL;
 }}
 
@@ -255,8 +270,7 @@ int32_t fuselog_filter_take(void *filter, int32_t topic, int64_t time_ns, const 
 {wrap}int32_t fuselog_filter_state(const void *filter, double *mean, double *covariance)
 {{
     const Own *own = filter;
-    memcpy(mean, own->filter.mean, sizeof own->filter.mean);
-    memcpy(covariance, own->filter.covariance, sizeof own->filter.covariance);
+COVARIANCE    give(mean, own->filter.mean, NAME_STATES);
 {angles}    return FUSELOG_FILTER_WELL;
 }}
 
@@ -265,12 +279,20 @@ int32_t fuselog_filter_innovation(const void *filter, double *innovation, double
     const Own *own = filter;
     if (own->outcome == FUSELOG_FILTER_NOTHING)
         return FUSELOG_FILTER_NOTHING;
-    memcpy(innovation, own->innovation.difference, sizeof own->innovation.difference);
-    memcpy(covariance, own->innovation.covariance, sizeof own->innovation.covariance);
+    give(innovation, own->innovation.difference, NAME_INNOVATION);
+    give(covariance, &own->innovation.covariance[0][0], NAME_INNOVATION * NAME_INNOVATION);
     return own->outcome;
 }}
 """
-    return filled(made, text).replace("DESCRIPTION", _literal(_description(made)))
+    spread = "    give(covariance, &WHOSE[0][0], NAME_TANGENT * NAME_TANGENT);\n"
+    covariance = (
+        "    REAL spread[NAME_TANGENT][NAME_TANGENT];\n    NAME_covariance(&own->filter, spread);\n"
+        + spread.replace("WHOSE", "spread")
+        if made.is_root
+        else spread.replace("WHOSE", "own->filter.covariance")
+    )
+    text = filled(made, text.replace("COVARIANCE", covariance))
+    return text.replace("DESCRIPTION", _literal(_description(made)))
 
 
 def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
@@ -278,9 +300,7 @@ def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
     m = len(sensor.measured)
     ids = list(dict.fromkeys(each.of for each in sensor.maps))
     first = len(ids)
-    lines = [
-        f"double data[{m + sensor.reference_size + (m * (m + 1) // 2 if sensor.covariance else 0)}];"
-    ]
+    lines = [f"REAL data[{m + sensor.reference_size + (m * (m + 1) // 2 if sensor.covariance else 0)}];"]
     at = m
     for each in sensor.maps:
         number = [one.topic for one in maps].index(each.topic)
@@ -290,18 +310,18 @@ def _taking(name: str, sensor: Sensor, maps: list[Map]) -> str:
         lines.append("    at++;")
         lines.append(f"if (at == own->points{number})")
         lines.append("    return FUSELOG_FILTER_WELL; /* an unknown one says nothing */")
-        lines.append(f"memcpy(data + {at}, own->point{number}[at] + 1, {each.size} * sizeof *data);")
+        lines.append(f"take(data + {at}, own->point{number}[at] + 1, {each.size});")
         at += each.size
-    lines.append(f"memcpy(data, fields + {first}, {m} * sizeof *data);")
+    lines.append(f"take(data, fields + {first}, {m});")
     extra = sum(sensor.fields.values())
     if extra:
-        lines.append(f"memcpy(data + {at}, fields + {first + m}, {extra} * sizeof *data);")
+        lines.append(f"take(data + {at}, fields + {first + m}, {extra});")
         at += extra
     if sensor.covariance:
         start = first + m + extra
         for row in range(m):
             for column in range(row + 1):
-                lines.append(f"data[{at}] = fields[{start + row * m + column}];")
+                lines.append(f"data[{at}] = (REAL)fields[{start + row * m + column}];")
                 at += 1
         missing = " || ".join(f"isnan(fields[{start + index}])" for index in range(m * m))
         lines.append(f"if ({missing})")

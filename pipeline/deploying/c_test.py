@@ -80,10 +80,12 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
     rows = np.searchsorted(stamps, time_ns).clip(max=max(len(stamps) - 1, 0))
     is_there = last & (stamps[rows] == time_ns)
     first = begun[0]
+    covariance = first.belief.covariance[0].copy()
+    filtering.form.to_covariance(covariance)
     return Vectors(
         int(first.time_ns[0]),
         first.belief.mean[0],
-        first.belief.covariance[0],
+        covariance,
         time_ns[chosen],
         sources[chosen],
         data[chosen],
@@ -165,6 +167,19 @@ def test_text(made: CFilter) -> str:
             if control
             else "        default:\n            break;\n"
         )
+    gap = "        if (outcome == NAME_NOT_DRIVEN)\n            continue;\n" if made.has_gaps else ""
+    factor = "            double own[NAME_TANGENT][NAME_TANGENT];\n"
+    kept = "                    own[row][column] = (double)filter.covariance[row][column];\n"
+    definite = "is_definite(own)"
+    if made.is_root:  # whose covariance is a square: it is definite where the factor has all its pivots
+        factor = (
+            "            REAL covariance[NAME_TANGENT][NAME_TANGENT];\n"
+            "            int has_pivots = 1;\n"
+            "            NAME_covariance(&filter, covariance);\n"
+            "            for (int i = 0; i < NAME_TANGENT; i++)\n"
+            "                has_pivots = has_pivots && filter.factor[i][i] > 0.0_S;\n"
+        )
+        kept, definite = "", "has_pivots"
     return filled(
         made,
         """/* Runs the filter over a recorded log; prints where it is furthest from fuselog's own, in
@@ -187,7 +202,7 @@ unsigned long INSTRUCTIONS(void);
 #endif
 
 static double furthest = 0.0;
-static int furthest_event = -1;
+static int furthest_event = -1, lost_event = -1;
 
 static void compare(int event, REAL found, double expected)
 {
@@ -197,6 +212,31 @@ static void compare(int event, REAL found, double expected)
         furthest = isnan(away) ? INFINITY : away;
         furthest_event = event;
     }
+}
+
+/* Whether a covariance, which is used up, is positive definite: whether it has a Cholesky factor. */
+static int is_definite(double A[NAME_TANGENT][NAME_TANGENT])
+{
+    for (int column = 0; column < NAME_TANGENT; column++)
+        for (int row = column; row < NAME_TANGENT; row++) {
+            for (int k = 0; k < column; k++)
+                A[row][column] -= A[row][k] * A[column][k];
+            if (row > column)
+                A[row][column] /= A[column][column];
+            else if (!(A[row][row] > 0.0))
+                return 0;
+            else
+                A[row][row] = sqrt(A[row][row]);
+        }
+    return 1;
+}
+
+/* Says from when on the covariance, which fuselog's own filter has, is none any more. */
+static int lost(int event)
+{
+    printf("event %d, after %.3f s: the covariance is no longer positive definite\\n", event,
+           (double)(event_time_ns[event] - start_ns) * 1e-9);
+    return 1;
 }
 
 int main(int argc, char **argv)
@@ -209,14 +249,13 @@ int main(int argc, char **argv)
     NAME_init(&filter, start_ns, prior_mean, prior_covariance);
     for (int event = 0; event < VECTORS_EVENTS; event++) {
         const REAL *data = event_data[event];
-        int outcome = NAME_WELL;
+        int outcome;
         if (event_time_ns[event] < filter.time_ns)
             continue;
         const unsigned long begin = INSTRUCTIONS();
-        if (PREDICT != NAME_WELL) {
-            printf("event %d: the covariance is no longer positive definite\\n", event);
-            return 1;
-        }
+        outcome = PREDICT;
+GAP        if (outcome != NAME_WELL)
+            return lost(event);
         switch (event_source[event]) {
 CASES        }
         const unsigned long step = INSTRUCTIONS() - begin;
@@ -224,26 +263,37 @@ CASES        }
         most = step > most ? step : most;
         messages++;
         updates += event_source[event] >= 0;
-        if (outcome == NAME_NOT_POSITIVE_DEFINITE) {
-            printf("event %d: the covariance is no longer positive definite\\n", event);
-            return 1;
-        }
+        if (outcome == NAME_NOT_POSITIVE_DEFINITE)
+            return lost(event);
         if (event_estimate[event] >= 0) {
             estimates++;
             for (int i = 0; i < NAME_STATES; i++)
                 compare(event, filter.mean[i], expected_mean[event_estimate[event]][i]);
-            for (int row = 0; row < NAME_TANGENT; row++)
-                for (int column = 0; column < NAME_TANGENT; column++)
-                    compare(event, filter.covariance[row][column],
-                            expected_covariance[event_estimate[event]][row * NAME_TANGENT + column]);
+            double fuselogs[NAME_TANGENT][NAME_TANGENT];
+COVARIANCE            for (int row = 0; row < NAME_TANGENT; row++)
+                for (int column = 0; column < NAME_TANGENT; column++) {
+KEPT                    fuselogs[row][column] =
+                        expected_covariance[event_estimate[event]][row * NAME_TANGENT + column];
+                    compare(event, ENTRY[row][column], fuselogs[row][column]);
+                }
+            if (lost_event < 0 && is_definite(fuselogs) && !WHETHER)
+                lost_event = event;
         }
     }
     (void)innovation;
     printf("%d updates, %d estimates: furthest %.3g, at event %d\\n", updates, estimates, furthest,
            furthest_event);
+    if (lost_event >= 0)
+        lost(lost_event);
     if (messages > 0 && most > 0)
         printf("%lu instructions for a message, at most %lu\\n", taken / (unsigned long)messages, most);
-    return furthest <= limit ? 0 : 1;
+    return furthest <= limit && lost_event < 0 ? 0 : 1;
 }
-""".replace("PREDICT", predict).replace("CASES", "".join(cases)),
+""".replace("GAP", gap)
+        .replace("COVARIANCE", factor)
+        .replace("KEPT", kept)
+        .replace("WHETHER", definite)
+        .replace("ENTRY", "covariance" if made.is_root else "filter.covariance")
+        .replace("PREDICT", predict)
+        .replace("CASES", "".join(cases)),
     )

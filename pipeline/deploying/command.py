@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.deploying.certificate import CERTIFICATE
 from pipeline.deploying.deploying import deploy
+from pipeline.deploying.folder import lost_sentence
 from pipeline.output.terminal import print_json, say
 from pipeline.runs.settings import settings_of_estimators
 
@@ -24,8 +25,12 @@ def deploy_filter(
     """Write a filter into a folder, and say what is in it, or with `as_json` its certificate."""
     chosen = settings_of_estimators([name], settings, settings_file, model=model)
     folder = deploy(log, chosen, out, single=single)
+    certificate = json.loads((folder / CERTIFICATE).read_text(encoding="utf-8"))
     if as_json:
-        print_json(json.loads((folder / CERTIFICATE).read_text(encoding="utf-8")))
+        print_json(certificate)
         return
     say(f"{folder}: {', '.join(sorted(each.name for each in folder.iterdir()))}")
     say(f"{folder / 'README.md'} says how to build, test and replay it")
+    cost = certificate["single"]
+    if cost and cost["lost_event"] is not None:
+        say(lost_sentence(cost, is_root=certificate["is_root"]))

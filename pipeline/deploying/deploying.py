@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.api.planning import Named, settings_of
 from pipeline.api.planning import open as open_source
-from pipeline.api.planning import settings_of
 from pipeline.checking.checking import Runs
 from pipeline.checking.stored import Golden
 from pipeline.deploying.c_replay import replay_text, why_no_replay
@@ -23,17 +23,25 @@ from replay.engine.replaying.estimator import Recursive, bind, configure
 from replay.foreign.filters import description_of_library
 from replay.foreign.naming import shorthand
 from replay.foreign.native.library import HEADER
-from replay.inference.kalman.methods import FILTERS
+from replay.inference.kalman.methods import FILTERS, filter_with
 from replay.inference.run.filtering import Filter
 from replay.inference.whole_steps import EXTENDED, ITERATED, SAMPLED, whole_steps
 from replay.tracing.c_text import DOUBLE, SINGLE, Precision
 
-KINDS = {"ekf": EXTENDED, "iekf": ITERATED, "ukf": SAMPLED}
+# by what makes a method's steps
+KINDS = {
+    FILTERS["ekf"].steps: EXTENDED,
+    FILTERS["iekf"].steps: ITERATED,
+    FILTERS["ukf"].steps: SAMPLED,
+    filter_with("sqrt", "ekf").steps: EXTENDED,
+    filter_with("sqrt", "ukf").steps: SAMPLED,
+}
+DEPLOYABLE = "ekf, iekf, ukf, lrkf:SAMPLING, sqrt:ekf or sqrt:ukf"
 
 
 def deploy(
     log: str | Path,
-    estimator: str | Mapping[str, Any],
+    estimator: Named,
     out: str | Path,
     /,
     *,
@@ -48,7 +56,8 @@ def deploy(
     Args:
         log: a log that the filter fits: its sensors are those of the C, its channels state what is not
             given, and its first messages are the test.
-        estimator: `ekf`, `iekf` or `ukf`, or a table of settings by its label.
+        estimator: `ekf`, `iekf`, `ukf`, `lrkf:SAMPLING`, `sqrt:ekf` or `sqrt:ukf`, what `modelled` makes
+            of a model of your own and one of these, or a table of settings by its label.
         out: the folder to write, which must not be there or be empty; its name is the filter's in C.
         single: use single precision, `float`.
         parameters: of the estimator, such as `model="robot"`.
@@ -68,19 +77,18 @@ def deploy(
     precision = SINGLE if single else DOUBLE
     bound, made = _made(name, label, {**settings, **parameters}, run, precision)
     vectors = vectors_of(run, bound, made.filtering)
-    own_header, own_source = header(made), source(made)
-    certificate = certificate_of(made, own_source, own_header)
     files = {
-        f"{made.name}.h": own_header,
-        f"{made.name}.c": own_source,
+        f"{made.name}.h": header(made),
+        f"{made.name}.c": source(made),
         f"test_{made.name}.c": test_text(made),
         "vectors.h": vectors_text(made, vectors),
         "cortex_m4f.c": STARTING,
         "cortex_m4f.ld": LINKED,
         "CMakeLists.txt": cmake_text(made),
-        "README.md": readme_text(made, Path(log).name, certificate),
-        CERTIFICATE: certificate_text(made, certificate),
     }
+    certificate = certificate_of(made, files)
+    files["README.md"] = readme_text(made, Path(log).name, certificate)
+    files[CERTIFICATE] = certificate_text(made, certificate)
     if not why_no_replay(made):
         files[f"{made.name}_replay.c"] = replay_text(made)
         files["fuselog_filter.h"] = HEADER.read_text(encoding="utf-8")
@@ -117,7 +125,7 @@ def in_place_of_golden(name: str, runs: Runs, golden: Golden) -> Settings:
     found = description_of_library(label, program).digest if program["kind"] == "lib" else ""
     for run in runs.values() if found else ():
         _, made = _made("filter", label, settings, run, DOUBLE)
-        if made.digest != found:
+        if found not in (made.digest, made._replace(precision=SINGLE).digest):
             raise BadInput(
                 f"{program['path']}: was deployed from another filter ({found}) than the golden's "
                 f"{label} is in {run.name} ({made.digest}); deploy that one, with the same settings"
@@ -142,20 +150,17 @@ def _check_empty(folder: Path) -> None:
 def _bound(label: str, settings: dict[str, Any], run: Any) -> tuple[Recursive, Filter, str]:
     """Bind the filter; raises BadInput where it is none that can be written."""
     configure(label, settings)
-    name = str(settings.get("kind", label))
+    kind = settings.get("kind", label)
+    name = kind if isinstance(kind, str) else label
     found = bind(label, [run], settings)
     [first, *others] = found
     filtering = getattr(getattr(first, "run", None), "__self__", None)
     if not isinstance(first, Recursive) or type(filtering) is not Filter:
-        raise BadInput(
-            f"estimator {label}: is no filter that can be written as C; give -e ekf, iekf or ukf"
-        )
-    kind = next((KINDS[each] for each in KINDS if filtering.method is FILTERS[each]), None)
-    if kind is None:
-        raise BadInput(
-            f"estimator {label}: {name} cannot be written as C yet; give -e ekf or iekf, or ukf for a "
-            "state without angles"
-        )
+        raise BadInput(f"estimator {label}: is no filter that can be written as C; give -e {DEPLOYABLE}")
+    kind = KINDS.get(filtering.method.steps)
+    if kind is None or filtering.is_random:
+        why = "draws its samples anew for every step" if kind else "cannot be written as C"
+        raise BadInput(f"estimator {label}: {name} {why}; give -e {DEPLOYABLE}")
     if others:
         several = ", ".join(each.name for each in found)
         raise BadInput(

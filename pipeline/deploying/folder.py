@@ -1,11 +1,17 @@
 """What stands beside a filter in C: how to build it, and what it is."""
 
+from collections.abc import Mapping
+from textwrap import fill
+from typing import Any
+
 from pipeline.deploying.c_replay import why_no_replay
 from pipeline.deploying.c_source.header import data_of
 from pipeline.deploying.c_source.names import CFilter
 from pipeline.deploying.c_target import target_lines
-from pipeline.deploying.certificate import OPTIONS, Certificate, Cost
+from pipeline.deploying.certificate import OPTIONS, Certificate
+from pipeline.deploying.costs import Cost
 from replay.inference.kalman.iterated_update import ITERATIONS
+from replay.inference.kalman.regression import MEANS
 
 
 def cmake_text(made: CFilter) -> str:
@@ -48,13 +54,16 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
         else f"{memory.compiler}, {' '.join(OPTIONS)}: {memory.text} bytes of code and\nconstants, "
         f"and {memory.stack} bytes of stack in the deepest chain of calls, without those of libm's own."
     )
+    of = "F L and H L of the\nfactor L" if made.is_root else "F P F', P H' and\nH P H'"
     saved = (
-        f" Of the products F P F', P H' and\nH P H', {certificate.sparse} flops are left of "
+        f" Of the products {of}, {certificate.sparse} flops are left of "
         f"{certificate.dense}: the others have known zeros and ones."
         if certificate.dense
         else ""
     )
     iterated = f", and all {ITERATIONS} iterates of an update" if made.steps.is_iterated else ""
+    bent = any(each is not None and each.recentre is not None for each in made.steps.sampled)
+    iterated += f",\nand all {MEANS} rounds to a mean of angles or orientations" if bent else ""
     return f"""| function | flops | square roots | other calls of libm |
 |---|---|---|---|
 {table}
@@ -62,6 +71,39 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
 At most: both sides of every condition count{iterated}.{saved}
 
 {bytes_said}"""
+
+
+def _single(made: CFilter, certificate: Certificate, log: str) -> str:
+    """Write what single precision costs."""
+    if not made.precision.ending:
+        return ""
+    single = certificate.single
+    if single is None:
+        told = f"No GCC was there to run the test; `test_{made.name}` says what it costs."
+    elif single.lost_event is not None:
+        lost = lost_sentence(single._asdict(), is_root=made.is_root)
+        told = f"{lost[0].upper()}{lost[1:]}."
+    else:
+        told = (
+            f"Over the first {single.estimates} estimates of {log} means and covariances are within "
+            f"{single.furthest:.1g} of those in double precision, in units of the state or, of larger "
+            "numbers, as a share of them."
+        )
+    more = (
+        "What the libraries of both precisions differ in over whole logs, with intervals, "
+        "`fuselog compare LOG ... -e lib:A.so -e lib:B.so` tells."
+    )
+    text = fill(f"{told} {more}", 100, break_on_hyphens=False, break_long_words=False)
+    return f"\n## What single precision costs\n\n{text}\n"
+
+
+def lost_sentence(single: Mapping[str, Any], *, is_root: bool) -> str:
+    """Say from when on single precision has no covariance any more, and what to take."""
+    mend = "" if is_root else "; take the square-root form, sqrt:ekf or sqrt:ukf"
+    return (
+        f"from event {single['lost_event']} of the test on, after {single['lost_s']:g} s, the "
+        f"covariance in single precision is no longer positive definite, where that in double is{mend}"
+    )
 
 
 def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
@@ -72,6 +114,11 @@ def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
         f"| `{name}_update_{each}` | {sensor.topic} | {', '.join(data_of(sensor))} |"
         for each, sensor in made.sensors
     ]
+    gap = (
+        f" In a gap of\nwhat drives it the prediction returns `{upper}_NOT_DRIVEN`."
+        if made.has_gaps
+        else ""
+    )
     why_not = why_no_replay(made)
     back = (
         f"fuselog cannot replay it: {why_not}."
@@ -80,7 +127,7 @@ def readme_text(made: CFilter, log: str, certificate: Certificate) -> str:
 
 ```
 cc -std=c99 -O2 -ffp-contract=off -shared -fPIC {name}_replay.c {name}.c -lm -o {name}.so
-fuselog replay {log} -e lib:./{name}.so
+fuselog replay PATH/{log} -e lib:./{name}.so
 ```"""
     )
     return f"""# {name}
@@ -101,8 +148,9 @@ C99 and libm: no heap, no recursion, no arrays of varying length. The filter is 
 {chr(10).join(updates)}
 
 An update is at the filter's time, so predict to a message's stamp first. They return `{upper}_WELL`,
-`{upper}_NOTHING_MEASURED`, or `{upper}_NOT_POSITIVE_DEFINITE`: then start again. Angles of the state
-are not wrapped. The numbers that it was tuned with are in `{name}_as_tuned`; copy it to change them.
+`{upper}_NOTHING_MEASURED`, or `{upper}_NOT_POSITIVE_DEFINITE`: then start again.{gap}
+Angles of the state are not wrapped. The numbers that it was tuned with are in `{name}_as_tuned`; copy
+it to change them.
 
 ## Test
 
@@ -126,4 +174,4 @@ takes as well. QEMU knows no cycles.
 ## What it costs
 
 {_costs(made, certificate)}
-"""
+{_single(made, certificate, log)}"""

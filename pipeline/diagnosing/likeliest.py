@@ -11,7 +11,7 @@ from pipeline.diagnosing.sentences import Sentence
 from pipeline.output.alarms import Cause
 from pipeline.output.report.evidence import findings
 from pipeline.output.results import RUNS, Result, read_table
-from pipeline.output.words import count, number, quantity, scale
+from pipeline.output.words import count, meaning_alone, number, quantity, scale
 from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
 
@@ -29,11 +29,7 @@ def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
     settings = result.settings.get("estimators") or {}
     causes = []
     for label, evidence in found.of.items():
-        if (
-            not logs
-            or label not in settings
-            or evidence.state(found.runs) not in ("too sure", "too careful")
-        ):
+        if not logs or label not in settings or evidence.state not in ("too sure", "too careful"):
             continue
         own = {"kind": label, **settings[label]}
         gap_limit_s = float(result.settings.get("gap_limit_s", 0.2))
@@ -60,7 +56,7 @@ def _cause(label: str, sentence: Sentence, mended: str) -> Cause:
     setting = sentence.setting
     if setting and not setting.startswith("/"):
         setting = f"{label}.{setting}"
-    short = words.partition(";")[0].partition(", so that")[0]
+    short = meaning_alone(words.partition(";")[0].partition(", so that")[0])
     return Cause(label, f"{words}.", short, setting, mended)
 
 

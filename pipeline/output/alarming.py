@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.output.alarms import Alarm
 from replay.distributions import chi2
 from replay.engine.replaying.usage import SILENT, UNTAKEN, Row
+from replay.judging.consistency.conditioning import LOST
 from replay.judging.consistency.consistency import CONSISTENT
 from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
@@ -38,6 +39,7 @@ def alarms_of(
         *_of_innovations(judge, parameters),
         *_of_errors(judge),
         *_of_costs(judge),
+        *_of_digits(judge),
         *_of_measurements(coverage),
     ]
     return [*sorted(found, key=lambda each: -each.excess), *_of_gates(judge, parameters)]
@@ -133,6 +135,30 @@ def _of_costs(judge: Judge) -> Iterator[Alarm]:
                 "not the least one; compare other starts, such as --set start=motion"
             )
             yield Alarm("minimum", estimator, case, cost / high, words)
+
+
+def _of_digits(judge: Judge) -> Iterator[Alarm]:
+    """Covariances, of estimates or of innovations, of which rounding has left next to nothing."""
+    for topic, found in judge.conditioning.items():
+        if not found.lost:
+            continue
+        estimator, case = split_topic(topic)
+        whose = "innovation's covariance" if topic.endswith("/innovation") else "covariance"
+        when = f"at {found.elapsed_s:.1f} s" + (f" of run {found.run}" if judge.runs > 1 else "")
+        words = f"{_name(estimator, case)}: the {whose} "
+        if found.failed:
+            words += (
+                f"is not positive definite in {found.failed} of {found.sampled} samples, worst {when}"
+            )
+        else:
+            words += (
+                f"has lost its digits in {found.lost} of {found.sampled} samples: {when} a pivot of "
+                f"its Cholesky factor is {max(found.least, 0.0):.2g} of a variance, where {LOST:g} "
+                "leaves four digits"
+            )
+        words += "; give a prior that is surer, or noise to what is known too well, or try sqrt:ekf"
+        share = found.lost / found.sampled
+        yield Alarm("digits", estimator, case, 1.0 + share / RARE, words)
 
 
 def _of_measurements(coverage: Sequence[Row]) -> Iterator[Alarm]:

@@ -1,12 +1,13 @@
-"""Defines what makes a replay's numbers doubtful, and why: alarms and their likeliest causes.
+"""Defines what makes a replay's numbers doubtful, and why: alarms, causes, verdicts of stress.
 
-`pipeline.output.alarming` finds the alarms, `fuselog run --diagnose` the causes.
+`pipeline.output.alarming` finds alarms, `fuselog run --diagnose` causes, and `--stress` its verdicts.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
-Kind = Literal["innovations", "errors", "origin", "lever arm", "minimum", "unused", "gates"]
+Kind = Literal["innovations", "errors", "origin", "lever arm", "minimum", "digits", "unused", "gates"]
 
 
 @dataclass(frozen=True)
@@ -44,3 +45,25 @@ class Cause:
     short: str
     setting: str = ""
     mended: str = ""
+
+
+Verdict = Literal["harmless", "sensitive", "discontinuous or chaotic", "not tried"]
+NOT_TESTED = "not stress-tested: --stress says whether changes that should not matter change a verdict"
+
+
+@dataclass(frozen=True)
+class Stressing:
+    """What changes that should not matter do to an estimator, over all runs.
+
+    Attributes:
+        estimator: whose.
+        verdict: the worst that more than one of a hundred runs have.
+        words: the verdict with its numbers, then what explains it.
+        moved: how far a change moves the mean of a metric over the runs at most, by `quantity.case`, and
+            by `quantity` over all cases.
+    """
+
+    estimator: str
+    verdict: Verdict
+    words: list[str]
+    moved: Mapping[str, float] = field(default_factory=dict)

@@ -6,6 +6,7 @@ as JSON, beside the SVG picture that is drawn of it here; the report draws it fo
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 # A person sees no more points of a line than these.
 MOST_POINTS = 1000
+LINE_LETTERS = 100  # of a picture's title
 # Each stands out from white and from black, by 3 to 1 at least (WCAG 2.2, 1.4.11), and from the others.
 COLOURS = (
     *("#2f7fd1", "#d2640a", "#2a9147", "#d8433b", "#9461d6"),
@@ -188,14 +190,15 @@ def draw(chart: Chart) -> "Figure":
     from matplotlib.figure import Figure
 
     rows = -(-len(chart.panels) // chart.columns)
-    height_in = 4.5 if any(panel.plane for panel in chart.panels) else 2.8
+    height_in = max(map(_height_in, chart.panels), default=2.8)
     size_in = (max(8.0, min(3.4 * chart.columns, 12.0)), height_in * rows + 0.5)
     figure = Figure(figsize=size_in, layout="constrained")
     colours = chart.colours()
     for place, panel in enumerate(chart.panels):
         _draw_panel(figure.add_subplot(rows, chart.columns, place + 1), panel, colours)
     if chart.title:
-        figure.suptitle(chart.title, fontsize=10, parse_math=False)
+        title = fill(chart.title, LINE_LETTERS)
+        figure.suptitle(title, fontsize=10, parse_math=False)
     handles: dict[str, Any] = {}
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -206,6 +209,14 @@ def draw(chart: Chart) -> "Figure":
             handles.values(), handles.keys(), loc="outside lower center", ncols=columns, fontsize=8
         )
     return figure
+
+
+def _height_in(panel: Panel) -> float:
+    """How high a panel is: of a plane with limits as high as these ask for."""
+    if panel.plane and panel.x.limits and panel.y.limits:
+        wide, high = panel.x.limits[1] - panel.x.limits[0], panel.y.limits[1] - panel.y.limits[0]
+        return min(4.5, 7.0 * high / wide + 0.9)
+    return 4.5 if panel.plane else 2.8
 
 
 STYLES: dict[Style, dict[str, Any]] = {
@@ -238,7 +249,7 @@ def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
         if of.limits:
             axes.set(**{f"{name}lim": of.limits})
     if panel.plane:
-        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_aspect("equal", adjustable="box" if panel.x.limits and panel.y.limits else "datalim")
 
 
 def _known(values: Places) -> list[Any]:

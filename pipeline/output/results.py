@@ -8,15 +8,17 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from urllib.parse import quote
 
+from pydantic import SerializerFunctionWrapHandler, model_serializer
+
 from pipeline.output import RESULT_FILE as RESULT_FILE
-from pipeline.output.alarms import Alarm, Cause
+from pipeline.output.alarms import Alarm, Cause, Stressing
 from pipeline.output.charts import Chart, draw, show_names_as_they_are
 from pipeline.output.claims import Claim, known
 from recorders.atomic import whole_file, whole_folder
@@ -28,14 +30,10 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from replay.judging.errors.evaluation import Errors
-
 # Longer tables are no reading matter: they are Parquet alone.
 CSV_ROWS = 20_000
 # Raised when result.json changes in a way that its readers must know; one without it is of the first.
 FORMAT = 1
-# Where every single error is, in a result's folder.
-ERRORS = Path("tables", "errors")
 # The table of runs, in a result's folder.
 RUNS = Path("tables", "runs.parquet")
 # What estimators cost, which no two runs have alike: beside result.json, and without a hash in it.
@@ -52,7 +50,8 @@ class Outcome:
     95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
     a hash of the data that went in, `parameters` are those of all estimators, defaults included,
     `alarms` what makes the metrics doubtful, `causes` why an estimator is inconsistent, where it was
-    diagnosed, `timings` the seconds and messages of each estimator.
+    diagnosed, `stress` what changes do that should not matter, where it was stressed, `timings` the
+    seconds and messages of each estimator.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -65,6 +64,7 @@ class Outcome:
     intervals: dict[str, Bounds] = field(default_factory=dict)
     alarms: list[Alarm] = field(default_factory=list)
     causes: list[Cause] = field(default_factory=list)
+    stress: list[Stressing] = field(default_factory=list)
     timings: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
@@ -79,7 +79,8 @@ class Result(Parameters):
     without it. What depends on the clock has none: a timeline, whose rows Rerun numbers by it, and
     `TIMINGS`. `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one
     lies with 95 %; `alarms` are what makes the metrics doubtful, the worst first; `causes` why
-    estimators are inconsistent, by a diagnosis.
+    estimators are inconsistent, by a diagnosis; `stress` what changes do that should not matter, where
+    that was asked for: else its text has none.
     """
 
     format: int = FORMAT
@@ -94,6 +95,12 @@ class Result(Parameters):
     intervals: dict[str, tuple[float | None, float | None]] = {}
     alarms: list[Alarm] = []
     causes: list[Cause] = []
+    stress: list[Stressing] = []
+
+    @model_serializer(mode="wrap")
+    def _as_it_is_written(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        written: dict[str, Any] = write(self)
+        return {name: value for name, value in written.items() if value or name != "stress"}
 
     @property
     def contents(self) -> list[str]:
@@ -258,53 +265,6 @@ def hash_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-class ErrorTables:
-    """Every error of every estimate, on request: a Parquet file per estimator and case.
-
-    They are written block by block, as they come; use it as a context.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder / ERRORS
-        self._stack = ExitStack()
-        self._writers: dict[tuple[str, str], Any] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: Any) -> None:
-        self._stack.close()
-
-    def add(self, errors: "Errors") -> None:
-        """Write a block; see `error_table`."""
-        import pyarrow
-        import pyarrow.parquet
-
-        from replay.judging.tables import error_table
-
-        table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
-        what = errors.estimator, errors.case
-        if what not in self._writers:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            path = self._folder / f"{quote('-'.join(filter(None, what)), safe=' ')}.parquet"
-            file = self._stack.enter_context(path.open("wb"))
-            writer = pyarrow.parquet.ParquetWriter(file, table.schema)
-            self._writers[what] = self._stack.enter_context(writer)
-        if len(table):
-            self._writers[what].write_table(table)
-
-
-def join_tables(parts: Sequence[Path], place: Path) -> None:
-    """Write one Parquet file of the rows of several, in their order."""
-    import pyarrow.parquet
-
-    files = [pyarrow.parquet.ParquetFile(part) for part in parts]
-    with pyarrow.parquet.ParquetWriter(place, files[0].schema_arrow) as writer:
-        for file in files:
-            for group in range(file.num_row_groups):
-                writer.write_table(file.read_row_group(group))
-
-
 def write_outcome(
     folder: Path, experiment: str, settings: Mapping[str, Any], outcome: Outcome
 ) -> Result:
@@ -352,6 +312,7 @@ def write_outcome(
             claims=[known(claim) for claim in outcome.claims],
             alarms=outcome.alarms,
             causes=outcome.causes,
+            stress=outcome.stress,
             files={
                 path.relative_to(folder).as_posix(): None if _is_by_clock(path) else hash_of(path)
                 for path in written
@@ -362,9 +323,9 @@ def write_outcome(
     return result
 
 
-def keep_causes(folder: Path, result: Result, causes: Sequence[Cause]) -> Result:
-    """Write the causes that a diagnosis found into a result's folder."""
-    told = _sealed(result.model_copy(update={"causes": [*causes]}))
+def keep(folder: Path, result: Result, **found: Sequence[Cause] | Sequence[Stressing]) -> Result:
+    """Write what was found afterwards, `causes` or `stress`, into a result's folder."""
+    told = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
     with whole_file(folder / RESULT_FILE) as new:
         new.write_text(_text(told), encoding="utf-8")
     return told

@@ -118,7 +118,7 @@ def error_chart(judged: list[tuple[Errors, pd.DataFrame]], case: str) -> Chart:
         panel.series.extend(_outside(steps, "nees", steps["nees_low"], steps["nees_high"], nees_axis))
         nees.append(panel)
     runs = int(table["runs"].max())
-    what = f"{case or 'errors'}, {runs} {'run' if runs == 1 else 'runs'}"
+    what = f"{case or 'errors'}, {'1 run' if runs == 1 else f'over all {runs} runs together'}"
     panels = [*rmse, *nees]
     title = f"{what}; tinted: where 95 % lie if the estimator's covariance is right"
     return Chart(title=title, panels=panels, columns=max(1, min(len(rmse), MOST_COLUMNS)), legend=False)

@@ -136,7 +136,17 @@ def label_of(key: str) -> str:
 
 def is_error(key: str) -> bool:
     """Whether less of a quantity is better, so that estimators may be compared by it."""
-    return any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
+    is_less_better = any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
+    return is_less_better and not key.startswith("standard_error")  # which says how sure a number is
+
+
+def meaning_alone(text: str) -> str:
+    """A sentence that begins with a parameter's name, with what that means in its place.
+
+    >>> meaning_alone("sigma_range_m (standard deviation of a range) is too small")
+    'the standard deviation of a range is too small'
+    """
+    return re.sub(r"^[\w.]+ \(([^()]+)\)", r"the \1", text)
 
 
 class Scale(NamedTuple):

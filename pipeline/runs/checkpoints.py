@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 
 from filelock import FileLock, Timeout
 
-from pipeline.output.results import ERRORS, hash_of, join_tables
+from pipeline.output.results import hash_of
+from pipeline.runs.estimates import ERRORS, join_tables
 from recorders.atomic import parents_of, settled
 from recorders.errors import BadInput
 from replay.engine.compiling.cache import is_own, read_own, write_checked

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pipeline.altering.sources import note_of
 from pipeline.output.coverage import added, replayed_note, rows_of, untaken
 from pipeline.runs.initial_states import Origin, start_from
+from pipeline.runs.settings import meanings_of
 from recorders.errors import BadInput
 from recorders.log import Clock, Companions, LogWriter, RunMetadata
 from replay.engine.replaying.estimator import Bound, bind
@@ -96,6 +97,7 @@ class Pass:
         seconds: that each estimator took, by label.
         refused: by estimator, why none of the runs can be replayed.
         input_sha256: a hash of the data that went in, where it was asked for.
+        meanings: of the parameters, in a few words, by label and name.
     """
 
     judge: Judge
@@ -106,6 +108,7 @@ class Pass:
     stated: dict[str, dict[str, str]] = field(default_factory=dict)
     usages: dict[str, Usage] = field(default_factory=dict)
     untaken: list[Row] = field(default_factory=list)
+    meanings: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @property
     def coverage(self) -> list[Row]:
@@ -232,6 +235,7 @@ def replay_parts(
         judge.close()
         done = Pass(judge, parameters_of(bound), dict(report.seconds), report.refused)
         done.stated = stated_of(bound, part.sources[0])
+        done.meanings = meanings_of(bound)
         done.usages = report.usages
         done.untaken = untaken(part.sources, estimators, bound, order)
         if passes:

@@ -1,9 +1,14 @@
-"""States of an estimates log which log and estimators it is of, and hashes what a replay was given."""
+"""States of an estimates log which log and estimators it is of, and hashes what a replay was given.
+
+Every error of estimates goes to tables from here, where it is asked for.
+"""
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
+from urllib.parse import quote
 
 import numpy as np
 
@@ -12,7 +17,10 @@ from recorders.errors import BadInput
 from recorders.log import Log, open_log
 from recorders.parsing import parse_json
 from replay.engine.streams.sources import LogSource, MemorySource, Source
-from replay.judging.errors.evaluation import split_topic
+from replay.judging.errors.evaluation import Errors, split_topic
+
+# Where every single error is, in a result's folder.
+ERRORS = Path("tables", "errors")
 
 
 def log_of_estimates(estimates: Log) -> Path:
@@ -97,3 +105,50 @@ def hash_files(paths: Sequence[Path]) -> str:
         with path.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
+
+
+class ErrorTables:
+    """Every error of every estimate, on request: a Parquet file per estimator and case.
+
+    They are written block by block, as they come; use it as a context.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / ERRORS
+        self._stack = ExitStack()
+        self._writers: dict[tuple[str, str], Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> None:
+        self._stack.close()
+
+    def add(self, errors: Errors) -> None:
+        """Write a block; see `error_table`."""
+        import pyarrow
+        import pyarrow.parquet
+
+        from replay.judging.tables import error_table
+
+        table = pyarrow.Table.from_pandas(error_table(errors), preserve_index=False)
+        what = errors.estimator, errors.case
+        if what not in self._writers:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            path = self._folder / f"{quote('-'.join(filter(None, what)), safe=' ')}.parquet"
+            file = self._stack.enter_context(path.open("wb"))
+            writer = pyarrow.parquet.ParquetWriter(file, table.schema)
+            self._writers[what] = self._stack.enter_context(writer)
+        if len(table):
+            self._writers[what].write_table(table)
+
+
+def join_tables(parts: Sequence[Path], place: Path) -> None:
+    """Write one Parquet file of the rows of several, in their order."""
+    import pyarrow.parquet
+
+    files = [pyarrow.parquet.ParquetFile(part) for part in parts]
+    with pyarrow.parquet.ParquetWriter(place, files[0].schema_arrow) as writer:
+        for file in files:
+            for group in range(file.num_row_groups):
+                writer.write_table(file.read_row_group(group))

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.altering.sources import alter
-from pipeline.output.results import ErrorTables
 from pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
-from pipeline.runs.estimates import hash_files, hash_streams
+from pipeline.runs.estimates import ErrorTables, hash_files, hash_streams
 from pipeline.runs.experiment import Experiment, Setting
 from pipeline.runs.initial_states import order_of
 from pipeline.runs.inputs import load_scenario

@@ -7,9 +7,9 @@ from typing import Any
 
 from pipeline.altering.changes import is_of_topic
 from recorders.errors import BadInput, choices
-from recorders.parameters import merge, parse_settings
+from recorders.parameters import in_few_words, meanings, merge, parse_settings
 from recorders.parsing import read_toml
-from replay.engine.replaying.estimator import specified
+from replay.engine.replaying.estimator import Bound, specified
 from replay.foreign.naming import allowed, of_file, refuse_programs, shorthand, without_named
 
 Settings = Mapping[str, Mapping[str, Any]]
@@ -121,3 +121,12 @@ def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
         if not 0 < sigmas[name] < math.inf:
             raise BadInput(f"{option} {text}: expected COMPONENT=SIGMA with a positive number")
     return sigmas
+
+
+def meanings_of(bound: Sequence[Bound]) -> dict[str, dict[str, str]]:
+    """What the parameters of estimators mean, in a few words, by label and name."""
+    kinds = {each.name.partition("/")[0]: type(each.parameters) for each in bound if each.parameters}
+    return {
+        label: {name: in_few_words(meaning) for name, meaning in meanings(kind).items()}
+        for label, kind in kinds.items()
+    }

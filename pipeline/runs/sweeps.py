@@ -19,14 +19,17 @@ from pipeline.output.results import (
     split_metric,
     write_outcome,
 )
-from pipeline.output.words import label_of
+from pipeline.output.words import is_error, label_of
 from pipeline.runs.campaigns import judge_all
 from pipeline.runs.checkpoints import checkpoints_of
-from pipeline.runs.ensemble import Progress, no_progress
+from pipeline.runs.ensemble import Pass, Progress, no_progress
 from pipeline.runs.executors import PoolFactory
 from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.inputs import load_scenario
 from recorders.errors import BadInput
-from recorders.parameters import merge, parse_settings
+from recorders.parameters import describe, in_few_words, merge, parse_settings, unit_of
+from recorders.recording import Recorder
+from recorders.registry import load
 from replay.engine.replaying.estimator import configure
 from replay.judging.judge import Judge
 from replay.judging.metrics.measuring import metric_key
@@ -51,12 +54,20 @@ class Over(NamedTuple):
         taken: the values that it takes on a grid.
         ends: of a range, from which samples are drawn too; None of a list.
         is_log: whether the range is even in the logarithm.
+        name: what it means, in a few words, where that is known.
     """
 
     key: str
     taken: tuple[Any, ...]
     ends: tuple[float, float] | None = None
     is_log: bool = False
+    name: str = ""
+
+    @property
+    def label(self) -> str:
+        """What an axis says."""
+        unit = unit_of(self.key)
+        return f"{self.name}{f' ({unit})' if unit else ''}" if self.name else self.key
 
 
 def parse_over(text: str) -> Over:
@@ -196,16 +207,19 @@ def run_sweep(
             checkpoints=checkpoints,
         )
         outcome = Outcome()
-        tables = []
+        tables, errors = [], []
         for number, done in enumerate(judge_all(experiments, setting)):
             tables.append(point_table(number, points[number], done.judge))
+            errors.append(errors_of_runs(number, done.judge))
             outcome.parameters = outcome.parameters or done.parameters
         table = pd.concat(tables, ignore_index=True)
-        outcome.tables["sweep"] = table
+        outcome.tables |= {"sweep": table, "sweep-runs": pd.concat(errors, ignore_index=True)}
+        over = [each._replace(name=meaning_of(each.key, done, experiments[-1])) for each in over]
         outcome.metrics.update(metrics_of(table, len(points)))
         outcome.figures.update(figures_of(table, over))
         settings = experiments[0].model_dump(mode="json", by_alias=True, exclude_none=True)
         settings["sweep"] = [dict(point) for point in points]
+        settings["meanings"] = {each.key: each.name for each in over if each.name}
         return write_outcome(part, name, settings, outcome)
 
 
@@ -234,6 +248,28 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
         consistent = {"aim": aim, "bound_low": bound_low, "bound_high": bound_high}
         rows.append({"point": number, **point, **said, **told, **consistent})
     return pd.DataFrame(rows)
+
+
+def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
+    """The errors of every run at a point, by which points are compared run by run."""
+    runs = judge.runs_table
+    names = [name for name in ("estimator", "case", "run") if name in runs]
+    kept = runs[[*names, *(key for key in runs if is_error(str(key)))]].copy()
+    kept.insert(0, "point", number)
+    return kept
+
+
+def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
+    """What a parameter of an estimator or of the scenario means, in a few words; empty if unknown."""
+    for label, words in done.meanings.items():
+        name = key.removeprefix(f"{label}.")
+        if name in experiment.estimators.get(label, {}):
+            return words.get(name, "")
+    if experiment.record is None:
+        return ""
+    recorder = load_scenario(experiment.record.scenario)[0]
+    of_scenario = describe(load("recorders", recorder, Recorder).parameters)
+    return in_few_words(next((each.meaning for each in of_scenario if each.name == key), ""))
 
 
 def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
@@ -270,7 +306,7 @@ def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = 
         numbers = all(isinstance(value, int | float) for value in each.taken)
         few = numbers and len(each.taken) <= MOST_TICKS
         ticks = {float(value): f"{value:.3g}" for value in each.taken} if few else {}
-        x = Axis(label=each.key, log=each.is_log, ticks=ticks)
+        x = Axis(label=each.label, log=each.is_log, ticks=ticks)
         panel = Panel(x=x, y=Axis(label=label_of(quantity)))
         for label, own in rows.groupby("estimator", sort=False):
             means = own.groupby(each.key)[["value", "low", "high"]].mean()
@@ -306,6 +342,6 @@ def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
             shown = range(0, len(places), -(-len(places) // 9))
             axis.set_ticks(list(shown), [f"{places[index]:.3g}" for index in shown])
         axes.tick_params(axis="x", rotation=45)  # nine numbers side by side
-        axes.set(xlabel=x.key, ylabel=y.key, title=label)
+        axes.set(xlabel=x.label, ylabel=y.label, title=label)
     figure.colorbar(picture, ax=figure.axes, label=name)
     return figure

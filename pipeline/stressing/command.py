@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.output.outputs import check_outputs
 from pipeline.output.terminal import print_json, print_table, say, status
 from pipeline.runs.settings import settings_of_estimators, split_texts
 from pipeline.stressing.changes import CHANGES
@@ -33,11 +34,13 @@ def stress_logs(
     seed: int,
     recover: bool,
     gap_limit_s: float,
+    save: Path | None,
     as_json: bool,
     settings_file: Path | None,
     settings: Sequence[str],
 ) -> None:
     """Stress, and print the verdicts first, then a table for each run and estimator."""
+    check_outputs(None, save, {"log": [*logs, *filter(None, [settings_file])]})
     alterations, own = split_texts(settings)
     chosen = settings_of_estimators(labels, own, settings_file, model=model)
     with status() as show:
@@ -49,6 +52,8 @@ def stress_logs(
             gap_limit_s=gap_limit_s,
             set=alterations,
         )
+    if save is not None:
+        found.draw(save)
     if as_json:
         rows = found.table.replace({np.nan: None}).to_dict("records")
         print_json({"sentences": found.sentences, "changes": rows})
@@ -60,6 +65,8 @@ def stress_logs(
             [CHANGES[row["change"]].words, *(_shown(row[name]) for name in COLUMNS)] for row in each.rows
         ]
         print_table(["change", *COLUMNS.values()], shown, f"{each.estimator} of {each.run}")
+    if save is not None:
+        say(str(save))
 
 
 def _shown(value: object) -> object:

@@ -31,7 +31,7 @@ class Parting(NamedTuple):
         amplification: (n,) A.
         metres, degrees: (n,) of positions and of angles; NaN where the state has none.
         spread: how much the standard deviations differ at most, as a share of them.
-        explained: (n,) how large A may be where the other replay is the same filter with less data.
+        explained: (n,) how large A may be where the other replay had less data, else 0.
     """
 
     topic: str
@@ -59,16 +59,19 @@ class Parting(NamedTuple):
         return int(beyond[0]) if len(beyond) else None
 
 
-def partings(base: Mapping[str, Stream], copy: Mapping[str, Stream], within_ns: int) -> list[Parting]:
+def partings(
+    base: Mapping[str, Stream], copy: Mapping[str, Stream], within_ns: int, *, has_less: bool = False
+) -> list[Parting]:
     """Compare all estimates of two replays.
 
     Args:
         base: the estimates of the unchanged replay, by topic.
         copy: those of the other.
         within_ns: how much later the copy's estimate of a stamp may be, or how much earlier.
+        has_less: whether the other one had less data, so that chance moves it.
     """
     return [
-        _parting(stream, copy[topic], within_ns)
+        _parting(stream, copy[topic], within_ns, has_less)
         for topic, stream in base.items()
         if stream.schema.full_name == schemas.GAUSSIAN_ESTIMATE.full_name
         and len(stream)
@@ -77,7 +80,7 @@ def partings(base: Mapping[str, Stream], copy: Mapping[str, Stream], within_ns: 
     ]
 
 
-def _parting(base: Stream, copy: Stream, within_ns: int) -> Parting:
+def _parting(base: Stream, copy: Stream, within_ns: int, has_less: bool) -> Parting:
     stamps_ns = base.publish_time_ns
     row = np.searchsorted(copy.publish_time_ns, stamps_ns + within_ns, side="right") - 1
     both = (row >= 0) & (copy.publish_time_ns[np.maximum(row, 0)] >= stamps_ns - within_ns)
@@ -97,7 +100,7 @@ def _parting(base: Stream, copy: Stream, within_ns: int) -> Parting:
         _norm(apart, [name in AXES for name, _ in names]),
         np.degrees(_norm(apart, [kind in ("angle", "rotation") for _, kind in names])),
         float(np.max(np.nan_to_num(spread, posinf=0.0), initial=0.0)),
-        _explained(covariance, other),
+        _explained(covariance, other) if has_less else np.zeros(len(covariance)),
     )
 
 

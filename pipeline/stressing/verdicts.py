@@ -1,26 +1,31 @@
 """What changes that should not matter did to a result: harmless, sensitive, discontinuous or chaotic."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from pipeline.output.alarms import Verdict
+from pipeline.output.outputs import TIMELINE, check_files
 from pipeline.stressing.changes import CHANGES, DROPPED
 from pipeline.stressing.partings import Parting, Undetermined, undetermined
 from recorders.log import Stream
+from replay.engine.streams.blocks import gather
+from replay.engine.streams.sources import MemorySource
+from replay.judging.judge import Judge
 
-Verdict = Literal["harmless", "sensitive", "discontinuous or chaotic", "not tried"]
 ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous or chaotic")
 HARMLESS = 0.1  # A below this
 MARGIN = 0.02  # of the metric, as compare's
 HALVES = (1.9, 2.1)  # how many times less half of a change does, where it is in proportion
+SQUARED = 4.2  # where it goes by the change's square; what shrinks by more has jumped
 ONE_SIGMA = 1.0  # A of a change that has no half: beyond it the copies are two results
 PER_PREDICTION = 1e-4  # the share by which moved stamps change a sigma, from which on half is tried
 SHRINKS = 1.5  # of a sigma: noise per prediction does not shrink with the shift, 1; per second 2
-NOT_TESTED = "not stress-tested: --stress says whether changes that should not matter change a verdict"
 
 
 class Tried(NamedTuple):
@@ -58,31 +63,37 @@ class Stressed:
     """One estimator over one run, stressed.
 
     Attributes:
-        run: the run's name.
+        source: the run.
         estimator: the label.
-        epoch_ns: the run's time zero.
         tried: each change, whole; halves: those that were halved.
         sensors: the stamps of each topic that was sensed.
-        estimates: those of the unchanged replay.
+        estimates: those of the unchanged replay, by topic.
+        copies: those of each change, whole.
     """
 
-    run: str
+    source: MemorySource
     estimator: str
-    epoch_ns: int
     tried: Mapping[str, Tried]
     halves: Mapping[str, Tried]
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
+    copies: Mapping[str, Mapping[str, Stream]]
+
+    @property
+    def run(self) -> str:
+        """The run's name."""
+        return self.source.name
 
     def _is_explained(self, name: str) -> bool:
         """Whether a change without a half moves the estimate no farther than it may.
 
-        A lost message moves it by chance, as far as the covariances say; any other less than a sigma.
+        It is less than a sigma, or, as a lost message moves it by chance, what the covariances say.
         """
         parting = self.tried[name].parting
         if name != DROPPED or parting is None:
             return self.tried[name].largest < ONE_SIGMA
-        return bool(np.all(parting.amplification <= parting.explained + HARMLESS))
+        limit = np.maximum(parting.explained + HARMLESS, ONE_SIGMA)
+        return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
         """How many times more the whole change does than half of it, in A; NaN where none was halved."""
@@ -97,14 +108,20 @@ class Stressed:
         if each.largest < HARMLESS and not each.is_beyond:
             return "harmless"
         if CHANGES[name].is_scaled:
-            is_in_proportion = HALVES[0] <= self.ratio(name) <= HALVES[1]
-            return "sensitive" if is_in_proportion else "discontinuous or chaotic"
+            shrinks = HALVES[0] <= self.ratio(name) <= SQUARED
+            return "sensitive" if shrinks else "discontinuous or chaotic"
         return "sensitive" if self._is_explained(name) else "discontinuous or chaotic"
 
     @property
     def worst(self) -> Verdict:
         """The worst of all verdicts."""
         return max((self.verdict(name) for name in self.tried), key=ORDER.index)
+
+    @property
+    def deciding(self) -> str:
+        """Which change decides the worst verdict: of those that have it what moves most."""
+        own = [name for name in self.tried if self.verdict(name) == self.worst]
+        return max(own, key=lambda name: self.tried[name].largest)
 
     @property
     def is_per_prediction(self) -> bool:
@@ -142,7 +159,7 @@ class Stressed:
                 row["growth"] = each.parting.growth
                 if (at := each.parting.parted) is not None:
                     stamp_ns = int(each.parting.stamps_ns[at])
-                    row["parted_s"] = (stamp_ns - self.epoch_ns) * 1e-9
+                    row["parted_s"] = (stamp_ns - self.source.epoch_ns) * 1e-9
                     row["topic"] = self._message_at(stamp_ns)
             found.append(row)
         return found
@@ -159,10 +176,9 @@ class Stressed:
     @property
     def sentence(self) -> str:
         """The verdict, with the numbers of the change that decides it."""
-        own = [name for name in self.tried if self.verdict(name) == self.worst]
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
-        name = max(own, key=lambda each: self.tried[each].largest)
+        name = self.deciding
         each, parting = self.tried[name], self.tried[name].parting
         far = "the metric moves" if parting is None else f"at most {each.largest:.3g} sigma"
         sizes = () if parting is None else ((parting.metres, "m"), (parting.degrees, "deg"))
@@ -171,10 +187,14 @@ class Stressed:
         if self.worst == "harmless":
             return f"{begin}; so does every other change that was tried less"
         if self.worst == "sensitive":
-            how = f"; half the change does {1.0 / self.ratio(name):.2g} of it"
-            return begin + (how if name in self.halves else "")
-        how = f"; half the change does {1.0 / self.ratio(name):.2g} of it: it does not shrink with it"
-        return begin + (how if np.isfinite(self.ratio(name)) else "")
+            if name not in self.halves:
+                return begin
+            more = ": it shrinks faster than the change" if self.ratio(name) > HALVES[1] else ""
+            return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it{more}"
+        if not np.isfinite(self.ratio(name)):
+            return begin
+        how = "it jumps" if self.ratio(name) > SQUARED else "it does not shrink with it"
+        return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it: {how}"
 
     @property
     def sentences(self) -> list[str]:
@@ -187,7 +207,7 @@ class Stressed:
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined
-            since_s = (least.since_ns - self.epoch_ns) * 1e-9
+            since_s = (least.since_ns - self.source.epoch_ns) * 1e-9
             said.append(
                 f"from {since_s:.1f} s on {least.words} is not determined: its sigma is "
                 f"{least.sigma:.3g}, across it {least.next_sigma:.3g}"
@@ -202,9 +222,13 @@ def _largest(values: Any) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stress:
-    """Estimators over runs, stressed: one of `Stressed` for each."""
+    """Estimators over runs, stressed: one of `Stressed` for each run and estimator.
+
+    `gap_limit_s` is over which gaps the truth was not interpolated.
+    """
 
     stressed: Sequence[Stressed]
+    gap_limit_s: float = 0.2
 
     @property
     def table(self) -> pd.DataFrame:
@@ -217,19 +241,29 @@ class Stress:
         by_weight = sorted(self.stressed, key=lambda each: -ORDER.index(each.worst))
         return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
 
-    def moved(self, estimator: str, quantity: str, case: str | None) -> float:
-        """The largest change of a metric, as a mean over runs; of all cases where none is named."""
-        own = [each for each in self.stressed if each.estimator == estimator]
-        largest = 0.0
-        for name in CHANGES:
-            found = [
-                by
-                for each in own
-                for key, by in each.tried.get(name, Tried(name)).moved.items()
-                if key[1] == quantity and case in (None, key[0])
-            ]
-            largest = max(largest, abs(float(np.mean(found)))) if found else largest
-        return largest
+    def draw(self, save: str | Path) -> None:
+        """Write the timeline of the first run, an .rrd file: copies fan out from the estimates.
+
+        Raises BadInput where the file cannot be written.
+        """
+        from replay.timeline.fanning import Fan  # which takes long to import
+        from replay.timeline.show import Drawing
+
+        check_files([(Path(save), TIMELINE)], {})
+        source, outputs, fans = self.stressed[0].source, dict[str, Stream](), list[Fan]()
+        for each in (each for each in self.stressed if each.source is source):
+            outputs |= each.estimates
+            for name, copies in each.copies.items():
+                for topic, stream in copies.items():
+                    renamed = topic.replace(f"/{each.estimator}/", f"/{each.estimator}, {name}/", 1)
+                    outputs[renamed] = replace(stream, topic=renamed)
+                if (parting := each.tried[name].parting) is not None:
+                    fans.append(Fan(each.estimator, name, parting.stamps_ns, parting.amplification))
+        judge = Judge([source], {}, gap_limit_s=self.gap_limit_s)
+        judged = judge.add({topic: gather([stream]) for topic, stream in outputs.items()})
+        identity = "; ".join(each.estimator for each in self.stressed)
+        with Drawing(source, identity=identity, save=Path(save), fans=fans) as drawing:
+            drawing.add(outputs, judged.errors)
 
     def __repr__(self) -> str:
         return "\n".join(self.sentences)

@@ -343,6 +343,8 @@ class Tuning:
         }
         if self._profiles:
             outcome.figures["profiles"] = self.profile_chart
+        meanings = next(iter(self.replay.done.meanings.values()), {})
+        tuned = {str(name) for name in self.parameters.get("parameter", ())}
         settings = {
             "title": f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}",
             "logs": [log.name for log in self.logs],
@@ -352,6 +354,7 @@ class Tuning:
             **setting_of(self.logs[0]),
             "notes": list(self.notes),
             "gap_limit_s": self.objective.gap_limit_s,
+            "meanings": {name: words for name, words in meanings.items() if name in tuned},
         }
         with result_folder(place) as part:
             for name, text in {SETTINGS: self.toml, **self.files}.items():

@@ -15,6 +15,7 @@ from recorders.log.planes import Origin
 from replay.engine.streams.blocks import Ragged
 from replay.engine.streams.sources import Source
 from replay.judging.consistency.bounds import Bounds
+from replay.judging.consistency.conditioning import Conditioning, conditioning_of
 from replay.judging.diagnostics import LEAVES, Diagnostics
 from replay.judging.errors.constant import Constant
 from replay.judging.errors.evaluation import (
@@ -77,7 +78,7 @@ class Judge:
         burn_in_s: errors up to so long after the epoch are left out.
         on_errors: is handed the errors of every block.
 
-    `innovations` are their sums by topic.
+    `innovations` are their sums by topic, `conditioning` what rounding has left of covariances.
     """
 
     def __init__(
@@ -106,6 +107,8 @@ class Judge:
         self._unjudged: dict[str, str] = {}
         self._first_fixes: dict[str, list[Origin | None]] = {}
         self.innovations: dict[str, InnovationSums] = {}
+        self.conditioning: dict[str, Conditioning] = {}
+        self._epochs_ns = np.array([source.epoch_ns for source in sources])
         self._bounds: dict[tuple[str, str], Bounds] = {}
         self._means = MeansOfAll()
         self._doubts: dict[str, Doubt] = {}
@@ -125,6 +128,9 @@ class Judge:
                     self.innovations[topic] = InnovationSums(self._first_run)
                 self.innovations[topic].add(innovations)
                 self._measured.add(topic, innovations)
+            if schema in (GAUSSIAN, INNOVATION):
+                own = conditioning_of(rows, self._epochs_ns, self._first_run)
+                self.conditioning[topic] = self.conditioning.get(topic, Conditioning()).plus(own)
             self._diagnostics.add(topic, rows, self._sources)
             named = (*split_topic(topic), topic.rpartition("/")[2])
             output = Output(*named, rows, self._sources, self._first_run)
@@ -203,6 +209,8 @@ class Judge:
         for what, bounds in other._bounds.items():
             self._bounds.setdefault(what, Bounds()).merge(bounds)
         self._diagnostics.merge(other._diagnostics)
+        for topic, each in other.conditioning.items():
+            self.conditioning[topic] = self.conditioning.get(topic, Conditioning()).plus(each)
 
     @property
     def metrics(self) -> dict[str, float]:

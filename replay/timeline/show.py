@@ -19,6 +19,7 @@ from replay.engine.streams.sources import Source
 from replay.judging.errors.evaluation import Errors, errors_at
 from replay.timeline.drawing.canvas import DRAWN_ROWS, Canvas, Scene, Timeline
 from replay.timeline.drawing.thinning import KEPT_ERRORS, KEPT_ROWS, Sensed, Thin
+from replay.timeline.fanning import Fan, draw_fans
 from replay.timeline.generic import TIMELINE as GENERIC
 from replay.timeline.side_by_side import draw_side_by_side
 from replay.timeline.sinks import open_recording
@@ -41,6 +42,7 @@ class Drawing:
         save: the .rrd file to write.
         connect: the receiver to send to, rerun+http://HOST:PORT/proxy.
         sides: estimators whose scenes stand side by side, with the differences of their errors.
+        fans: how far copies are from their estimates.
 
     Raises BadInput where neither is given or a sink fails (see `open_recording`), or there is no such
     focus.
@@ -55,13 +57,14 @@ class Drawing:
         save: Path | None = None,
         connect: str | None = None,
         sides: Sequence[str] = (),
+        fans: Sequence[Fan] = (),
     ) -> None:
         if save is None and connect is None:
             raise BadInput(
                 "a timeline needs a destination: give --save FILE.rrd, --connect URL, or both"
             )
         self._source, self._focus, self._save = source, focus, save
-        self._sides = sides
+        self._sides, self._fans = sides, fans
         scenario = source.run.scenario if source.run else ""
         known = available("timelines")
         self._timeline: Timeline = load("timelines", scenario) if scenario in known else GENERIC
@@ -129,6 +132,8 @@ class Drawing:
         layout = self._timeline.draw(canvas, scene)
         if self._sides:
             layout = draw_side_by_side(canvas, scene, layout, self._sides)
+        if self._fans:
+            layout = draw_fans(canvas, layout, self._fans)
         recording.send_blueprint(
             rrb.Blueprint(
                 layout,

@@ -11,8 +11,9 @@ In a page stands a comment, a template, and below it what it gives, up to `<!-- 
 `{NAME[KEY]:FORMAT}` is a metric of the experiment NAME, `{NAME[KEY][0]}` an entry of one that is a list,
 `{NAME.claims}` its table of claims, `{NAME.counted}` how many there are of each verdict, and
 `{NAME.verdicts}` the same in numbers alone. `{speed[WHAT]:.0f}` is how many times faster than a peer
-`make bench` found fuselog to be at WHAT, and `{speed.machine}` where. `{catalogue.data_sets}` is the
-table of public data and their experiments, `{catalogue.mappings}` that of the mappings that ship.
+`make bench` found fuselog to be at WHAT, and `{speed.machine}` where. `{deploy.costs}` and others are
+what `python -m tests.deployed --keep` found. `{catalogue.data_sets}` is the table of public data and
+their experiments, `{catalogue.mappings}` that of the mappings that ship.
 """
 
 import json
@@ -34,6 +35,7 @@ from recorders.importers.tables.mapping import shipped as shipped_mappings
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs" / "families" / "results"
 SPEED = ROOT / "docs" / "speed.json"
+DEPLOYED = ROOT / "docs" / "deploy.json"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 _BLOCK = re.compile(r"(<!-- results\n(.*?)\n-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 
@@ -96,6 +98,60 @@ class Speed:
         return float(self._ratios[what].partition(" ")[0])
 
 
+class Deployed:
+    """What `python -m tests.deployed --keep` kept."""
+
+    def __init__(self, kept: Mapping[str, Any]) -> None:
+        self.kept = kept
+        self.compiler, self.target_compiler = kept["compiler"], kept["target_compiler"]
+        self.unfit = kept["unfit"]
+
+    @property
+    def compared(self) -> int:
+        """How many pairs of model and method were compared with the replay."""
+        return sum(map(len, self.kept["pairs"].values()))
+
+    @property
+    def models(self) -> int:
+        """Of how many models they are."""
+        return len(self.kept["pairs"])
+
+    @property
+    def furthest(self) -> float:
+        """How far the furthest of them is from the replay."""
+        return max(pair["furthest"] for each in self.kept["pairs"].values() for pair in each.values())
+
+    @property
+    def costs(self) -> str:
+        """The table of costs of some."""
+        rows = [
+            "| filter | flops, worst case | square roots | calls of libm | code, bytes | stack, bytes |",
+            "|---|---|---|---|---|---|",
+        ]
+        for model, states in (("batch-reactor", 2), ("robot", 3), ("orientation", 12), ("inertial", 16)):
+            for method in ("ekf", "sqrt:ekf", "ukf", "sqrt:ukf"):
+                pair = self.kept["pairs"][model][method]
+                assert pair["states"] == states
+                numbers = (pair[each] for each in ("flops", "roots", "calls", "text", "stack"))
+                rows.append(f"| {model} `{method}`, {states} states | {' | '.join(map(str, numbers))} |")
+        return "\n".join(rows)
+
+    @property
+    def target(self) -> str:
+        """The table of what a robot's filters take on the emulated target."""
+        rows = [
+            "| filter | numbers | instructions, on average | at most | furthest from fuselog |",
+            "|---|---|---|---|---|",
+        ]
+        for name, taken in self.kept["target"].items():
+            method, numbers = name.split()
+            rows.append(
+                f"| `{method}` | `{numbers}` | {taken['average']} | {taken['most']} "
+                f"| {taken['furthest']:.0e} |"
+            )
+        return "\n".join(rows)
+
+
 class Catalogue:
     """What ships for real data, by its own descriptions."""
 
@@ -151,7 +207,13 @@ def speed() -> Speed:
     return Speed(json.loads(SPEED.read_text(encoding="utf-8")))
 
 
+@cache
+def deployed() -> Deployed:
+    """What filters in C cost, and how they compare with the replay."""
+    return Deployed(json.loads(DEPLOYED.read_text(encoding="utf-8")))
+
+
 def rendered(page: str) -> str:
     """The text of a page with everything that is made from results made anew."""
-    known = {**stored(), "speed": speed(), "catalogue": Catalogue()}
+    known = {**stored(), "speed": speed(), "deploy": deployed(), "catalogue": Catalogue()}
     return _BLOCK.sub(lambda block: f"{block[1]}{block[2].format_map(known)}\n{block[4]}", page)

@@ -18,7 +18,7 @@ from tests.docs.test_worked_pages import WORKED
 DOCS = Path(__file__).parents[2] / "docs"
 WORKED_THROUGH = {each if isinstance(each, str) else each.values[0] for each in WORKED}
 BY_OTHERS = {"python", "your-estimator", "your-model"}  # tests/pipeline
-HERE = {"compare", "many-runs"}
+HERE = {"compare", "deploy", "many-runs"}
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 
@@ -86,3 +86,18 @@ def test_the_golden_of_compare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     names["MINE"] = {"kind": "ekf", "sigma_range_m": 0.5}
     with pytest.raises(AssertionError, match=r"drive\.mcap"):
         names["test_my_estimator"]()
+
+
+@pytest.mark.paper
+@pytest.mark.usefixtures("uncompiled")
+def test_a_model_of_ones_own_is_tuned_and_deployed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page Deploy goes on where the page Your model has its pendulum and its log."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for code in (*python_of("your-model")[:2], *python_of("deploy")):
+        exec(code, names)
+    assert 0.03 < names["found"].settings["tuned"]["sigma_m"] < 0.07
+    tuned = repr(names["found"].settings["tuned"]["sigma_m"])
+    assert f".sigma_m = {tuned}," in (tmp_path / "pendulum_ekf/pendulum_ekf.c").read_text()

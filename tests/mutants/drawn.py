@@ -723,15 +723,15 @@ DRAWN = [
         "tests/pipeline/test_stressing.py tests/pipeline/test_stress_studies.py",
     ),
     Fault(
-        "pipeline/deploying/c_source/statements.py",
-        'elif array == "P" and place[0] >= place[1]:',
-        'elif array == "P" and place[0] > place[1]:',
+        "pipeline/deploying/c_source/samples.py",
+        "samples->centre[i] += samples->shift[i];",
+        "samples->centre[i] -= samples->shift[i];",
         "tests/pipeline/test_deploying.py",
     ),
     Fault(
-        "pipeline/deploying/c_source/updates.py",
-        "find_slope(filter->covariance, a, slope);",
-        "find_slope(filter->covariance, slope, a);",
+        "pipeline/deploying/c_source/factors.py",
+        "? 1.0_S - 1.0_S / wider : 1.0_S;",
+        "? 1.0_S : 1.0_S - 1.0_S / wider;",
         "tests/pipeline/test_deploying.py",
     ),
     Fault(

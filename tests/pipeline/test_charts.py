@@ -73,7 +73,7 @@ def test_errors_and_nees_are_of_their_estimators_in_their_unit() -> None:
     judged = [(errors("ekf", *plane), ekf), (errors("bound", *plane, is_bound=True), bound)]
     chart = error_chart(judged, "robot1")
     assert chart.title == (
-        "robot1, 7 runs; tinted: where 95 % lie if the estimator's covariance is right"
+        "robot1, over all 7 runs together; tinted: where 95 % lie if the estimator's covariance is right"
     )
     assert all(panel.y.log for panel in chart.panels)
     rmse = {

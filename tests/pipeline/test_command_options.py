@@ -70,7 +70,12 @@ MOVES = [
     ),
     Moves(
         "stress run.mcap -e ekf",
-        {"--json": "--json", "--seed": "--seed 1", "--set": "--set ekf.sigma_range_m=0.3"},
+        {
+            "--json": "--json",
+            "--seed": "--seed 1",
+            "--set": "--set ekf.sigma_range_m=0.3",
+            "--save": "--save fan.rrd",
+        },
     ),
     Moves(
         "deploy run.mcap -e ekf --model robot -o robot_ekf",
@@ -205,7 +210,7 @@ COMMANDS_ELSEWHERE = {
     "noise": ("test_noise", "test_outputs"),
     "replay": ("test_spans", "test_command_line"),
     "report": ("test_report", "test_outputs"),
-    "run": ("test_experiments", "test_late", "test_report"),
+    "run": ("test_experiments", "test_late", "test_report", "test_stressing"),
     "stress": ("test_stressing",),
     "sweep": ("test_sweeps", "test_campaigns", "test_outputs"),
     "tune": ("test_tuning",),

@@ -1,51 +1,45 @@
 """A filter as C: the same to the last bit, built without a warning, silent under the sanitizers."""
 
 import json
-import re
-import shutil
 import subprocess
 import sys
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.deploying.c_target import target_lines
 from pipeline.deploying.certificate import deepest_stack
 from recorders.errors import BadInput
+from replay.estimators.models.reactor import REACTOR
+from tests.claims.pages import DEPLOYED
+from tests.deployed.building import COMPILERS, compiled, furthest, missing_of_target, on_target
+from tests.deployed.models import Tried, deployed, robot_log
+from tests.deployed.own_models import own_models
 from tests.pipeline.conftest import run_here
+from tests.replay.estimators.test_attitude import carried
 
-COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
-WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
-STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
 needs_compiler = pytest.mark.skipif(not COMPILERS, reason="there is no C compiler here")
 
 
-def recorded(tmp_path: Path, scenario: str, **parameters: object) -> Path:
+def recorded(tmp_path: Path, scenario: str, **parameters: Any) -> Path:
     log = tmp_path / f"{scenario}.mcap"
     fl.write(log, fl.record(scenario, seed=7, **parameters))
     return log
 
 
-def compiled(folder: Path, *options: str, compiler: str = "") -> Path:
-    """Build the test program, or with `-shared` the library."""
-    name = folder.name
-    is_library = "-shared" in options
-    out = folder.parent / (f"{name}.so" if is_library else f"test_{name}")
-    first = f"{name}_replay.c" if is_library else f"test_{name}.c"
-    files = [str(folder / each) for each in (first, f"{name}.c")]
-    subprocess.run(
-        [compiler or COMPILERS[0], *STRICT, *options, *files, "-lm", "-o", str(out)], check=True
-    )
-    return out
-
-
-def furthest(program: Path) -> float:
-    """How far the program finds its estimates from fuselog's."""
-    said = subprocess.run([program, "1e300"], capture_output=True, text=True, check=True)
-    assert not said.stderr
-    return float(said.stdout.partition("furthest ")[2].partition(",")[0])
+@cache
+def sanitizes(compiler: str) -> bool:
+    """Whether the compiler has the sanitizers' libraries, which Debian packs by themselves for clang."""
+    with TemporaryDirectory() as place:
+        source = Path(place) / "nothing.c"
+        source.write_text("int main(void) { return 0; }")
+        command = [compiler, "-fsanitize=address,undefined", str(source), "-o", f"{source}.out"]
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 @needs_compiler
@@ -54,19 +48,21 @@ def furthest(program: Path) -> float:
     [
         ("landmarks", "ekf", {"model": "robot"}),
         ("landmarks", "iekf", {"model": "robot"}),
+        ("landmarks", "ukf", {"model": "robot"}),
+        ("landmarks", "sqrt:ukf", {"model": "robot"}),
         ("batch-reactor", "ekf", {}),
         ("batch-reactor", "ukf", {}),
     ],
 )
 @pytest.mark.paper
 def test_estimates_are_equal_to_the_last_bit(
-    tmp_path: Path, scenario: str, label: str, options: dict[str, str]
+    tmp_path: Path, scenario: str, label: str, options: dict[str, Any]
 ) -> None:
     log = recorded(tmp_path, scenario, **({"duration_s": 10.0} if scenario == "landmarks" else {}))
     folder = fl.deploy(log, label, tmp_path / "filter_c", **options)
     for compiler in COMPILERS:
         assert furthest(compiled(folder, compiler=compiler)) == 0.0
-        if sys.platform != "win32":
+        if sanitizes(compiler):
             sanitized = compiled(folder, "-fsanitize=address,undefined", compiler=compiler)
             assert furthest(sanitized) == 0.0
     if sys.platform == "win32":
@@ -75,13 +71,31 @@ def test_estimates_are_equal_to_the_last_bit(
     kinds = {"kind": label, **options}, {"kind": "lib", "path": str(library), "in_process": True}
     replays = [fl.replay(log, {"it": each}) for each in kinds]
     own, foreign = (each.estimates[0] for each in replays)
-    topics = [each for each in own if each.endswith(("/innovation", "/state", "/pose"))]
+    topics = [each for each in own.topics if each.endswith(("/innovation", "/state", "/pose"))]
     assert len(topics) == 2
     for topic in topics:
+        ours, theirs = (each.read([topic])[topic] for each in (own, foreign))
         for name in ("mean", "covariance", "innovation", "normalised_innovation_squared", "accepted"):
-            if name in own[topic].columns:
-                both = own[topic][name], foreign[topic][name]
-                np.testing.assert_array_equal(*both, err_msg=f"{topic} {name}")
+            if name in ours.columns:
+                np.testing.assert_array_equal(ours[name], theirs[name], err_msg=f"{topic} {name}")
+
+
+@needs_compiler
+@pytest.mark.parametrize("label", ["ekf", pytest.param("sqrt:ukf", marks=pytest.mark.paper)])
+def test_a_gap_of_the_control_widens_the_estimate(tmp_path: Path, label: str) -> None:
+    """Of an orientation, whose mean is found in rounds where it is sampled."""
+    samples, _ = carried()
+    stamps_s = (samples.publish_time_ns - samples.publish_time_ns[0]) * 1e-9
+    log = tmp_path / "carried.mcap"
+    fl.write(log, [samples.take((stamps_s < 4.0) & ~((stamps_s > 1.5) & (stamps_s < 2.2)))])
+    folder = fl.deploy(log, label, tmp_path / "filter_c", model="orientation")
+    assert furthest(compiled(folder)) < 1e-12
+    source = folder / "filter_c.c"
+    text = source.read_text()
+    source.write_text(
+        text.replace("return pass_gap(filter, time_ns, parameters);", "filter->is_in_gap = 0;")
+    )
+    assert furthest(compiled(folder, "-Wno-unused-function")) > 0.1
 
 
 @needs_compiler
@@ -126,6 +140,90 @@ def test_certificate_counts_what_a_step_takes(tmp_path: Path) -> None:
     assert found["products"]["dense_flops"] == 9 * 5 + 6 * 5 + 6 * 5 + 3 * 5
 
 
+class CartParameters(fl.ModelParameters):
+    """What a cart's camera and pushes are."""
+
+    sigma_m: float = 0.01
+    push_density: float = 0.001
+
+
+def roll(state: Any, _: Any, duration_s: Any, __: Any) -> Any:
+    return state[0] + duration_s * state[1], state[1]
+
+
+CART = fl.Model(
+    "a cart that rolls past a camera",
+    {"x_m": "linear", "v_mps": "linear"},
+    CartParameters,
+    (
+        fl.Sensor(
+            "camera",
+            fl.schemas.VECTOR_MEASUREMENT,
+            {"x_m": "linear"},
+            lambda state, *_: (state[0],),
+            lambda parameters: (parameters.sigma_m**2,),
+            vector="value",
+        ),
+    ),
+    fl.Motion(roll, lambda _, duration_s, parameters: (0.0, parameters.push_density**2 * duration_s)),
+)
+
+
+@needs_compiler
+@pytest.mark.usefixtures("uncompiled")
+def test_single_precision_says_where_it_breaks_and_the_square_root_holds(tmp_path: Path) -> None:
+    """The prior is 1e5 times as wide as a measurement: squared that is more than float's digits."""
+    stamps = fl.simulation_stamps_ns(0.01 * np.arange(150))
+    noise = 0.01 * np.random.default_rng(1).standard_normal((150, 1))
+    log = tmp_path / "cart.mcap"
+    prior = {"components": "x_m,v_mps", "kinds": "linear,linear"}
+    streams = [
+        fl.make_stream(
+            "/cart/prior",
+            fl.schemas.GAUSSIAN_ESTIMATE,
+            stamps[:1],
+            metadata=prior,
+            mean=np.zeros((1, 2)),
+            covariance=np.diag([1e6, 1e6]).reshape(1, 4),
+        ),
+        fl.make_stream(
+            "/cart/camera",
+            fl.schemas.VECTOR_MEASUREMENT,
+            stamps,
+            metadata={"components": "x_m"},
+            value=5.0 + 0.02 * np.arange(150)[:, None] + noise,
+        ),
+    ]
+    fl.write(log, streams)
+    costs = {}
+    for kind in ("ekf", "sqrt:ekf"):
+        folder = fl.deploy(log, fl.modelled(CART, kind), tmp_path / kind.replace(":", "_"), single=True)
+        costs[kind] = json.loads((folder / "certificate.json").read_text())["single"]
+    assert costs["ekf"]["lost_event"] > 0
+    assert "take the square-root form" in (tmp_path / "ekf/README.md").read_text()
+    assert costs["sqrt:ekf"]["lost_event"] is None
+    assert costs["sqrt:ekf"]["furthest"] < 1e-4
+    assert costs["sqrt:ekf"]["estimates"] == 150
+
+
+@needs_compiler
+@pytest.mark.skipif(sys.platform == "win32", reason="the library is built for POSIX")
+@pytest.mark.paper
+def test_both_precisions_are_compared_with_intervals(tmp_path: Path) -> None:
+    logs = [tmp_path / f"{run}.mcap" for run in range(5)]
+    for run, log in enumerate(logs):
+        fl.write(log, fl.record("landmarks", seed=run, duration_s=5.0))
+    sides = []
+    for precision in ("double", "single"):
+        folder = tmp_path / precision
+        fl.deploy(logs[0], "ekf", folder, model="robot", single=precision == "single")
+        sides += ["-e", f"lib:{compiled(folder, '-shared', '-fPIC')}"]
+    said = run_here("compare", *logs, *sides)
+    assert said.code == 0, said.err
+    [row] = [line for line in said.out.splitlines() if line.startswith(" position_rmse_m ")]
+    assert "no difference" in row
+
+
 def test_stack_is_that_of_the_deepest_chain() -> None:
     node = 'node: {{ title: "{0}" label: "{0}\\nx.c:1:5\\n{1} bytes (static)" }}\n'
     edge = 'edge: {{ sourcename: "{0}" targetname: "{1}" label: "x.c:2:3" }}\n'
@@ -143,13 +241,25 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     out = tmp_path / "robot_ekf"
     for label, options, sentence in (
         ("smoother:ekf", {"model": "robot"}, "smoother:ekf: is no filter that can be written as C"),
-        ("sqrt:ekf", {"model": "robot"}, "sqrt:ekf cannot be written as C yet; give -e ekf"),
-        ("ukf", {"model": "robot"}, "the prediction cannot be written as C: samples of an angle"),
+        ("lrkf:rukf-10", {"model": "robot"}, "lrkf:rukf-10 draws its samples anew for every step"),
         ("ekf", {"model": "robot", "sigma_range_m": -1.0}, "sigma_range_m"),
     ):
         with pytest.raises(BadInput, match=sentence):
             fl.deploy(log, label, out, **options)
         assert not out.exists()
+
+    def by_float(*_: Any) -> Any:
+        return float(_[0][0]), 0.0
+
+    reactor = recorded(tmp_path, "batch-reactor")
+    with pytest.raises(BadInput, match="analytic cannot be written as C; give -e ekf, iekf, ukf"):
+        fl.deploy(reactor, "analytic", out)
+    model = replace(REACTOR, motion=fl.Motion(by_float))
+    with pytest.raises(
+        BadInput, match=r"by_float \(test_deploying.py, line \d+\): it uses float\(\) of"
+    ):
+        fl.deploy(reactor, fl.modelled(model, "ekf"), out)
+    assert not out.exists()
     out.mkdir()
     (out / "mine.c").write_text("mine")
     with pytest.raises(BadInput, match="robot_ekf: is not empty; give another folder with -o"):
@@ -157,23 +267,34 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     assert [each.name for each in out.iterdir()] == ["mine.c"]
 
 
-NEEDED = ("arm-none-eabi-gcc", "qemu-system-arm")
+@pytest.mark.parametrize(("single", "away"), [(False, 1e-12), (True, 2e-6)])
+def test_an_emulated_cortex_m4f_gives_the_estimates(tmp_path: Path, single: bool, away: float) -> None:
+    if missing := missing_of_target():
+        pytest.skip(f"there is no {missing} here")
+    tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot"})
+    taken = on_target(deployed(tried, "ekf", tmp_path, single=single), away)
+    kept = json.loads(DEPLOYED.read_text())["target"]["ekf float" if single else "ekf double"]
+    assert [taken.average, taken.most] == pytest.approx([kept["average"], kept["most"]], rel=0.1)
 
 
-@pytest.mark.skipif(not all(map(shutil.which, NEEDED)), reason=f"needs {' and '.join(NEEDED)}")
-@pytest.mark.parametrize(("single", "away", "row"), [(False, 1e-12, "double"), (True, 2e-6, "float")])
-def test_an_emulated_cortex_m4f_gives_the_estimates(
-    tmp_path: Path, single: bool, away: float, row: str
-) -> None:
-    log = recorded(tmp_path, "landmarks", duration_s=10.0)
-    folder = fl.deploy(log, "ekf", tmp_path / "robot_ekf", model="robot", single=single)
-    build, run = (line.split() for line in target_lines("robot_ekf", argument=str(away)))
-    subprocess.run(build, cwd=folder, check=True)
-    found = subprocess.run(run, cwd=folder, capture_output=True, text=True, timeout=60, check=False)
-    assert found.returncode == 0, found.stdout + found.stderr
-    taken = re.search(r"(\d+) instructions for a message, at most (\d+)", found.stdout)
-    page = (Path(__file__).parents[2] / "docs/deploy.md").read_text()
-    stated = re.search(rf"\| `{row}`[^|]*\| (\d+) \| (\d+) \|", page)
-    assert taken is not None
-    assert stated is not None
-    assert [*map(int, taken.groups())] == pytest.approx([*map(int, stated.groups())], rel=0.1)
+def test_the_costs_that_are_kept_are_those_of_now(tmp_path: Path) -> None:
+    """`python -m tests.deployed --keep` keeps them."""
+    tried = Tried("robot", robot_log(tmp_path), None, {"model": "robot"})
+    kept = json.loads(DEPLOYED.read_text())["pairs"]["robot"]
+    for method in ("ekf", "sqrt:ukf"):
+        folder = deployed(tried, method, tmp_path)
+        found = json.loads((folder / "certificate.json").read_text())["worst"]
+        assert found == {name: kept[method][name] for name in found}
+
+
+@needs_compiler
+@pytest.mark.usefixtures("uncompiled")
+@pytest.mark.paper
+def test_models_of_the_pages_deploy_as_they_stand_there(tmp_path: Path) -> None:
+    """`python -m tests.deployed` has them by every method."""
+    found = []
+    for name, model, log, settings in own_models(tmp_path):
+        folder = deployed(Tried(name, log, model, settings), "sqrt:ukf", tmp_path)
+        assert furthest(compiled(folder)) <= 1e-12
+        found.append(name)
+    assert found == ["pendulum", "pendulum with its length", "ball", "walker"]

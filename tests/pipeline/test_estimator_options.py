@@ -123,6 +123,14 @@ def test_no_estimator_is_left_out():
     assert {*cases.MODELS, *MODELS_ELSEWHERE} == set(available("models"))
 
 
+def test_a_start_without_a_prior_is_of_the_models_own_states_and_parameters():
+    starts = {name: model for name, model in registered_models().items() if model.start}
+    for name, model in starts.items():
+        assert model.start.sigmas.keys() <= model.state.keys(), name
+        assert model.start.parameters.keys() <= model.parameters.model_fields.keys(), name
+    assert len(starts) > 5
+
+
 def test_a_name_and_a_setting_that_differ_are_refused():
     """What the name says stood, and the setting did nothing."""
     with pytest.raises(BadInput, match="tracker:jipda says association = jipda, and a setting nearest;"):

@@ -12,6 +12,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import Queue
 from threading import Event
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 
 import fuselog as fl
-from pipeline.exploring.curves import BIN_S, ellipse, extremes, typical_time_s
+from pipeline.exploring.curves import BIN_S, ellipse, extremes, fewer, typical_time_s
 from pipeline.exploring.curves import Path as Track
 from pipeline.exploring.newest import NewestFirst
 from pipeline.exploring.plots import blank, show_lens
@@ -159,6 +160,73 @@ def test_the_lens_shows_the_truth_near_its_instant(session: Session) -> None:
     show_lens(plot, scene, {0: session.play("ekf", SURE)}, "robot1", truth, 30.0)
     assert shown.data["x"].tolist() == [*range(26, 35)]
     assert shown.data["y"].tolist() == [-each for each in range(26, 35)]
+
+
+def test_the_page_draws_and_says_what_was_replayed(session: Session) -> None:
+    """All plots are read back, of a filter that is too sure, above the one that was pinned."""
+    document_of = pytest.importorskip("bokeh.document").Document
+    from pipeline.exploring.page import Page
+
+    document, acts = document_of(), Queue()
+    document.add_next_tick_callback = acts.put
+    page, slider = Page(session, document), session.slider("sigma_range_m")
+    try:
+        page._pin()
+        page._widgets["sigma_range_m"][1].value = slider.place(0.03)
+        shown = page.plots["likelihood"].sources[0, "here"]
+        while list(shown.data["x"]) != [slider.place(0.03)]:  # which comes after the replay
+            acts.get(timeout=20.0)()
+        page._component.value = "y_m"
+    finally:
+        page.end()
+    drawn = {name: plot.sources for name, plot in page.plots.items()}
+    titles = {name: plot.figure.title.text for name, plot in page.plots.items()}
+    assert page.values.keys() == {"sigma_range_m"}
+    values = dict(page.values)
+    for of, played in (("pinned", session.play("ekf", {})), (0, session.play("ekf", values))):
+        case = played.cases["robot1"]
+        sigma, most = 1.96 * np.sqrt(case.errors.covariance[:, 1, 1]), np.abs(case.errors.error[:, 1])
+        wanted = {
+            "error": (case.errors.elapsed_s, case.errors.error[:, 1]),
+            "nees": (case.errors.elapsed_s, case.errors.nees),
+            "nis": (case.nis.time_s, case.nis.mean),
+            "scene": tuple(case.path.points.T),
+        }
+        for name, (x, y) in wanted.items():
+            line = drawn[name][of, "line"].data
+            shown = set(zip(line["t" if "t" in line else "x"].tolist(), line["y"].tolist(), strict=True))
+            assert shown <= set(zip(x.tolist(), y.tolist(), strict=True)), name
+            assert len(shown) >= min(len(x), 200), name
+        row = np.argmin(np.abs(case.path.time_s - page._at_s))
+        outline = drawn["lens"][of, "ellipse"].data
+        middle = [np.mean([np.min(outline[axis]), np.max(outline[axis])]) for axis in "xy"]
+        np.testing.assert_allclose(middle, case.path.points[row], atol=1e-3)
+    band, rows = drawn["error"][0, "band"].data, fewer(len(sigma))
+    np.testing.assert_allclose((band["low"], band["high"]), (-sigma[rows], sigma[rows]))
+    for name, outside in (("error", np.mean(most > sigma)), ("nees", case.nees_outside)):
+        assert f": outside {100 * outside:.{int(outside < 0.1)}f} %" in titles[name]
+    assert titles["error"].startswith("Error of y_m")
+    for plot, low, high in (("nees", *case.nees_interval), ("nis", case.nis.low, case.nis.high)):
+        interval = drawn[plot][0, "interval"].data
+        assert np.all(interval["low"] == low)
+        assert np.all(interval["high"] == high)
+    end = page.plots["error"].figure.y_range.end
+    assert end == pytest.approx(1.1 * max(2 * np.median(sigma), np.quantile(most, 0.995)), rel=0.3)
+    assert end == -page.plots["error"].figure.y_range.start
+    least = min(case.whiteness, key=lambda name: case.whiteness[name].probability)
+    assert titles["whiteness"].endswith(f" {least}")
+    np.testing.assert_array_equal(
+        drawn["whiteness"][0, "line"].data["y"], case.whiteness[least].correlation
+    )
+    line, peak, here = (drawn["likelihood"][0, what].data for what in ("line", "peak", "here"))
+    assert np.all(np.diff(line["x"]) > 0)
+    assert (peak["y"], here["x"]) == (max(line["y"]), slider.place(0.03))
+    assert here["y"] == pytest.approx(np.interp(here["x"], line["x"], line["y"]))
+    assert slider.words(slider.value(peak["x"][0])) in titles["likelihood"]
+    assert "Too sure of itself." in page._head.text
+    assert "pinned" in page._head.text
+    page._command()
+    assert "--set sigma_range_m=0.03" in page._saved.text
 
 
 def test_numbers_below_zero_are_written_as_those_above() -> None:

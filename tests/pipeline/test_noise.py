@@ -2,6 +2,8 @@
 
 import io
 import json
+import math
+import re
 import tarfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +20,7 @@ from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
 from pipeline.sensing.likelihood import Samples, likelihood
 from pipeline.sensing.preparing import find_drift, find_vibration, samples_of, white_block
 from pipeline.sensing.terms import Terms
-from pipeline.sensing.units import parse_sheet
+from pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
 from tests.pipeline.conftest import Said
 
@@ -152,22 +154,25 @@ def test_vibration_is_noticed(walking: np.ndarray) -> None:
     assert (frequency_hz, amplitude) == pytest.approx((7.3, 1e-3), rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("text", "term", "value"),
-    [
-        ("1 deg/sqrt(h)", "white", 2.908882086657e-4),
-        ("1 deg/s/sqrt(Hz)", "white", 0.01745329252),
-        ("1 deg/h/sqrt(h)", "walk", 8.080228018e-8),
-        ("1 deg/s/sqrt(Hz) one-sided", "white", 0.01745329252 / np.sqrt(2)),
-    ],
-)
-def test_units_of_sheets(text: str, term: str, value: float) -> None:
-    assert parse_sheet("turn_rate_radps", text) == (term, pytest.approx(value, rel=1e-9))
-
-
-def test_units_of_sheets_for_accelerometers() -> None:
-    assert parse_sheet("specific_force_mps2", "1 ug/sqrt(Hz)")[1] == pytest.approx(9.80665e-6)
-    assert parse_sheet("specific_force_mps2", "1 m/s/sqrt(h)")[1] == pytest.approx(1 / 60)
+def test_units_of_sheets_are_what_their_words_multiply_to() -> None:
+    """Beside the column's unit white noise has s to the half, and a walk s to minus the half."""
+    degree, g = np.pi / 180, 9.80665
+    sizes = {"deg": degree, "mdeg": degree / 1e3, "g": g, "mg": g / 1e3, "ug": g / 1e6}
+    columns = {"rad/s": ("turn_rate_radps", -1), "m/s^2": ("specific_force_mps2", -2)}
+    for unit, (column, term, _) in UNITS.items():
+        word, rest = re.fullmatch(r"(m?deg|rad|[mu]?g|m)(.*)", unit).groups()
+        by_seconds = []
+        for s in (1.0, 4.0):
+            known = {"s": s, "h": 3600 * s, "Hz": 1 / s, "sqrt": math.sqrt}
+            acceleration = s**-2 if word in ("g", "mg", "ug") else 1.0
+            by_seconds.append(acceleration * eval(f"1.0{rest.replace('^', '**')}", known))
+        field, power = columns[column]
+        value = 3 * sizes.get(word, 1.0) * by_seconds[0]
+        assert parse_sheet(field, f"3 {unit}") == (term, pytest.approx(value, rel=1e-12)), unit
+        left = {"white": 0.5, "walk": -0.5}[term]
+        assert by_seconds[1] == pytest.approx(by_seconds[0] * 4.0 ** (power + left)), unit
+    half = parse_sheet("turn_rate_radps", "1 deg/s/sqrt(Hz) one-sided")
+    assert half == ("white", pytest.approx(degree / np.sqrt(2)))
 
 
 def rest(size: int = 4096, seconds: float = STEP_S, **changed: np.ndarray) -> fl.Stream:

@@ -29,15 +29,12 @@ from pipeline.output.charts import (
     interval,
     level,
 )
-from pipeline.output.claims import Claim
 from pipeline.output.report import write_report
 from pipeline.output.report.colours import DARK, LIGHT, contrast, text_colours
-from pipeline.output.report.evidence import findings
 from pipeline.output.report.first_run import Followed
-from pipeline.output.report.kinds import opening, said
+from pipeline.output.report.kinds import said
 from pipeline.output.report.scene import typical_second
-from pipeline.output.report.story import Story, story
-from pipeline.output.results import Outcome, Result, read_result, result_folder, write_outcome
+from pipeline.output.results import Outcome, read_result, result_folder, write_outcome
 from recorders.errors import BadInput
 from recorders.log import open_log, read_streams
 
@@ -215,158 +212,6 @@ def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) ->
     ]
 
 
-def _told(
-    runs: dict[str, dict[str, list[float]]],
-    bounds: dict[str, tuple[float, float]] | None = None,
-    timings: dict[str, dict[str, float]] | None = None,
-) -> Story:
-    """The story of estimators whose quantities in every run are given."""
-    rows = pd.concat(
-        pd.DataFrame({"estimator": label, "case": "", "run": range(len(next(iter(of.values())))), **of})
-        for label, of in runs.items()
-    )
-    metrics = {
-        f"{label}.{key}": float(np.sqrt(np.mean(np.square(of))) if "rmse" in key else np.mean(of))
-        for label, each in runs.items()
-        for key, of in each.items()
-    }
-    result = Result(
-        experiment="x",
-        fuselog="1",
-        settings={"runs": len(rows) // len(runs)},
-        input_sha256="",
-        metrics=metrics,
-        claims=[],
-        bounds=bounds or {},
-    )
-    return story(findings(result, {"runs": rows}), timings=timings)
-
-
-NOISE = np.random.default_rng(3).normal(0.0, 0.1, (3, 20))
-HONEST = (2.0, 4.2)  # of three components over twenty runs
-
-
-def test_the_story_calls_a_draw_a_draw_and_names_who_is_too_sure_first() -> None:
-    """What chance explains is no winner, whoever has the smaller number; the broken one comes first."""
-    error = 1.0 + NOISE[0]
-    told = _told(
-        {
-            "a": {"position_rmse_m": list(error), "nees": list(3.0 + NOISE[1])},
-            "b": {"position_rmse_m": list(error + 1e-3 * NOISE[2]), "nees": list(3.0 + NOISE[2])},
-            "c": {"position_rmse_m": list(2.0 * error), "nees": list(27.0 + NOISE[2])},
-        },
-        {f"{label}.nees": HONEST for label in "abc"},
-    )
-    first, second = told.verdict
-    assert first.endswith("tie in position error: take either.")
-    assert second == "c is overconfident: its errors are 3 times what it states."
-    assert told.cards[2].estimator == "c"
-    assert [card.look for card in told.cards] == ["best", "best", "broken"]
-    assert told.cards[2].consistency == "Its errors are 3 times what it states"
-    assert told.cards[2].numbers.startswith("NEES 27")
-    assert told.cards[2].numbers.endswith("; 3 is right")
-    assert not told.is_sound
-    [difference] = told.differences
-    assert re.match(
-        r"c errs 0\.98\d m more than [ab] in the mean over runs \(95 % 0\.9\d+ to 1\.0\d m\)\.",
-        difference,
-    )
-
-
-def test_a_card_says_what_a_message_cost() -> None:
-    """Beside the one to take; nothing of who was given no message."""
-    told = _told(
-        {label: {"position_rmse_m": list(size + NOISE[0])} for size, label in enumerate("abc", start=1)},
-        timings={
-            "a": {"seconds": 0.02, "messages": 5000},
-            "b": {"seconds": 0.026, "messages": 5000},
-            "c": {"seconds": 0.0, "messages": 0},
-        },
-    )
-    feet = {card.estimator: card.foot for card in told.cards}
-    beside = "5.2 µs a message; in all 1.3 times the time of a"
-    assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
-
-
-@pytest.mark.parametrize(
-    ("seconds", "take"),
-    [
-        ((0.03, 0.04), "take either; a needs 0.75 times the time of b."),
-        ((0.04, 0.03), "take either; b needs 0.75 times the time of a."),
-        ((0.038, 0.04), "take either."),
-        ((0.003, 0.004), "take either."),
-    ],
-    ids=["first", "second", "alike", "too short to measure"],
-)
-def test_a_tie_is_broken_by_the_time_where_that_was_measured_and_differs(
-    seconds: tuple[float, float], take: str
-) -> None:
-    error = 1.0 + NOISE[0]
-    told = _told(
-        {
-            "a": {"position_rmse_m": list(error)},
-            "b": {"position_rmse_m": list(error + 1e-3 * NOISE[2])},
-        },
-        timings={
-            label: {"seconds": each, "messages": 5000} for label, each in zip("ab", seconds, strict=True)
-        },
-    )
-    assert told.verdict[0].endswith(take)
-
-
-def test_the_story_advises_what_is_best_beyond_chance_but_nobody_who_is_too_sure() -> None:
-    error = 1.0 + NOISE[0]
-    runs = {
-        "a": {"position_rmse_m": list(error), "nees": list(3.0 + NOISE[1])},
-        "b": {"position_rmse_m": list(0.5 * error), "nees": list(3.0 + NOISE[2])},
-    }
-    bounds = {f"{label}.nees": HONEST for label in "ab"}
-    told = _told(runs, bounds)
-    assert told.verdict == ["Take b: it has the least position error, 49.7 cm."]
-    assert told.cards[0].notes == ["Least error in each of the 20 runs."]
-    runs["b"]["nees"] = list(48.0 + NOISE[2])
-    assert _told(runs, bounds).verdict == [
-        "b errs least, 49.7 cm, but mend it before you believe its covariance; of the others a errs "
-        "least, 99.4 cm.",
-        "b is overconfident: its errors are 4 times what it states.",
-    ]
-
-
-def test_the_story_of_one_run_leaves_chance_open() -> None:
-    """Neither a winner beyond chance nor an interval; and a few hundredths of NEES are no fault."""
-    told = _told({"a": {"position_rmse_m": [1.0]}, "b": {"position_rmse_m": [0.5]}})
-    assert told.verdict[0].endswith("on this run, 0.500 m; whether by chance, 5 runs or more tell.")
-    assert not told.draws + told.differences
-    many = {"a": {"position_rmse_m": [1.0] * 2000, "nees": [3.15] * 2000}}
-    nearly = _told(many, {"a.nees": (2.894, 3.108)})
-    assert nearly.verdict == ["a has a position error of 1 m RMS; its errors are as large as it states."]
-    without = _told({"a": {"nis_per_component": [1.0]}}, {"a.nis_per_component": (0.9, 1.1)})
-    assert without.verdict == ["a: its innovations are as large as it states."]
-
-
-def test_the_opening_says_which_claims_hold() -> None:
-    claims = [
-        Claim("A is 1", "1", "1", "confirmed"),
-        Claim("B is 2", "2", "3", "refuted"),
-        Claim("C is 3", "3", "", "not reproducible"),
-        Claim("D is 4", "4", "3 to 5", "not shown"),
-    ]
-    settings = {"estimators": {"a": {}, "b": {}}, "record": {"scenario": "s"}, "runs": 4, "seed": 7}
-    result = Result(
-        experiment="x", fuselog="1", settings=settings, input_sha256="", metrics={}, claims=claims
-    )
-    begun = opening(result, {})
-    assert (
-        begun.tried
-        == "a and b over 4 simulated runs (scenario s), seed 7, each on the same measurements."
-    )
-    assert begun.story.verdict == [
-        "1 of 4 claims confirmed.",
-        "1 refuted: “B is 2”.",
-        "1 not shown; 1 not reproducible.",
-    ]
-
-
 def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     result: Path, tmp_path: Path, fuselog: Fuselog
 ) -> None:
@@ -383,19 +228,22 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     assert tried == "ekf and ukf over the same 5 runs, run by run."
     assert "Over 5 runs" in came
     tried, came = said(read_result(sweep), sweep)
-    assert tried.startswith("ekf.sigma_range_m from 0.05 to 0.2: 3 points, 2 runs of landmarks at each")
-    assert "ekf has its least position error" in came
-    assert re.search(
-        r"dead-reckoning \([\d.]+ [cm]+\) and ukf \([\d.]+ [cm]+\) do not depend on it\.", came
+    assert tried.startswith(
+        "Standard deviation of a range (ekf.sigma_range_m) from 0.05 to 0.2 m: 3 points, 2 runs of "
+        "landmarks at each"
     )
+    assert re.search(r"ekf errs least with standard deviation of a range = 0\.[\d]+ m\.", came)
+    assert "dead-reckoning and ukf do not depend on it." in came
     write_report([compare, sweep], tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert page.texts["h1"] == ["2 results"]
-    assert re.search(
-        r"The errors of its runs at [\d. and]+ overlap those at the best point: a sweep does not test "
-        r"whether that is chance; fuselog compare does\.",
-        (tmp_path / "page.html").read_text(encoding="utf-8"),
-    )
+    titles = [chart["title"] for chart in page.charts]
+    forest, scene, lens = titles[:3]  # several logs, and estimates that the folder does not keep
+    assert forest.startswith("Every difference with its interval")
+    assert scene.startswith("robot1, first run from above")
+    assert lens.startswith("Lens: 1 s of the first run")
+    axes = {panel["x"]["label"] for chart in page.charts for panel in chart["panels"]}
+    assert "standard deviation of a range (m)" in axes
     assert not re.search(r"\de[-+]\d", " ".join(page.texts["h3"]))
 
 

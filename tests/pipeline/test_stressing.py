@@ -5,14 +5,19 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import fuselog as fl
-from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of
+from pipeline.output.alarms import NOT_TESTED, Stressing
+from pipeline.output.report.kinds import opening
+from pipeline.output.results import RUNS, Result, read_result, read_table
+from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of, parameters_changed
+from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
-from pipeline.stressing.verdicts import NOT_TESTED
 from recorders.log import RunMetadata, Stream
 from replay.engine.streams.sources import memory_source
+from tests.replay.timeline.reading import picture_of
 
 VECTOR = fl.schemas.VECTOR_MEASUREMENT
 LINEAR = {"p_m": "linear", "v_mps": "linear"}
@@ -393,6 +398,78 @@ def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> No
     assert NOT_TESTED in fuselog("compare", logs[0], "-e", "ekf", "-e", "ukf").out
 
 
+def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, monkeypatch: Any) -> None:
+    """A verdict on every estimator, by all runs; what a change moves further than two differ is open."""
+    experiment = tmp_path / "near.toml"
+    experiment.write_text(
+        'title = "near"\nruns = 5\n[record]\nscenario = "landmarks"\nparameters = {duration_s = 2.0}\n'
+        '[estimators.one]\nkind = "ekf"\n[estimators.other]\nlike = "one"\nsigma_bearing_rad = 0.0204\n',
+        encoding="utf-8",
+    )
+    out = tmp_path / "out"
+    told = fuselog("run", str(experiment), "--stress", "--logs", "0", "--out", str(out)).out
+    assert NOT_TESTED not in told
+    kept = read_result(out)
+    assert [each.estimator for each in kept.stress] == ["one", "other"]
+    assert all(words in told for each in kept.stress for words in each.words)
+    assert "over 5 runs: " in kept.stress[0].words[0]
+    found = opening(kept, {"runs": read_table(out / RUNS)})
+    assert found.story.cards[0].stress in kept.stress
+    monkeypatch.setattr("pipeline.stressing.experiments.TOGETHER", 2)
+    parts = stress_result(kept)
+    assert [each.words for each in parts] == [each.words for each in kept.stress]
+    assert parts[0].moved == pytest.approx(kept.stress[0].moved)
+
+
+def test_pages_withhold_what_stress_moves_further() -> None:
+    runs = pd.DataFrame(
+        [
+            {"estimator": label, "case": "", "run": run, "position_rmse_m": 1.0 + 0.01 * run + more}
+            for label, more in (("a", 0.0), ("b", 0.1))
+            for run in range(8)
+        ]
+    )
+    metrics = {"a.position_rmse_m": 1.035, "b.position_rmse_m": 1.135}
+    said = []
+    for moved in (0.0, 0.09, 0.11):
+        stress = [Stressing("b", "sensitive", ["b is sensitive"], {"position_rmse_m": moved})]
+        result = Result(
+            experiment="x",
+            fuselog="1",
+            settings={"estimators": {"a": {}, "b": {}}, "runs": 8},
+            input_sha256="",
+            metrics=metrics,
+            claims=[],
+            stress=stress,
+        )
+        said.append(opening(result, {"runs": runs}).story)
+        assert "stress" in result.model_dump()
+        assert "stress" not in result.model_copy(update={"stress": []}).model_dump()
+    assert said[0].verdict == said[1].verdict == ["Take a: it has the least position error, 1.03 m."]
+    assert said[2].verdict[0].startswith("No verdict between a and b: changes that should not matter")
+    assert "is withheld" in said[2].draws[0]
+    assert said[1].differences
+    assert not said[2].differences
+
+
+def test_copies_fan_out_in_the_timeline(tmp_path: Any) -> None:
+    """Beside the estimate's way each copy's, and below how many sigmas it is away."""
+    found = fl.stress(fl.record("landmarks", duration_s=1.0, landmarks=3), "ekf")
+    found.draw(tmp_path / "fan.rrd")
+    moving = {
+        each.replace("\\", ""): rows for each, rows in picture_of(tmp_path / "fan.rrd").moving.items()
+    }
+    [stressed] = found.stressed
+    for name, each in stressed.tried.items():
+        assert each.parting is not None
+        curve = moving[f"/plots/stress/ekf/{name}"]["Scalars:scalars"]
+        assert np.ravel(curve) == pytest.approx(each.parting.amplification)
+        arrows = moving[f"/map/robot1/ekf, {name}/pose"]["Arrows2D:origins"]
+        [copy] = stressed.copies[name].values()
+        assert np.reshape(arrows, (-1, 2)) == pytest.approx(copy["mean"][:, :2], rel=1e-6)
+    assert len(stressed.tried) == len(CHANGES)
+
+
 def test_changes_go_to_both_sides_and_half_as_far_where_halved() -> None:
     values = np.linspace(0.1, 0.7, 8)[:, None]
     stamps_ns = EPOCH_NS + 10**9 * np.arange(1, 9)
@@ -407,3 +484,29 @@ def test_changes_go_to_both_sides_and_half_as_far_where_halved() -> None:
         rounded = CHANGES["single"].of_run(source, inputs, size, 3).streams["/car/a"]["value"]
         whole = values.astype(np.float32).astype(float) - values
         assert np.allclose(rounded - values, size * whole, rtol=1e-6, atol=1e-16)
+        [start] = CHANGES["start"].of_run(source, inputs, size, 3).streams["/car/prior"]["mean"]
+        assert abs(start) == pytest.approx(size * 0.1)  # sigmas, as the words say
+        given = {"a": 2.0, "of": [4.0, 3, True, 0.0], "gate_probability": 0.9, "low_probability": 0.1}
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            changed: Any = parameters_changed(given, size, rng)
+            shares = [changed["a"] / 2, changed["of"][0] / 4, changed["low_probability"] / 0.1]
+            shares.append((1 - changed["gate_probability"]) / 0.1)
+            assert np.abs(np.array(shares) - 1) == pytest.approx(size * 0.01)
+            assert changed["of"][1:] == [3, True, 0.0]
+
+
+def test_of_a_thousand_messages_ten_are_dropped_and_what_drives_comes_twice() -> None:
+    stamps_ns, values = EPOCH_NS + np.arange(10_000), np.arange(10_000.0)[:, None]
+    drive = recording([0.0], [1.0], dict.fromkeys("ab", (stamps_ns, values)))
+    source = memory_source(drive, RunMetadata("two sensors", epoch_ns=EPOCH_NS))
+    inputs = inputs_of(source, ["/car/a", "/car/b", "/car/prior"], ["/car/b"])
+    dropped = CHANGES["dropped"].of_run(source, inputs, 1.0, 3).streams
+    for topic in ("/car/a", "/car/b"):
+        assert 0.007 < 1 - len(dropped[topic]) / 10_000 < 0.013
+    left = [set(dropped[topic]["value"].ravel().tolist()) for topic in ("/car/a", "/car/b")]
+    assert left[0] != left[1]
+    again = CHANGES["zero duration"].of_run(source, inputs, 1.0, 3).streams
+    np.testing.assert_array_equal(again["/car/b"]["value"], np.repeat(values, 2, axis=0))
+    assert len(again["/car/a"]) == 10_000
+    assert len(dropped["/car/prior"]) == 1

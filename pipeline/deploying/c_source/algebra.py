@@ -1,30 +1,76 @@
 """The Kalman update in C, operation by operation that of `replay.inference.kalman.update`.
 
 `UPDATE` is the one of all filters but those that iterate, which have `ITERATE`; both call `ALGEBRA`.
+Square-root forms have an update of their own, and of this `COMMON` alone.
 
 NAME, T and M stand for the filter's name, its tangent space's size, and the most components of a sensor;
 REAL and what ends numbers and functions of libm, _S, for the precision.
 """
 
-ALGEBRA = """/* A = L L' in place, of the first `size` rows and columns; 0 where A is indefinite. */
-static int cholesky(REAL A[M][M], int size)
+CHOLESKY = """/* A = L L' in place, of the first `size` rows and columns; 0 where A is indefinite. */
+static int cholesky(REAL *A, int stride, int size)
 {
     for (int column = 0; column < size; column++)
         for (int row = column; row < size; row++) {
-            REAL entry = A[row][column];
+            REAL entry = A[row * stride + column];
             for (int k = 0; k < column; k++)
-                entry -= A[row][k] * A[column][k];
+                entry -= A[row * stride + k] * A[column * stride + k];
             if (row > column)
-                A[row][column] = entry / A[column][column];
+                A[row * stride + column] = entry / A[column * stride + column];
             else if (entry > 0.0_S)
-                A[row][row] = sqrt_S(entry);
+                A[row * stride + row] = sqrt_S(entry);
             else
                 return 0;
         }
     return 1;
 }
+"""
 
-/* Moves the components that were measured to the front; returns how many there are. */
+COMMON = """\
+/* How many times larger the covariance of an innovation counts, by the options of robust updates. */
+static REAL inflation(REAL nis, int size, const NAME_gate *gate)
+{
+    REAL factor = 1.0_S;
+    if (nis > gate->inflate_nis)
+        factor = nis / gate->inflate_nis;
+    if (gate->student_freedom > 0.0_S) {
+        const REAL wider = (gate->student_freedom + nis) / (gate->student_freedom + (REAL)size);
+        factor = wider > factor ? wider : factor;
+    }
+    if (nis > gate->switch_nis) {
+        const REAL half = 0.5_S * (1.0_S + nis / gate->switch_nis);
+        factor = half * half > factor ? half * half : factor;
+    }
+    return factor;
+}
+
+/* Whether a measurement is used: its NIS is below the bound, or the last one was used too long ago. */
+static int is_used(NAME *filter, int sensor, int size, REAL nis, const NAME_gate *gate)
+{
+    const double waited_s = (double)(filter->time_ns - filter->accepted_ns[sensor]) * 1e-9;
+    if (size == 0 || !(waited_s > gate->reopens_s || nis <= gate->nis[size]))
+        return 0;
+    filter->accepted_ns[sensor] = filter->time_ns;
+    return 1;
+}
+
+/* Keeps an innovation for whoever looks at it: each component at its place, NaN where it is missing. */
+static void keep(NAME_innovation *innovation, int components, const int *places, REAL v[M], REAL S[M][M])
+{
+    for (int i = 0; i < NAME_INNOVATION; i++) {
+        innovation->difference[i] = NAN;
+        for (int j = 0; j < NAME_INNOVATION; j++)
+            innovation->covariance[i][j] = NAN;
+    }
+    for (int i = 0; i < components; i++) {
+        innovation->difference[places[i]] = v[i];
+        for (int j = 0; j < components; j++)
+            innovation->covariance[places[i]][places[j]] = isnan(v[i] + v[j]) ? NAN : S[i][j];
+    }
+}
+"""
+
+ALGEBRA = """/* Moves the components that were measured to the front; returns how many there are. */
 static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
 {
     int size = 0;
@@ -45,28 +91,11 @@ static int drop_missing(int components, REAL v[M], REAL S[M][M], REAL C[T][M])
     return size;
 }
 
-/* How many times larger the covariance of an innovation counts, by the options of robust updates. */
-static REAL inflation(REAL nis, int size, const NAME_gate *gate)
-{
-    REAL factor = 1.0_S;
-    if (nis > gate->inflate_nis)
-        factor = nis / gate->inflate_nis;
-    if (gate->student_freedom > 0.0_S) {
-        const REAL wider = (gate->student_freedom + nis) / (gate->student_freedom + (REAL)size);
-        factor = wider > factor ? wider : factor;
-    }
-    if (nis > gate->switch_nis) {
-        const REAL half = 0.5_S * (1.0_S + nis / gate->switch_nis);
-        factor = half * half > factor ? half * half : factor;
-    }
-    return factor;
-}
-
 /* v becomes L^-1 v and S its factor L; the NIS is the square of that. 0 where S is indefinite. */
 static int whiten(int size, REAL v[M], REAL S[M][M], REAL *nis)
 {
     *nis = 0.0_S;
-    if (!cholesky(S, size))
+    if (!cholesky(&S[0][0], M, size))
         return 0;
     for (int i = 0; i < size; i++) {
         for (int k = 0; k < i; k++)
@@ -115,31 +144,6 @@ static void downdate(REAL P[T][T], int size, REAL W[T][M])
                 entry -= W[row][i] * W[column][i];
             P[row][column] = P[column][row] = entry;
         }
-}
-
-/* Whether a measurement is used: its NIS is below the bound, or the last one was used too long ago. */
-static int is_used(NAME *filter, int sensor, int size, REAL nis, const NAME_gate *gate)
-{
-    const double waited_s = (double)(filter->time_ns - filter->accepted_ns[sensor]) * 1e-9;
-    if (size == 0 || !(waited_s > gate->reopens_s || nis <= gate->nis[size]))
-        return 0;
-    filter->accepted_ns[sensor] = filter->time_ns;
-    return 1;
-}
-
-/* Keeps an innovation for whoever looks at it: each component at its place, NaN where it is missing. */
-static void keep(NAME_innovation *innovation, int components, const int *places, REAL v[M], REAL S[M][M])
-{
-    for (int i = 0; i < NAME_INNOVATION; i++) {
-        innovation->difference[i] = NAN;
-        for (int j = 0; j < NAME_INNOVATION; j++)
-            innovation->covariance[i][j] = NAN;
-    }
-    for (int i = 0; i < components; i++) {
-        innovation->difference[places[i]] = v[i];
-        for (int j = 0; j < components; j++)
-            innovation->covariance[places[i]][places[j]] = isnan(v[i] + v[j]) ? NAN : S[i][j];
-    }
 }
 """
 

@@ -1,52 +1,73 @@
 """The source of a filter in C99, of the graphs of its steps."""
 
 import re
-from collections.abc import Sequence
 
-from pipeline.deploying.c_source.header import predict_signature
+from pipeline.deploying.c_source.algebra import CHOLESKY
+from pipeline.deploying.c_source.factors import (
+    CARRYING,
+    FACTORISING,
+    RETRIANGULATE,
+    SAMPLING,
+    START,
+)
 from pipeline.deploying.c_source.names import CFilter, filled, identifier
+from pipeline.deploying.c_source.predictions import predicting_text
 from pipeline.deploying.c_source.products import (
     MEASURE,
     PROPAGATE,
-    SLOPE,
-    TURN,
     add_through,
+    slope_text,
+    turn_text,
 )
+from pipeline.deploying.c_source.samples import MOMENTS, samples_text
 from pipeline.deploying.c_source.statements import (
-    Inputs,
     body,
     count_gains,
-    guards,
-    jacobian_loops,
-    moved_state,
     turned_axes,
 )
 from pipeline.deploying.c_source.updates import algebra_text, correcting_text, update_text
+from replay.inference.linear_algebra.factors import NOTHING_LEFT, ROUNDING
 from replay.inference.linear_algebra.manifold import right_jacobian_factors
 from replay.tracing.c_text import Precision, c_lines, helpers_of
 from replay.tracing.functions import trace
 from replay.tracing.graph import Graph, needed
 
+IN_SINGLE = 5e-7, 3e-11  # for ROUNDING and NOTHING_LEFT: as many roundings, and their square
+
 
 def source(made: CFilter) -> str:
     """Write NAME.c."""
-    every = [
-        node for step in made.all_steps for node in needed([*step.outputs.values(), *step.conditions])
-    ]
+    every = [node for step in made.steps.all for node in needed([*step.outputs.values()])]
     parts = [
         f"/* {made.origin} Made by fuselog deploy; see {made.name}.h.\n"
         " * Compile it with -ffp-contract=off to have fuselog's bits. */",
-        f'#include "{made.name}.h"\n\n#include <math.h>\n',
+        f'#include "{made.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n',
+        filled(made, "enum { T = NAME_TANGENT, M = NAME_MOST };\n"),
         _as_tuned(made),
         *helpers_of(every, made.precision),
         *_products(made),
+        *samples_text(made),
+        *_moments(made),
         _init(made),
-        _predict(made),
+        *predicting_text(made),
         *correcting_text(made),
         *algebra_text(made),
         *(update_text(made, number) for number in range(len(made.sensors))),
     ]
-    return "\n".join(parts)
+    return _without_unused("\n".join(parts))
+
+
+_FUNCTION = re.compile(
+    r"(?:/\*(?:(?!\*/).)*\*/\n)?static [^;={}]*?\b(\w+)\([^;{}]*\)\n\{\n.*?^\}\n\n?", re.S | re.M
+)
+
+
+def _without_unused(text: str) -> str:
+    """Leave out functions that nothing calls, and what these alone call."""
+    for found in reversed([*_FUNCTION.finditer(text)]):
+        if len(re.findall(rf"\b{found[1]}\(", text)) == 1:
+            text = text[: found.start()] + text[found.end() :]
+    return text
 
 
 def _as_tuned(made: CFilter) -> str:
@@ -73,6 +94,13 @@ def repr_double(value: float) -> str:
     return Precision().number(value)
 
 
+_COPY = """\
+    for (int row = 0; row < T; row++)
+        for (int column = 0; column < T; column++)
+            filter->covariance[row][column] = covariance[row * T + column];
+"""
+
+
 def _init(made: CFilter) -> str:
     control = made.filtering.initial
     driven = "".join(
@@ -81,6 +109,7 @@ def _init(made: CFilter) -> str:
     )
     if made.is_interpolated:  # what drives it from the prior on is not known before its first message
         driven = "".join(f"    filter->control[{index}] = NAN;\n" for index in range(len(control)))
+        driven += "    filter->is_in_gap = 0;\n" if made.has_gaps else ""
     return filled(
         made,
         """void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance)
@@ -88,91 +117,48 @@ def _init(made: CFilter) -> str:
     filter->time_ns = time_ns;
     for (int i = 0; i < NAME_STATES; i++)
         filter->mean[i] = mean[i];
-    for (int row = 0; row < NAME_TANGENT; row++)
-        for (int column = 0; column < NAME_TANGENT; column++)
-            filter->covariance[row][column] = covariance[row * NAME_TANGENT + column];
-    for (int sensor = 0; sensor < NAME_SENSORS + 1; sensor++)
+BELIEF    for (int sensor = 0; sensor < NAME_SENSORS + 1; sensor++)
         filter->accepted_ns[sensor] = time_ns;
 DRIVEN}
-""".replace("DRIVEN", driven),
+""".replace("DRIVEN", driven).replace("BELIEF", START if made.is_root else _COPY),
     )
 
 
 def _products(made: CFilter) -> list[str]:
     """Write the loops that the steps use."""
-    steps = made.steps
-    jacobians = [name for step in made.all_steps for name in ("F", "H") if step.has(name)]
-    sizes = {"states": "T"} if count_gains(steps.predict) else {}
+    steps, is_root = made.steps, made.is_root
+    gained = [steps.predict, *([] if steps.gap is None else [steps.gap])]
+    sizes = {"states": "T"} if any(map(count_gains, gained)) else {}
     sizes |= {"components": "M"} if any(map(count_gains, steps.innovate)) else {}
-    texts = [PROPAGATE] if "F" in jacobians else []
-    texts += [MEASURE] if "H" in jacobians else []
-    texts += add_through(sizes, max(map(count_gains, made.all_steps)))
-    texts += [SLOPE] if steps.direction is not None else []
+    texts: list[str] = []
+    if is_root:
+        texts += [_factorising(made), CARRYING, RETRIANGULATE]
+    else:
+        texts += [CHOLESKY, PROPAGATE, MEASURE]
+    texts += add_through(sizes, max(map(count_gains, steps.all)))
+    texts += [slope_text(is_root=is_root)] if steps.direction is not None else []
     if turned_axes(made):
         graph = Graph()
         factors = trace(graph, right_jacobian_factors, (None,)).returned
         lines = c_lines(dict(zip("fg", factors, strict=True)), {(0, None): "squared"}, made.precision)
-        texts.append(TURN.replace("FACTORS\n", body(lines)))
+        texts.append(turn_text(body(lines), is_root=is_root))
     return [filled(made, text) for text in texts]
 
 
-def _declares_covariance(made: CFilter, declared: list[str], lines: Sequence[str]) -> list[str]:
-    if any(re.search(r"\bP[\[,]", each) for each in lines) and not any(
-        "const P)" in each for each in declared
-    ):
-        upper = made.name.upper()
-        declared.append(f"{made.precision.real} (*const P)[{upper}_TANGENT] = filter->covariance;")
-    return declared
+def _moments(made: CFilter) -> list[str]:
+    """Write what is made of samples."""
+    if not any(made.steps.sampled):
+        return []
+    return [filled(made, SAMPLING if made.is_root else MOMENTS)]
 
 
-_BETWEEN_CONTROLS = """{
-    int outcome = NAME_WELL;
-    if (time_ns < filter->time_ns)
-        return NAME_WELL;
-    if (time_ns > filter->time_ns) {
-        if (!isnan(filter->control[0]))
-            for (int k = 0; k < NAME_CONTROLS; k++)
-                filter->control[k] = 0.5_S * (filter->control[k] + control[k]);
-        outcome = predict(filter, time_ns, parameters);
-    }
-    for (int k = 0; k < NAME_CONTROLS; k++)
-        if (!isnan(control[k]))
-            filter->control[k] = control[k];
-    return outcome;
-}
-"""
-
-
-def _predict(made: CFilter) -> str:
-    step = made.steps.predict
-    names, declared = Inputs(made, "motion").names(step, "control")
-    named, assigned = moved_state(made, step)
-    if step.has("F"):
-        call = "propagate(filter->covariance, F, columns_of_F); /* P = F P F' */"
-        loops = jacobian_loops(step, "F", made.tangent, call, "P", "states")
-        named |= loops.named
-        declared = [*(filled(made, each) for each in loops.declared), *declared]
-        assigned = [*loops.calls, *assigned]
-    declared = _declares_covariance(made, declared, assigned)
-    real = made.precision.real
-    span = "(double)(time_ns - filter->time_ns) * 1e-9"
-    if "duration_s" in names.values():
-        declared.append(
-            f"const {real} duration_s = " + (f"({real})({span});" if real != "double" else f"{span};")
-        )
-    begin = ["if (time_ns <= filter->time_ns)\n        return NAME_WELL;"]
-    if made.is_interpolated:
-        outer = filled(made, f"{predict_signature(made)}\n{_BETWEEN_CONTROLS}")
-        signature = (
-            "static int predict(NAME *filter, int64_t time_ns, const NAME_parameters *parameters)"
-        )
-        begin = []
-    else:
-        outer = ""
-        signature = predict_signature(made)
-    unused = [] if "parameters->" in "".join(declared) else ["(void)parameters;"]
-    lines = [*c_lines(named, names, made.precision)]
-    text = filled(made, f"{signature}\n{{\n{body(begin)}") + body(declared)
-    text += body(unused) + body(guards(made, step, names)) + body(lines) + body(assigned)
-    text += filled(made, "    filter->time_ns = time_ns;\n    return NAME_WELL;\n}\n")
-    return text + ("\n" + outer if outer else "")
+def _factorising(made: CFilter) -> str:
+    """Write how rows are factorised, with room for the largest step."""
+    t, m, number = made.tangent, made.most if made.sensors else 0, made.precision.number
+    counts = [len(each.points) if each is not None else t for each in made.steps.sampled]
+    columns = [counts[0] + t, *(count + m for count in counts[1:])]
+    sizes = f"enum {{ SIDE = {max(t, m)}, ROWS = {t + m}, COLUMNS = {max(columns)} }};\n\n"
+    rounding, nothing = IN_SINGLE if made.precision.ending else (ROUNDING, NOTHING_LEFT)
+    return sizes + FACTORISING.replace("ROUNDING", number(rounding)).replace(
+        "NOTHING_LEFT", number(nothing)
+    )

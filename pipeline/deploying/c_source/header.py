@@ -8,6 +8,12 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.inference.formulas import reference_names
 from replay.inference.model.model import Sensor
 
+_COVARIANCE = """\
+/* The covariance, of the lower factor L that the filter carries: L L'. */
+void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANGENT]);
+
+"""
+
 
 def header(made: CFilter) -> str:
     """Write NAME.h."""
@@ -29,7 +35,7 @@ def header(made: CFilter) -> str:
         *_enum(made, "SENSOR_", [name for name, _ in made.sensors], "SENSORS"),
         *_enum(made, "INNOVATION_", [identifier(name) for name in made.innovation], "INNOVATION"),
         f"enum {{ {upper}_MOST = {made.most} }}; /* components of the widest sensor */",
-        f"enum {{ {upper}_WELL, {upper}_NOTHING_MEASURED, {upper}_NOT_POSITIVE_DEFINITE }};\n",
+        f"enum {{ {', '.join(f'{upper}_{each}' for each in outcomes(made))} }};\n",
         filled(
             made,
             """/* A measurement with a larger NIS than nis[its components] is not used, unless the last
@@ -50,10 +56,10 @@ typedef struct {
             """typedef struct {
     int64_t time_ns;
     REAL mean[NAME_STATES];
-    REAL covariance[NAME_TANGENT][NAME_TANGENT];
+    REAL CARRIED[NAME_TANGENT][NAME_TANGENT];
     REAL control[NAME_CONTROLS + 1];
     int64_t accepted_ns[NAME_SENSORS + 1]; /* when a measurement was last used */
-} NAME;
+GAP} NAME;
 
 /* Measured minus predicted, and its covariance before the update; NAN where a component is missing. */
 typedef struct {
@@ -66,7 +72,12 @@ typedef struct {
 /* Starts at a prior, undriven. */
 void NAME_init(NAME *filter, int64_t time_ns, const REAL *mean, const REAL *covariance);
 
-""",
+FACTOR""".replace("CARRIED", "factor" if made.is_root else "covariance")
+            .replace("FACTOR", _COVARIANCE if made.is_root else "")
+            .replace(
+                "GAP",
+                "    int is_in_gap; /* whether what drives it is silent */\n" if made.has_gaps else "",
+            ),
         ),
         _predict_comment(made),
         filled(made, f"{predict_signature(made)};\n"),
@@ -103,6 +114,12 @@ def _struct(made: CFilter) -> Iterator[str]:
         yield f"    }} {part};"
 
 
+def outcomes(made: CFilter) -> list[str]:
+    """List what a prediction or an update may return."""
+    lost = ["NOT_DRIVEN"] if made.has_gaps else []
+    return ["WELL", "NOTHING_MEASURED", "NOT_POSITIVE_DEFINITE", *lost]
+
+
 def predict_signature(made: CFilter) -> str:
     """Write how a prediction is called."""
     control = ", const REAL *control" if made.is_interpolated else ""
@@ -111,9 +128,28 @@ def predict_signature(made: CFilter) -> str:
 
 def _predict_comment(made: CFilter) -> str:
     if made.is_interpolated:
-        return "/* Predicts to a time, driven by the mean of the last control and that at this time. */"
+        return _between_comment(made)
     driven = "; filter->control holds until it is changed" if made.controls else ""
     return f"/* Predicts to a time{driven}. */"
+
+
+def _between_comment(made: CFilter) -> str:
+    control = made.filtering.stage.model.control
+    assert control is not None
+    told = "Predicts to a time, driven by the mean of the last control and that at this time."
+    if not made.has_gaps:
+        return f"/* {told} */"
+    after = (
+        "the next prediction with a control passes over all of it"
+        if made.steps.gap is not None
+        else "the filter has to be started again"
+    )
+    silent = made.filtering.gap_ns * 1e-9
+    return (
+        f"/* {told}\n * Hand over NAN where {control.topic} is silent for longer than {control.gap},\n"
+        f" * {silent:g} s, up to its first message then: {made.name.upper()}_NOT_DRIVEN says that the\n"
+        f" * estimate is unknown, messages are not to be used, and {after}. */"
+    )
 
 
 def update_signature(name: str) -> str:

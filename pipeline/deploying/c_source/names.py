@@ -5,16 +5,19 @@ from hashlib import sha256
 from typing import NamedTuple
 
 from replay.inference.kalman.update import innovation_components
+from replay.inference.linear_algebra.factors import FACTORS
 from replay.inference.model.model import Sensor
 from replay.inference.model.parameters import number_fields
 from replay.inference.run.filtering import Filter
-from replay.inference.whole_steps import Step, WholeSteps
+from replay.inference.step_graphs import Step
+from replay.inference.whole_steps import WholeSteps
 from replay.tracing.c_text import Precision
 from replay.tracing.graph import INPUT, described, needed
 
 _NAMES_OF_C = """auto break case char const continue default do double else enum extern float for goto if
 inline int long register restrict return short signed sizeof static struct switch typedef union unsigned
-void volatile while filter parameters P S C v F H G u a slope data time_ns duration_s step innovation"""
+void volatile while filter parameters P S C v F H G u a slope data time_ns duration_s step innovation
+samples away centre shift value again index round i k found noise factorisation drawn_samples"""
 
 
 class CFilter(NamedTuple):
@@ -51,10 +54,21 @@ class CFilter(NamedTuple):
         return control.components if control else ()
 
     @property
+    def is_root(self) -> bool:
+        """Tell whether it carries a factor of the covariance, not the covariance itself."""
+        return self.filtering.form is FACTORS
+
+    @property
     def is_interpolated(self) -> bool:
         """Tell whether the motion gets the mean of the controls at both ends of a step."""
         control = self.filtering.stage.model.control
         return control is not None and control.interpolated
+
+    @property
+    def has_gaps(self) -> bool:
+        """Tell whether its control may be silent for so long that nothing is known meanwhile."""
+        control = self.filtering.stage.model.control
+        return control is not None and bool(control.gap)
 
     @property
     def sensors(self) -> list[tuple[str, Sensor]]:
@@ -76,20 +90,21 @@ class CFilter(NamedTuple):
         return list(innovation_components(self.filtering.stage.sensors)) or ["none"]
 
     @property
+    def parts(self) -> list[str]:
+        """List the motion and the sensors, as the parameters stand in C."""
+        return ["motion", *(name for name, _ in self.sensors)]
+
+    @property
     def values(self) -> dict[str, dict[str, float]]:
         """Return the parameters that motion and sensors read, by part, with their values."""
         names = number_fields(self.filtering.stage.model.parameters)
-        parts = [
-            ("motion", self.steps.predict),
-            *zip(dict(self.sensors), self.steps.innovate, strict=True),
-        ]
         return {
             part: {
                 name: float(self.filtering.settings[row, names.index(name)])
                 for name in names
-                if name in _read(step)
+                if any(name in _read(step) for step in self.steps.of(row))
             }
-            for row, (part, step) in enumerate(parts)
+            for row, part in enumerate(self.parts)
         }
 
     def robustness(self, row: int) -> dict[str, float]:
@@ -102,20 +117,16 @@ class CFilter(NamedTuple):
         }
 
     @property
-    def all_steps(self) -> list[Step]:
-        """List the steps."""
-        predict, innovate, direction, correct, _ = self.steps
-        return [predict, *innovate, *([] if direction is None else [direction]), correct]
-
-    @property
     def digest(self) -> str:
         """Return what is the same for the same graphs and numbers."""
-        words = [repr([[*step.outputs] for step in self.all_steps])]
+        words = [repr([[*step.outputs] for step in self.steps.all])]
+        words += [word for step in self.steps.all for word in described([*step.outputs.values()])]
         words += [
-            word
-            for step in self.all_steps
-            for word in described([*step.outputs.values(), *step.conditions])
+            repr((each.points.tolist(), each.weights.tolist()))
+            for each in self.steps.sampled
+            if each is not None
         ]
+        words += ["factors"] if self.is_root else []
         numbers = [repr(self.values), repr(self.filtering.gates.tolist()), self.precision.real]
         return sha256("\n".join([*words, *numbers]).encode()).hexdigest()[:16]
 
@@ -133,7 +144,7 @@ def identifier(name: str) -> str:
 
 
 def _read(step: Step) -> set[str]:
-    nodes = needed([*step.outputs.values(), *step.conditions])
+    nodes = needed([*step.outputs.values()])
     return {
         each.value[1] for each in nodes if each.operation is INPUT and isinstance(each.value[1], str)
     }
@@ -143,7 +154,4 @@ def filled(made: CFilter, template: str) -> str:
     """Fill the names and sizes of a filter into a template."""
     text = re.sub(r"\bNAME_(?=[A-Z])", f"{made.name.upper()}_", template)
     text = re.sub(r"\bNAME(?=_|\b)", made.name, text)
-    upper = made.name.upper()
-    text = re.sub(r"(?<=\[)T\b|(?<=< )T\b", f"{upper}_TANGENT", text)
-    text = re.sub(r"(?<=\[)M\b", f"{upper}_MOST", text)
     return made.precision.text(text)

@@ -61,14 +61,14 @@ static void measure(REAL P[T][T], REAL H[M][T], const signed char (*columns)[T +
 }
 """
 
-TURN = """/* P = J P J' for the rotation whose axes begin at `at`, with its right Jacobian at the step d,
- * J = I - f [d]x + g [d]x^2: P goes over into the tangent space of the moved orientation. */
+TURN = """/* WHAT for the rotation whose axes begin at `at`, with its right Jacobian at the step d,
+ * J = I - f [d]x + g [d]x^2: it goes over into the tangent space of the moved orientation. */
 static void turn(REAL P[T][T], const REAL step[T], int at)
 {
     const REAL x = step[at], y = step[at + 1], z = step[at + 2];
     const REAL squared = x * x + y * y + z * z;
 FACTORS
-    for (int side = 0; side < 2; side++)
+    for (int side = 0; side < SIDES; side++)
         for (int column = 0; column < T; column++) {
             REAL *const first = side == 0 ? &P[at][column] : &P[column][at];
             REAL *const second = side == 0 ? &P[at + 1][column] : &P[column][at + 1];
@@ -86,17 +86,33 @@ SLOPE = """/* P a / (a' P a): how the state changes with what bends along a. */
 static void find_slope(REAL P[T][T], const REAL a[T], REAL slope[T])
 {
     REAL variance = 0.0_S;
-    for (int row = 0; row < T; row++) {
-        slope[row] = 0.0_S;
-        for (int column = 0; column < T; column++)
-            slope[row] += P[row][column] * a[column];
-    }
     for (int row = 0; row < T; row++)
+        slope[row] = 0.0_S;
+PRODUCT    for (int row = 0; row < T; row++)
         variance += a[row] * slope[row];
     for (int row = 0; row < T; row++)
         slope[row] = variance > 0.0_S ? slope[row] / variance : 0.0_S;
 }
 """
+_TIMES = """\
+    for (int row = 0; row < T; row++)
+        for (int column = 0; column < T; column++)
+            slope[row] += P[row][column] * a[column];
+"""
+_TIMES_FACTOR = """\
+    for (int k = 0; k < T; k++) { /* P P' a, of the factor P */
+        REAL entry = 0.0_S;
+        for (int row = k; row < T; row++)
+            entry += P[row][k] * a[row];
+        for (int row = k; row < T; row++)
+            slope[row] += P[row][k] * entry;
+    }
+"""
+
+
+def slope_text(*, is_root: bool) -> str:
+    """Write how the state changes with what bends; of a covariance, or of its factor."""
+    return SLOPE.replace("PRODUCT", _TIMES_FACTOR if is_root else _TIMES)
 
 
 def add_through(sizes: Mapping[str, str], gains: int) -> list[str]:
@@ -111,3 +127,9 @@ def columns_text(name: str, columns: list[list[int]], size: str) -> str:
     """Write the table of a matrix's columns."""
     rows = ", ".join("{" + ", ".join(map(str, [*row, -1])) + "}" for row in columns)
     return f"static const signed char {name}[{size}][T + 1] = {{{rows}}};"
+
+
+def turn_text(factors: str, *, is_root: bool) -> str:
+    """Write how a covariance is turned with an orientation, from both sides; its factor from one."""
+    what, sides = ("A factor P = J P", "1") if is_root else ("P = J P J'", "2")
+    return TURN.replace("WHAT", what).replace("SIDES", sides).replace("FACTORS\n", factors)

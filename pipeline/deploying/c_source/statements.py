@@ -1,15 +1,14 @@
 """Names, declarations and loops that the functions of a filter in C are put together of."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from pipeline.deploying.c_source.names import CFilter, identifier
 from pipeline.deploying.c_source.products import (
     columns_text,
 )
-from replay.inference.linear_algebra.manifold import manifold_blocks
-from replay.inference.whole_steps import Step
-from replay.tracing.c_text import truth_text
+from replay.inference.linear_algebra.manifold import is_flat, manifold_blocks
+from replay.inference.step_graphs import Step
 from replay.tracing.graph import INPUT, Node, needed
 
 
@@ -31,9 +30,8 @@ class Inputs:
         """
         names: dict[Any, str] = {}
         lines: dict[str, str] = {}
-        nodes = needed([*step.outputs.values(), *step.conditions])
+        nodes = needed([*step.outputs.values()])
         real = self.made.precision.real
-        uses_covariance = False
         for node in nodes:
             if node.operation is not INPUT:
                 continue
@@ -42,8 +40,6 @@ class Inputs:
             if argument == 0:
                 name = self.state[place[0]]
                 declared = f"filter->mean[{self.made.name.upper()}_{name.upper()}]"
-            elif argument == 1:
-                name, uses_covariance = f"P[{place[0]}][{place[1]}]", True
             elif isinstance(place, str):
                 name = identifier(place)
                 name = f"{name}_" if name in (*self.state, *self.controls) else name
@@ -58,13 +54,11 @@ class Inputs:
             names[node.value] = name
             if declared:
                 lines[name] = f"const {real} {name} = {declared};"
-        if uses_covariance:
-            lines["P"] = f"{real} (*const P)[{self.made.name.upper()}_TANGENT] = filter->covariance;"
         return names, list(lines.values())
 
 
 def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
-    """Name what a step makes of mean and covariance, and write the assignments."""
+    """Name what a step makes of the mean, and write the assignments."""
     state = [identifier(name) for name in made.filtering.stage.model.state]
     named: dict[str, Node] = {}
     lines: list[str] = []
@@ -73,17 +67,11 @@ def moved_state(made: CFilter, step: Step) -> tuple[dict[str, Node], list[str]]:
             name = f"next_{state[place[0]]}"
             named[name] = node
             lines.append(f"filter->mean[{made.name.upper()}_{state[place[0]].upper()}] = {name};")
-        elif array == "P" and place[0] >= place[1]:
-            row, column = place
-            name = f"next_P{row}_{column}"
-            named[name] = node
-            twin = f"P[{column}][{row}] = " if row != column else ""
-            lines.append(f"P[{row}][{column}] = {twin}{name};")
     return named, lines
 
 
 class Loops(NamedTuple):
-    """Holds what loops over a Jacobian go by: declarations, what the graph gives, and the calls."""
+    """Holds what is done in loops: declarations, what the graph gives for it, and the calls."""
 
     declared: list[str]
     named: dict[str, Node]
@@ -102,10 +90,21 @@ def jacobian_loops(step: Step, jacobian: str, rows: int, multiply: str, into: st
         what: `states` or `components`, for the size of that matrix.
     """
     size = "T" if what == "states" else "M"
-    declared = [f"REAL {jacobian}[{size}][T];"]
-    declared.insert(0, columns_text(f"columns_of_{jacobian}", step.columns(jacobian, rows), size))
-    named = entries(step, jacobian)
-    calls = [multiply]
+    columns = columns_text(f"columns_of_{jacobian}", step.columns(jacobian, rows), size)
+    noise = noise_loops(step, rows, into, what)
+    return Loops(
+        [columns, f"REAL {jacobian}[{size}][T];", *noise.declared],
+        entries(step, jacobian) | noise.named,
+        [multiply, *noise.calls],
+    )
+
+
+def noise_loops(step: Step, rows: int, into: str, what: str) -> Loops:
+    """Write what adds a step's noise, given as G and u and as N, to a matrix; see `jacobian_loops`."""
+    size = "T" if what == "states" else "M"
+    declared: list[str] = []
+    named: dict[str, Node] = {}
+    calls: list[str] = []
     gains = count_gains(step)
     if gains:
         declared.append(f"REAL G[{size}][GAINS] = {{{{0}}}}, u[GAINS];")
@@ -142,15 +141,12 @@ def turned_axes(made: CFilter) -> list[int]:
     return [tangent for kind, _, tangent, _ in blocks if kind == "quaternion"]
 
 
+def retriangulates(made: CFilter) -> bool:
+    """Tell whether a correction turns the covariance, so that its factor is none any more."""
+    model = made.filtering.stage.model
+    return bool(made.sensors) and model.correct is None and not is_flat(model.kinds)
+
+
 def body(lines: Iterable[str]) -> str:
     """Write the lines of a function."""
     return "".join(f"    {each}\n" for each in lines)
-
-
-def guards(made: CFilter, step: Step, names: Mapping[Any, str]) -> list[str]:
-    """Return early where the step's conditions do not hold."""
-    return [
-        f"if (!({truth_text(each, names, made.precision)}))\n"
-        f"        return {made.name.upper()}_NOT_POSITIVE_DEFINITE;"
-        for each in step.conditions
-    ]

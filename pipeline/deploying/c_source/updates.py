@@ -2,16 +2,20 @@
 
 import re
 
-from pipeline.deploying.c_source.algebra import ALGEBRA, ITERATE, UPDATE
+from pipeline.deploying.c_source import factors
+from pipeline.deploying.c_source.algebra import ALGEBRA, COMMON, ITERATE, UPDATE
 from pipeline.deploying.c_source.header import update_signature
 from pipeline.deploying.c_source.names import CFilter, filled
+from pipeline.deploying.c_source.samples import sampling_call, weighed
 from pipeline.deploying.c_source.statements import (
     Inputs,
+    Loops,
     body,
     entries,
-    guards,
     jacobian_loops,
     moved_state,
+    noise_loops,
+    retriangulates,
     turned_axes,
 )
 from replay.inference.kalman.iterated_update import SETTLED
@@ -23,6 +27,7 @@ def correcting_text(made: CFilter) -> list[str]:
     if not made.sensors:
         return []
     step, direction = made.steps.correct, made.steps.direction
+    carried = "factor" if made.is_root else "covariance"
     texts = []
     if direction is not None:
         names, declared = Inputs(made, "").names(direction)
@@ -30,16 +35,21 @@ def correcting_text(made: CFilter) -> list[str]:
         text += "static void bend(NAME *filter, REAL slope[T])\n{\n"
         text += body([*declared, "REAL a[T];"])
         text += body(c_lines(entries(direction, "a"), names, made.precision))
-        texts.append(filled(made, text + "    find_slope(filter->covariance, a, slope);\n}\n"))
+        texts.append(filled(made, text + f"    find_slope(filter->{carried}, a, slope);\n}}\n"))
     names, declared = Inputs(made, "").names(step, "step", "slope")
     named, assigned = moved_state(made, step)
     if step.has("F"):
-        call = "propagate(filter->covariance, F, columns_of_F);"
-        loops = jacobian_loops(step, "F", made.tangent, call, "P", "states")
+        t, call = made.tangent, f"propagate(filter->{carried}, F, columns_of_F);"
+        if made.is_root:
+            call = f"carry(filter, F, columns_of_F, {t}, &found);"
+            declared = ["factorisation found;", *declared]
+            assigned = [f"orthogonalise(&found, {t}, {t});", "take_factor(filter, &found);", *assigned]
+        loops = jacobian_loops(step, "F", t, call, "P", "states")
         declared = [*loops.declared, *declared]
         named |= loops.named
         assigned = [*loops.calls, *assigned]
-    assigned += [f"turn(filter->covariance, step, {at});" for at in turned_axes(made)]
+    assigned += [f"turn(filter->{carried}, step, {at});" for at in turned_axes(made)]
+    assigned += ["retriangulate(filter);"] if made.is_root and retriangulates(made) else []
     head = (
         "/* Moves the state by a step of its tangent space, and the covariance with it. */\n"
         "static void correct(NAME *filter, const REAL step[T], const REAL slope[T])\n{\n"
@@ -61,66 +71,98 @@ def algebra_text(made: CFilter) -> list[str]:
     """Write the update that all sensors have in common."""
     if not made.sensors:
         return []
+    if made.is_root:
+        return [filled(made, COMMON), _bending(made, filled(made, factors.UPDATE))]
     settled = made.precision.number(1e-6 if made.precision.ending else SETTLED)
     own = ITERATE.replace("LEAST_CHANGE", settled) if made.steps.is_iterated else UPDATE
-    return [filled(made, ALGEBRA), _bending(made, filled(made, own))]
+    return [filled(made, COMMON), filled(made, ALGEBRA), _bending(made, filled(made, own))]
 
 
 def update_text(made: CFilter, number: int) -> str:
     """Write the update by a sensor."""
-    (name, sensor), step = made.sensors[number], made.steps.innovate[number]
-    m = len(sensor.measured)
-    names, declared = Inputs(made, name).names(step, "data", "", "step", "slope")
-    named, calls = entries(step, "v"), []
-    if step.has("S"):
-        named |= {f"S[{i}][{j}]": step.outputs["S", (i, j)] for i in range(m) for j in range(i + 1)}
-        named |= entries(step, "C")
-        calls = [f"S[{j}][{i}] = S[{i}][{j}];" for i in range(m) for j in range(i)]
-    else:
-        call = f"measure(filter->covariance, H, columns_of_H, {m}, C, S); /* C = P H', S = H C */"
-        loops = jacobian_loops(step, "H", m, call, "S", "components")
-        declared = [*(filled(made, each) for each in loops.declared), *declared]
-        named, calls = named | loops.named, loops.calls
-    innovated = body(guards(made, step, names))
-    innovated += body([*c_lines(named, names, made.precision), *calls])
+    name, sensor = made.sensors[number]
+    m, loops, lines = len(sensor.measured), *_innovation(made, number)
     places = [made.innovation.index(each) for each in sensor.measured]
     missing = " && ".join(f"isnan(data[{index}])" for index in range(m))
-    begin = (
-        f"{update_signature(name)}\n{{\n"
-        f"    static const int places[] = {{{', '.join(map(str, places))}}};\n"
-        "    REAL v[M], S[M][M], C[T][M];\n"
-    )
-    given = f"    if ({missing})\n        return NAME_NOTHING_MEASURED;\n"
+    begin = [f"static const int places[] = {{{', '.join(map(str, places))}}};"]
+    given = [f"if ({missing})", "    return NAME_NOTHING_MEASURED;"]
+    head = f"{update_signature(name)}\n{{\n"
+    gate = f"&parameters->{name}.gate, innovation"
     if made.steps.is_iterated:
-        return _linearise(made, name, body(declared) + innovated) + _bending(
-            made,
-            filled(
-                made,
-                f"{begin}    REAL step[T] = {{0}}, factor = 1.0_S;\n"
-                f"    int outcome = UNSETTLED;\n{given}"
-                "    FIND_SLOPE;\n    for (int iteration = 0; outcome == UNSETTLED; iteration++) {\n"
-                f"        linearise_{name}(filter, step, slope, data, parameters, v, S, C);\n"
-                f"        keep(innovation, {m}, places, v, S);\n"
-                f"        outcome = iterate(filter, NAME_SENSOR_{name.upper()}, {m}, iteration,\n"
-                "                          v, S, C, step, slope, &factor,\n"
-                f"                          &parameters->{name}.gate, innovation);\n"
-                "    }\n    return outcome;\n}\n",
-            ),
+        calls = [
+            "REAL v[M], S[M][M], C[T][M];",
+            "REAL step[T] = {0}, factor = 1.0_S;",
+            "int outcome = UNSETTLED;",
+            *given,
+            "FIND_SLOPE;",
+            "for (int iteration = 0; outcome == UNSETTLED; iteration++) {",
+            f"    linearise_{name}(filter, step, slope, data, parameters, v, S, C);",
+            f"    keep(innovation, {m}, places, v, S);",
+            f"    outcome = iterate(filter, NAME_SENSOR_{name.upper()}, {m}, iteration,",
+            f"                      v, S, C, step, slope, &factor, {gate});",
+            "}",
+            "return outcome;",
+        ]
+        own = _bending(made, filled(made, head + body([*begin, *calls]) + "}\n"))
+        return _linearise(made, name, body([*loops.declared, *lines])) + own
+    if made.is_root:
+        sampled = made.steps.sampled[number + 1]
+        columns = made.tangent if sampled is None else len(sampled.points)
+        begin.append("REAL v[M], noise[M][M] = {{0}};")
+        begin.append("factorisation found;")
+        end = [
+            f"return update(filter, NAME_SENSOR_{name.upper()}, {m}, {columns}, places, v, noise,",
+            f"              &found, {gate});",
+        ]
+    else:
+        begin.append("REAL v[M], S[M][M], C[T][M];")
+        end = [
+            f"keep(innovation, {m}, places, v, S);",
+            f"return update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,",
+            f"              {gate});",
+        ]
+    return filled(made, head + body([*begin, *loops.declared, *given, *lines, *end]) + "}\n")
+
+
+def _innovation(made: CFilter, number: int) -> tuple[Loops, list[str]]:
+    """Write how an innovation is formed: what is declared for it, and the lines."""
+    (name, sensor), step = made.sensors[number], made.steps.innovate[number]
+    m, t, sampled = len(sensor.measured), made.tangent, made.steps.sampled[number + 1]
+    into = "noise" if made.is_root else "S"
+    first: list[str] = []
+    if sampled is None:
+        names, declared = Inputs(made, name).names(step, "data", "", "step", "slope")
+        call = (
+            f"carry(filter, H, columns_of_H, {m}, &found);"
+            if made.is_root
+            else f"measure(filter->covariance, H, columns_of_H, {m}, C, S); /* C = P H', S = H C */"
         )
-    end = (
-        f"    keep(innovation, {m}, places, v, S);\n"
-        f"    return update(filter, NAME_SENSOR_{name.upper()}, {m}, v, S, C,\n"
-        f"                  &parameters->{name}.gate, innovation);\n}}\n"
-    )
-    return filled(made, begin) + body(declared) + filled(made, given) + innovated + filled(made, end)
+        loops = jacobian_loops(step, "H", m, call, into, "components")
+        if made.is_root:
+            loops = loops._replace(calls=[*loops.calls, f"add_factor(filter, {m}, &found);"])
+    else:
+        names, declared = Inputs(made, name).names(step, "data", "", "samples.centre")
+        loops = noise_loops(step, m, into, "components")
+        declared = ["drawn_samples samples;", *declared]
+        call = sampling_call(made, number + 1)
+        if made.is_root:
+            first = ["start_samples(filter, &samples);", call]
+            first.append(f"spread(&samples, {weighed(sampled)}, {m}, {t}, &found);")
+        else:
+            first = ["if (!start_samples(filter, &samples))", "    return NAME_NOT_POSITIVE_DEFINITE;"]
+            first.append(call)
+            first.append(f"find_moments(&samples, {weighed(sampled)}, {m}, &S[0][0], M, C);")
+    named = entries(step, "v") | loops.named
+    lines = [*first, *c_lines(named, names, made.precision), *loops.calls]
+    return loops._replace(declared=[*loops.declared, *declared]), lines
 
 
-def _linearise(made: CFilter, name: str, body: str) -> str:
+def _linearise(made: CFilter, name: str, text: str) -> str:
     """Write the innovation of a sensor that is linearised at every iterate."""
     head = f"""/* The innovation about the mean, of the sensor linearised at the mean moved by a step. */
 static void linearise_{name}(NAME *filter, const REAL step[T], const REAL slope[T], const REAL *data,
     const NAME_parameters *parameters, REAL v[M], REAL S[M][M], REAL C[T][M])
 {{
 """
-    unused = "" if "parameters->" in body else "    (void)parameters;\n"
-    return _bending(made, filled(made, head) + unused + body + "}\n\n")
+    unused = "" if "parameters->" in text else "    (void)parameters;\n"
+    return _bending(made, filled(made, head + unused + text) + "}\n\n")

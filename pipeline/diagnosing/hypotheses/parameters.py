@@ -1,6 +1,5 @@
 """Faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -23,7 +22,7 @@ from pipeline.diagnosing.likelihood import Trial
 from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
 from recorders.log import Stream, Topic
-from recorders.parameters import Parameters, meanings
+from recorders.parameters import Parameters, in_few_words, meanings
 from replay.engine.replaying.estimator import Bound, Reading
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
@@ -53,12 +52,11 @@ def of_noises(
         if value is None:
             continue
         kind: Kind = "measurement noise" if topic else "process noise"
-        yield _noise(name, meanings(type(parameters)).get(name, ""), value, kind)
+        yield _noise(name, in_few_words(meanings(type(parameters)).get(name, "")), value, kind)
 
 
-def _noise(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
+def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
     letter = "R" if kind == "measurement noise" else "Q"
-    what = re.split("[,.:;]", meaning)[0]
     named = f"{name} ({what})" if what else name
 
     def without(trial: Trial, logarithm: float) -> Trial:

@@ -21,7 +21,7 @@ from jinja2 import Environment, PackageLoader, select_autoescape
 from markdown_it import MarkdownIt
 from markupsafe import Markup, escape
 
-from pipeline.output.alarms import Alarm, Cause
+from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
 from pipeline.output.report.colours import text_colours
 from pipeline.output.report.evidence import Timings
@@ -30,10 +30,11 @@ from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
 from pipeline.output.report.naming import distinct_names, title_of
 from pipeline.output.report.scene import lens, nis_chart, plan
-from pipeline.output.report.sheet import Sheet, sheets
+from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
+from pipeline.output.report.sweeps import RUNS_TABLE
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
-from pipeline.output.words import listed
+from pipeline.output.words import TRACKING, quantity
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
@@ -43,6 +44,8 @@ from recorders.parsing import parse_json
 USUAL = ("dead-reckoning", "ekf", "ukf")
 # Longer tables (one row per step, say) stay in their Parquet and CSV files.
 LONGEST_TABLE = 60
+SCENES = ("scene", "lens")  # figures that a comparison keeps, which has no logs to draw
+MOST_DOUBTS = 3  # on the first screen; more are folded
 _SIGNATURE = b"<!-- fuselog "
 _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
@@ -74,6 +77,7 @@ class Section:
     text: Markup
     looks: list[Shown]
     over_time: list[Shown]
+    legend: str
     sheet: Sheet | None
     sheets: list[Sheet]
     tables: dict[str, pd.DataFrame]
@@ -116,9 +120,9 @@ def write_report(
         "hashes": _hashes,
         "named": _named,
         "hues": _hues,
-        "doubts": _doubts,
     }
     text = environment.get_template("page.html").render(
+        MOST_DOUBTS=MOST_DOUBTS,
         text_colours=text_colours(),
         sections=sections,
         style=_asset("page.css"),
@@ -161,22 +165,13 @@ def _hues(labels: Sequence[str]) -> dict[str, str]:
     return {label: f"e{place % len(text_colours())}" for place, label in enumerate(labels)}
 
 
-def _doubts(alarms: Sequence[Alarm]) -> str:
-    """What is doubtful of whom, in a few words."""
-    of: dict[str, list[str]] = {}
-    for each in alarms:
-        of.setdefault(each.kind, []).append(each.estimator)
-    whose = {kind: listed(list(dict.fromkeys(filter(None, each)))) for kind, each in of.items()}
-    return "; ".join(f"{kind} of {each}" if each else kind for kind, each in whose.items())
-
-
 def _named(text: str, labels: Sequence[str]) -> Markup:
     """A sentence in which estimators have their colours."""
     hues = _hues(labels)
     if not hues:
         return escape(text)
     longest = sorted(map(re.escape, hues), key=len, reverse=True)
-    parts = re.split(rf"(?<![\w:.-])({'|'.join(longest)})(?![\w:-]|\.\w)", text)
+    parts = re.split(rf"(?<![\w:.-])({'|'.join(longest)})(?![\w-]|[:.]\w)", text)
     return Markup("").join(
         Markup('<b class="{}">{}</b>').format(hues[part], part) if place % 2 else escape(part)
         for place, part in enumerate(parts)
@@ -200,6 +195,8 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     looks = [_chart("", begun.chart)] if begun.chart else []
     order = [card.estimator for card in begun.story.cards] or labels
     looks += _first_run(folder, order, viewer=viewer)
+    looks += [each for name in SCENES for each in figures if each.name == name]
+    figures = [each for each in figures if each.name not in SCENES]
     if "sweep" in result.settings or not looks:
         looks, figures = [*looks, *figures[:2]], figures[2:]
     over_time = [each for each in figures if each.name.startswith("errors")][:1]
@@ -209,8 +206,10 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     short = {
         key: table
         for key, table in tables.items()
-        if len(table) <= LONGEST_TABLE and key not in ("summary", "runs")
+        if len(table) <= LONGEST_TABLE and key not in ("summary", "runs", RUNS_TABLE)
     }
+    if begun.found.pairs:
+        short["differences of pairs, 95 % over the runs"] = table_of_pairs(begun.found)
     keys = {split_metric(key)[1] for key in result.metrics} | {
         row.key for rows in (sheet.groups.values() if sheet else ()) for row in rows
     }
@@ -223,12 +222,19 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
         Markup(_MARKDOWN.render(str(result.settings.get("text") or ""))),  # which lets no HTML through
         looks,
         [*over_time, *([_chart("nis", nis)] if nis else [])],
+        _legend(begun),
         sheet,
         each_case,
         short,
         figures,
         glossary(keys, draws=bool(begun.story.draws)),
     )
+
+
+def _legend(begun: Opening) -> str:
+    """What estimators are compared by, where that is no plain error."""
+    by = quantity(begun.found.main) if begun.found.compared else None
+    return f"{by.name}: {by.meaning} Less is better." if by and by.group == TRACKING else ""
 
 
 def _timings(folder: Path, result: Result) -> Timings:
@@ -269,7 +275,7 @@ def _chart(name: str, chart: Chart) -> Shown:
     axes = [f"{panel.y.label} over {panel.x.label}" for panel in chart.panels]
     titles = filter(None, (panel.title for panel in chart.panels))
     what = f"Chart: {'; '.join(dict.fromkeys([*axes, *titles]))}; {', '.join(chart.colours())}"
-    return Shown(name, chart.title or name, what, chart)
+    return Shown(name, chart.title or re.sub("[-_]", " ", name), what, chart)
 
 
 def _first_run(folder: Path, order: Sequence[str], *, viewer: bool) -> list[Shown]:

@@ -4,37 +4,36 @@ It is computed of the metrics and of the table of runs, which all kinds of resul
 """
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.special import ndtr, stdtrit
 
-from pipeline.output.results import MetricTable, Result, metric_tables
+from pipeline.output.alarms import Stressing
+from pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
 from pipeline.output.words import is_error
 from replay.judging.errors.differences import (
-    FEWEST_RUNS,
-    RESAMPLES,
     Difference,
     Target,
+    mean_interval,
     paired_difference,
+    rms_interval,
     target_of,
 )
 
-Floats = NDArray[np.float64]
 Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and the messages it was given
 # By what estimators are compared, where they have it; else by the first error that there is.
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
 # A mean of squares may be off by this share: nobody would act on less, however many runs show it.
 MATERIAL = 0.1
 FAR = 1.25  # times larger than claimed: errors of that are no matter of a few percent
-MANY_RUNS = 500
 MARGIN = 0.02  # as `fuselog compare` has it
 
+Relation = Literal["draw", "unclear", "withheld", "beyond chance", "untold"]
 State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
 
 
@@ -96,6 +95,7 @@ class Evidence:
         consistency: by NEES, or by NIS where there is no truth.
         also: by NIS, where NEES is known too.
         failed: how many runs failed; None where that is not known.
+        runs: how many there were, of all cases.
         share: of the time that was estimated.
         outside: cases in which it is inconsistent, of so many.
     """
@@ -105,12 +105,14 @@ class Evidence:
     consistency: Consistency | None
     also: Consistency | None
     failed: int | None
+    runs: int
     share: float
     outside: tuple[int, int] = (0, 1)
 
-    def state(self, runs: int) -> State:
+    @property
+    def state(self) -> State:
         """What can be said of it in a word; NIS counts where NEES finds nothing."""
-        if self.failed and self.failed >= runs:
+        if self.failed and self.failed >= self.runs:
             return "failed"
         states = [each.state for each in (self.consistency, self.also) if each is not None]
         return next((state for state in states if state != "honest"), states[0] if states else "unknown")
@@ -123,6 +125,16 @@ class Evidence:
         return self.consistency
 
 
+class Pair(NamedTuple):
+    """How much more of a quantity an estimator has than another one; NaN where no interval is known."""
+
+    first: str
+    second: str
+    quantity: str
+    case: str
+    more: Spread
+
+
 @dataclass(frozen=True)
 class Findings:
     """What a result knows of all its estimators.
@@ -132,6 +144,9 @@ class Findings:
         rows: a row per estimator, case and run, with quantities; may be empty.
         runs: how many runs there were.
         labels: the estimators in their order, bounds left out.
+        bounds: labels of bounds, which nobody can take.
+        stress: what changes do that should not matter, by estimator; nothing where nobody asked.
+        pairs: what a study measured of two estimators together.
     """
 
     tables: list[MetricTable]
@@ -139,6 +154,8 @@ class Findings:
     runs: int
     labels: list[str]
     bounds: list[str] = field(default_factory=list)
+    stress: Mapping[str, Stressing] = field(default_factory=dict)
+    pairs: list[Pair] = field(default_factory=list)
 
     @cached_property
     def main(self) -> str:
@@ -150,6 +167,26 @@ class Findings:
     def of(self) -> Mapping[str, Evidence]:
         """The evidence by estimator."""
         return {label: self._evidence(label) for label in self.labels}
+
+    @cached_property
+    def cases(self) -> list[dict[str, Measured]]:
+        """Of each case in which estimators are compared: their errors, by label."""
+        return [each.quantities[self.main] for each in self.tables if self.main in each.quantities]
+
+    @property
+    def compared(self) -> list[str]:
+        """The estimators that have an error in every case."""
+        return [label for label in self.labels if self.of[label].error is not None]
+
+    def least_in(self) -> Counter[str]:
+        """In how many cases each estimator errs least, of those that have an error in every case."""
+        found: Counter[str] = Counter()
+        for case in self.cases:
+            of = {label: case[label].value for label in self.compared}
+            errors = {label: float(each) for label, each in of.items() if isinstance(each, int | float)}
+            if errors:
+                found[min(errors, key=errors.__getitem__)] += 1
+        return found
 
     def by_run(self, label: str, key: str) -> "pd.Series[float]":
         """A quantity in every run: of errors the root mean square over the cases, else the mean."""
@@ -168,6 +205,11 @@ class Findings:
             return None
         values = both.to_numpy(dtype=float)
         return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
+
+    def stressed(self, *labels: str) -> float:
+        """How far changes that should not matter move the main error, of any of these at most."""
+        own = [self.stress[label].moved.get(self.main, 0.0) for label in labels if label in self.stress]
+        return max(own, default=0.0)
 
     def values(self, label: str, key: str) -> list[float]:
         """An estimator's metric in every case that has it."""
@@ -189,6 +231,7 @@ class Findings:
             nees or nis,
             nis if nees else None,
             int(sum(failed)) if failed else None,
+            self.runs * max(len(failed), 1),
             min(self.values(label, "estimated_share") or [1.0]),
             (sum(place != "within" for place in judged), max(len(judged), 1)),
         )
@@ -196,8 +239,7 @@ class Findings:
     def _error(self, label: str) -> Spread | None:
         """The error over all cases; an estimator that lacks one that another has is not compared."""
         values = self.values(label, self.main)
-        cases = [table for table in self.tables if self.main in table.quantities]
-        if not values or len(values) < len(cases):
+        if not values or len(values) < len(self.cases):
             return None
         squared = "rmse" in self.main
         mean = float(np.mean(np.square(values) if squared else values))
@@ -242,30 +284,64 @@ class Findings:
         return float(min(sizes, key=lambda size: abs(chi_square_interval(size, runs)[1] - honest[1])))
 
 
-def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Where the mean of runs lies with 95 %, by Student's distribution; NaN of few runs."""
-    runs = len(values)
-    if runs < FEWEST_RUNS:
-        return math.nan, math.nan
-    half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
-    return float(values.mean()) - half, float(values.mean()) + half
+def broken_of(found: Findings) -> list[Evidence]:
+    """Who cannot be believed: who fails, then who is too sure, the worst first."""
+
+    def badness(each: Evidence) -> float:
+        failed = each.state == "failed"
+        return math.inf if failed else each.decisive.factor if each.decisive else 0.0
+
+    bad = [each for each in found.of.values() if each.state in ("failed", "too sure")]
+    return sorted(bad, key=badness, reverse=True)
 
 
-def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Where the root mean square of runs lies with 95 %: the bootstrap of `compare`, NaN of few runs.
+def choice_of(found: Findings) -> tuple[str, list[str]]:
+    """Whom to take, empty where there is none, and who draws with it: of those that can be believed."""
+    sound = [
+        each
+        for each in found.of.values()
+        if each.error is not None and each.state not in ("failed", "too sure")
+    ]
+    if not sound:
+        return "", []
+    best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
+    others = [each.estimator for each in sound if each.estimator != best]
+    return best, [
+        label for label in others if relation(found, best, label) in ("draw", "unclear", "withheld")
+    ]
 
-    Of many runs the mean square is normal, and resamples would take much memory to say the same.
-    """
-    runs, squares = len(values), values**2
-    if runs < FEWEST_RUNS:
-        return math.nan, math.nan
-    if runs > MANY_RUNS:
-        low, high = mean_interval(squares)
-        return math.sqrt(max(low, 0.0)), math.sqrt(high)
-    drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
-    tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
-    low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
-    return float(low), float(high)
+
+def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
+    """Whom to take, then who cannot be believed, the worst first, then the others by their error."""
+    rest = sorted(
+        found.labels,
+        key=lambda label: error.value if (error := found.of[label].error) else math.inf,
+    )
+    first = [each.estimator for each in broken]
+    return list(dict.fromkeys([*filter(None, [take]), *equal, *first, *rest]))
+
+
+def relation(found: Findings, first: str, second: str) -> Relation:
+    """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
+    difference = found.difference(first, second, found.main, "low")
+    if difference is not None and math.isfinite(difference.low):
+        if difference.verdict == "no difference":
+            return "draw"
+        if difference.verdict == "unclear":
+            return "unclear"
+        return (
+            "withheld" if is_withheld(found, first, second, difference.difference) else "beyond chance"
+        )
+    errors = [found.of[label].error for label in (first, second)]
+    one, other = (each.value if each else math.nan for each in errors)
+    if abs(other - one) <= MARGIN * abs(one):
+        return "draw"
+    return "withheld" if is_withheld(found, first, second, other - one) else "untold"
+
+
+def is_withheld(found: Findings, first: str, second: str, difference: float) -> bool:
+    """Whether changes that should not matter move one of two estimators farther than they differ."""
+    return abs(difference) < found.stressed(first, second)
 
 
 def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
@@ -274,11 +350,34 @@ def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
     if not {"estimator", "run"} <= {*rows}:
         rows = pd.DataFrame()
     metrics = {key: value for key, value in result.metrics.items() if isinstance(value, int | float)}
-    cases = metric_tables(metrics, result.bounds)
+    pairs = _pairs(result, metrics)
+    of_pairs = {each.quantity for each in pairs}
+    own = {key: value for key, value in metrics.items() if split_metric(key)[1] not in of_pairs}
+    cases = metric_tables(own, result.bounds)
     labels = cases[0].estimators if cases else []
     found = Findings(cases, rows, runs_of(result, tables), labels)
     bounds = [label for label in labels if found.values(label, "over_ensemble")]
-    return Findings(cases, rows, found.runs, [each for each in labels if each not in bounds], bounds)
+    labels = [label for label in labels if label not in bounds]
+    stress = {each.estimator: each for each in result.stress}
+    return Findings(cases, rows, found.runs, labels, bounds, stress, pairs)
+
+
+def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
+    """The metrics of two estimators: quantities whose cases all begin with another one's label."""
+    labels = {split_metric(key)[0] for key in metrics}
+    found: dict[str, list[Pair | None]] = {}
+    for key, value in metrics.items():
+        first, quantity, case = split_metric(key)
+        others = [each for each in labels - {first} if each and f"{case}-".startswith(f"{each}-")]
+        if not others:
+            found.setdefault(quantity, []).append(None)
+            continue
+        second = max(others, key=len)  # of labels that begin alike
+        low, high = (math.nan if end is None else end for end in result.intervals.get(key, (None, None)))
+        more = Spread(float(value), low, high)
+        rest = case.removeprefix(second).removeprefix("-")
+        found.setdefault(quantity, []).append(Pair(first, second, quantity, rest, more))
+    return [each for of in found.values() if None not in of for each in of if each is not None]
 
 
 def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:

@@ -12,7 +12,7 @@ from PIL import Image
 from recorders.atomic import scratch_folder
 from recorders.log import open_log, schemas
 from replay.engine.replaying.replaying import BLOCK_MESSAGES
-from replay.engine.streams.sources import LogSource, ensemble_of
+from replay.engine.streams.sources import LogSource, Source, ensemble_of
 from replay.judging.errors.evaluation import Innovations, split_topic
 from replay.judging.judge import Judge
 
@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 PLANE = ("x_m", "y_m")
 PICTURE_PX = (1280, 800)
 # The innovations of so many runs are read: their mean over time is no surer of more.
+RUNS = "estimates/run-*.mcap"
 MOST_RUNS = 20
 GAP_LIMIT_S = 0.2
 
@@ -58,8 +59,8 @@ class Followed:
 class FirstRun:
     """The first run of a result: its log, what was estimated, and of the first case how well."""
 
-    source: LogSource
-    output: LogSource
+    source: Source
+    output: Source
     case: str
     followed: Mapping[str, Followed]
 
@@ -73,18 +74,23 @@ def first_run(folder: Path, gap_limit_s: float = GAP_LIMIT_S) -> FirstRun | None
     for log in sorted(folder.rglob("logs/run-0000.mcap")):
         estimates = log.parent.parent / "estimates" / log.name
         if estimates.is_file():
-            source, output = LogSource(open_log(log)), LogSource(open_log(estimates))
-            found = _followed(source, output, gap_limit_s)
-            if found:
-                case = next(iter(found))[1]
-                own = {label: each for (label, of), each in found.items() if of == case}
-                return FirstRun(source, output, case, own)
+            run = seen_from_above(LogSource(open_log(log)), LogSource(open_log(estimates)), gap_limit_s)
+            if run is not None:
+                return run
     return None
 
 
-def _followed(
-    source: LogSource, output: LogSource, gap_limit_s: float
-) -> dict[tuple[str, str], Followed]:
+def seen_from_above(source: Source, output: Source, gap_limit_s: float) -> FirstRun | None:
+    """A run by its log and what was estimated; None without a truth and estimates over the plane."""
+    found = _followed(source, output, gap_limit_s)
+    if not found:
+        return None
+    case = next(iter(found))[1]
+    own = {label: each for (label, of), each in found.items() if of == case}
+    return FirstRun(source, output, case, own)
+
+
+def _followed(source: Source, output: Source, gap_limit_s: float) -> dict[tuple[str, str], Followed]:
     """By estimator and case, what has errors over the plane."""
     topics = {
         topic: each.metadata.get("truth", "")
@@ -129,7 +135,7 @@ def _joined(parts: list[Followed]) -> Followed:
 def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats, Innovations]]]:
     """By estimator and case the innovations of runs whose estimates are kept, with their times in s."""
     found: dict[tuple[str, str], list[tuple[Floats, Innovations]]] = {}
-    for path in sorted(folder.glob("estimates/run-*.mcap"))[:MOST_RUNS]:
+    for path in sorted(folder.glob(RUNS))[:MOST_RUNS]:
         output = LogSource(open_log(path))
         topics = [
             topic

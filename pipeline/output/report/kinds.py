@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 import pandas as pd
@@ -16,19 +15,18 @@ import pandas as pd
 from pipeline.output.charts import Axis, Chart, Panel, Series, curve
 from pipeline.output.claims import NO_VERDICT
 from pipeline.output.report.evidence import MARGIN, Findings, Timings, findings, runs_of
-from pipeline.output.report.story import Story, story
-from pipeline.output.report.sweeps import story_of_sweep
+from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
+from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
-from pipeline.output.words import count, is_error, listed, number, quantity, scale
+from pipeline.output.words import count, is_error, listed, meaning_alone, number, quantity, scale
 from replay.judging.errors.evaluation import chi_square_interval
 
 Tables = Mapping[str, pd.DataFrame]
-# More estimators than these are counted, and more claims than these are in the table below alone.
+# More estimators than these are counted, and more claims that are refuted stand in the table alone.
 MOST_NAMED = 6
 MOST_CLAIMS = 2
-LONGEST_CLAIM = 60
 # The tables that sentences are made of.
-TOLD_BY = ("runs", "times", "differences", "sweep", "parameters")
+TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
 
 @dataclass(frozen=True)
@@ -41,6 +39,7 @@ class Opening:
         found: what is known of the estimators.
         also: further sentences, in a list below the cards.
         chart: a picture of this kind of result alone.
+        numbers_of: what the table of numbers is of, where that is not all that was run.
     """
 
     tried: str
@@ -48,6 +47,7 @@ class Opening:
     found: Findings
     also: list[str] = field(default_factory=list)
     chart: Chart | None = None
+    numbers_of: str = ""
 
 
 def opening(result: Result, tables: Tables, timings: Timings | None = None) -> Opening:
@@ -55,20 +55,18 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     if "sides" in result.settings:
         return _of_comparison(result, tables)
     if "sweep" in result.settings:
-        tried, told = story_of_sweep(result, tables)
-        labels = [str(each) for each in tables["sweep"]["estimator"].unique()]
-        return Opening(tried, told, Findings([], pd.DataFrame(), runs_of(result, tables), labels))
+        return Opening(*story_of_sweep(result, tables), numbers_of="Each estimator where it errs least.")
     found = findings(result, tables)
-    told = story(found, result.causes, timings)
+    told = story(found, result.causes, timings, result.alarms)
     notes = [str(each) for each in result.settings.get("notes", [])]
     tried = what_was_tried(result, found, tables)
     if result.experiment == "diagnose":
         return Opening(tried, _of_diagnosis(told, notes), found, notes[1:])
     if result.experiment == "tune":
-        return Opening(tried, _of_tuning(told, tables), found, notes)
+        meanings = result.settings.get("meanings", {})
+        return Opening(tried, _of_tuning(told, tables, meanings), found, notes)
     if result.claims:
-        paired = told if len(found.rows) and len(found.labels) <= MOST_NAMED else Story([])
-        told = replace(paired, verdict=[*claims_sentences(result), *paired.verdict])
+        told = _with_claims(told if found.compared else Story([], doubts=told.doubts), result)
     return Opening(tried, told, found, notes)
 
 
@@ -105,34 +103,53 @@ def _length(tables: Tables) -> str:
     return ""
 
 
+def _with_claims(told: Story, result: Result) -> Story:
+    """A story, then how many claims hold, with a card of those that do not."""
+    counts = Counter(claim.verdict for claim in result.claims)
+    refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
+    notes = [f"Refuted: {each}" for each in refuted[:MOST_CLAIMS]]
+    if len(refuted) > MOST_CLAIMS:
+        more = len(refuted) - MOST_CLAIMS
+        are = "is" if more == 1 else "are"
+        notes.append(f"{more} more {are} refuted; the table has all claims.")
+    look: tuple[Look, str, str] = ("best", "✓", "All confirmed")
+    if refuted:
+        look = ("careful", "✕", f"{len(refuted)} refuted")
+    elif counts["confirmed"] < len(result.claims):
+        look = ("careful", "○", "Not all confirmed")
+    of_all = f"of {count(len(result.claims), 'claim')} confirmed"
+    rest = [f"{counts[each]} {each}" for each in ("not shown", "not reproducible") if counts[each]]
+    card = Card("claims", *look, str(counts["confirmed"]), of_all, notes=notes, foot=rest)
+    cards = told.cards[: MOST_CARDS - 1]
+    left_out = [each.estimator for each in told.cards[MOST_CARDS - 1 :]] + told.left_out
+    verdict = [*told.verdict, *claims_sentences(result)]
+    return replace(told, verdict=verdict, cards=[*cards, card], left_out=left_out)
+
+
 def claims_sentences(result: Result) -> list[str]:
-    """How many claims hold and how many do not, and the first of these."""
+    """How many claims hold, and how many do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     of_all = count(len(result.claims), "claim")
     if counts["confirmed"] == len(result.claims):
         return [f"{'The only claim is' if len(result.claims) == 1 else f'All {of_all} are'} confirmed."]
-    sentences = [f"{counts['confirmed']} of {of_all} confirmed."]
-    refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
-    if refuted:
-        named = [f"“{shorten(each, LONGEST_CLAIM, placeholder=' …')}”" for each in refuted[:MOST_CLAIMS]]
-        more = f" and {len(refuted) - MOST_CLAIMS} more" if len(refuted) > MOST_CLAIMS else ""
-        sentences.append(f"{len(refuted)} refuted: {', '.join(named)}{more}.")
-    open_ones = [f"{counts[each]} {each}" for each in ("not shown", "not reproducible") if counts[each]]
+    told = [
+        f"{counts[each]} {each}" for each in ("refuted", "not shown", "not reproducible") if counts[each]
+    ]
     if counts[NO_VERDICT]:
-        open_ones.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
-    return [*sentences, *([f"{'; '.join(open_ones)}."] if open_ones else [])]
+        told.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
+    return [f"{counts['confirmed']} of {of_all} confirmed; {listed(told)}."]
 
 
 def _of_diagnosis(told: Story, notes: Sequence[str]) -> Story:
     """What is wrong comes first; that an estimator is inconsistent is on its card."""
     first = notes[0].removeprefix("1. ") if notes else ""
-    what, _, advice = first.partition("; try ")
+    what, _, advice = meaning_alone(first).partition("; try ")
     is_name = "_" in what.split(" ")[0]
     verdict = [f"{what if is_name else what[:1].upper() + what[1:]}."] if what else []
     return replace(told, verdict=[*verdict, *([f"Try {advice}."] if advice else [])] or told.verdict)
 
 
-def _of_tuning(told: Story, tables: Tables) -> Story:
+def _of_tuning(told: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
     """The values that were found, then whether they change what the estimator is worth."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
@@ -142,7 +159,9 @@ def _of_tuning(told: Story, tables: Tables) -> Story:
         begun = (
             "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
         )
-        sentences.append(f"{row['parameter']} is likeliest {number(row['value'])}{told_by}{begun}.")
+        meaning = meanings.get(row["parameter"], "")
+        what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
+        sentences.append(f"{what} is likeliest {number(row['value'])}{told_by}{begun}.")
     return replace(told, verdict=[*sentences, *told.verdict])
 
 
@@ -163,7 +182,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
         summary = f"{runs} give no interval: whether the differences are chance is open."
     elif differ.empty:
         summary = f"Over {runs} none of {len(rows)} metrics differs by more than chance and {margin}"
-        summary += f"; in {len(unclear)} ({', '.join(unclear)}) they do not decide." if unclear else "."
+        summary += f"; in {len(unclear)} they do not decide." if unclear else "."
     else:
         summary = (
             f"Over {runs} {len(differ)} of {len(rows)} metrics differ by more than chance and {margin}."
@@ -172,8 +191,9 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
-    verdict = [*told.verdict[:2], summary]
-    return Opening(tried, replace(told, verdict=verdict), found, [*also, *notes], chart)
+    doubts = [f"{listed(unclear)}, in which {runs} do not decide"] if unclear else []
+    told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
+    return Opening(tried, told, found, [*also, *notes], chart)
 
 
 def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:
@@ -191,7 +211,8 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
             of.setdefault(str(row[side]), Measured(float(row[f"{side}_mean"]), bounds))
     tables_of = [MetricTable(case, labels, of) for case, of in quantities.items()]
     rows = tables.get("runs", pd.DataFrame())
-    return Findings(tables_of, rows, runs_of(result, tables), labels)
+    stress = {each.estimator: each for each in result.stress}
+    return Findings(tables_of, rows, runs_of(result, tables), labels, stress=stress)
 
 
 def _difference_sentence(row: Mapping[Any, Any]) -> str:

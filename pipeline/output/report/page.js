@@ -25,6 +25,7 @@ function compare(a, b) {
 
 // A chart is drawn when it comes near to the window, and again when the window or its colours change.
 const NARROWEST_PANEL = 260;
+const LETTER_PX = 7;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const drawn = new Map();
 
@@ -49,8 +50,10 @@ function draw(place) {
   const chart = chartOf(place);
   const bands = chart.panels.flatMap((panel, index) =>
     panel.bands.flatMap((band) => bandTraces(band, chart.colours[band.label], index)));
-  const lines = chart.panels.flatMap((panel, index) =>
-    panel.series.map((series) => lineTrace(series, chart.colours[series.label], index)));
+  const lines = chart.panels.flatMap((panel, index) => {
+    const paths = panel.plane ? panel.series.filter((series) => series.style === "line" && !series.reference) : [];
+    return panel.series.map((series) => lineTrace(series, chart.colours[series.label], index, paths.length - paths.indexOf(series)));
+  });
   const named = new Set();
   for (const trace of [...lines, ...bands.filter((trace) => trace.fill)]) {
     trace.showlegend = !named.has(trace.legendgroup);
@@ -78,13 +81,15 @@ const MARKERS = {
   dots: { size: 2, opacity: 0.5 }, triangles: { size: 9, symbol: "triangle-up-open" }, outside: { size: 5, symbol: "square" },
 };
 
-function lineTrace(series, colour, index) {
+// Of paths that coincide the lower ones are wider: `place` counts from the uppermost.
+function lineTrace(series, colour, index, place) {
+  const isPath = series.style === "line" && !series.reference;
   const isOut = series.style === "outside";
   return {
     ...axesOf(index), x: series.x, y: series.y, name: escaped(series.label), legendgroup: series.label,
     mode: MODES[series.style] ?? "lines", cliponaxis: !isOut, ...(isOut && { hoverinfo: "skip" }),
     ...(series.style === "area" && { fill: "toself", fillcolor: `${colour}33`, hoverinfo: "skip" }),
-    line: { color: colour, width: series.reference ? 1.8 : 1.5, dash: series.style === "dashed" ? "dash" : "solid" },
+    line: { color: colour, width: series.reference ? 1.8 : isPath ? 1.5 + 1.5 * Math.max(0, Math.min(place, 4) - 1) : 1.5, dash: series.style === "dashed" ? "dash" : "solid" },
     marker: { color: colour, size: 6, ...MARKERS[series.style] },
   };
 }
@@ -110,29 +115,33 @@ function layoutOf(place) {
   const isLens = planes.length > 0 && planes.every((panel) => panel.x.limits && panel.y.limits);
   const row = isLens ? lensHeight(planes[0], (place.clientWidth - 70) / columns)
     : planes.length ? 400 : rows === 1 ? 260 : 180;
-  const foot = chart.legend ? 90 : 66;
-  const height = rows * row + foot;
+  const panelWidth = (place.clientWidth - 70) / columns - (columns > 1 ? 40 : 0);
+  const titles = chart.panels.map((panel) => fitted(panel.title, panelWidth));
+  const second = titles.some((title) => title.includes("\n")) ? 16 : 0; // line of a title
+  const foot = (chart.legend ? 90 : 66) + second;
+  const height = rows * (row + second) + foot;
+  const inner = height - 67 - second;
   const layout = {
     height, autosize: true, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: text, size: 12, family: style.fontFamily },
-    margin: { l: 60, r: 10, t: 22, b: 45 }, hovermode: "closest", showlegend: chart.legend, dragmode: "zoom",
-    hoverlabel: { font: { family: style.fontFamily } }, legend: { orientation: "h", y: -45 / (height - 67), yanchor: "top", x: 0 },
+    margin: { l: 60, r: 10, t: 22 + second, b: 45 }, hovermode: "closest", showlegend: chart.legend, dragmode: "zoom",
+    hoverlabel: { font: { family: style.fontFamily } }, legend: { orientation: "h", y: -45 / inner, yanchor: "top", x: 0 },
     annotations: [],
   };
-  const gap = { x: columns > 1 ? 0.25 / columns : 0, y: 62 / (height - 67) };
+  const gap = { x: columns > 1 ? 0.25 / columns : 0, y: (62 + second) / inner };
   chart.panels.forEach((panel, index) => {
     const at = { x: index % columns, y: rows - 1 - Math.floor(index / columns) };
     const size = { x: (1 - gap.x * (columns - 1)) / columns, y: (1 - gap.y * (rows - 1)) / rows };
     for (const name of ["x", "y"]) {
       const start = at[name] * (size[name] + gap[name]);
       layout[`${name}axis${index ? index + 1 : ""}`] = {
-        ...axisOf(panel, name), gridcolor: line, linecolor: line, zeroline: false,
+        ...axisOf(panel, name, { x: panelWidth - namesWidth(panel), y: inner * size.y }[name]), gridcolor: line, linecolor: line, zeroline: false,
         domain: [start, Math.min(1, start + size[name])], anchor: axesOf(index)[name === "x" ? "yaxis" : "xaxis"],
       };
     }
     if (panel.plane) Object.assign(layout[`yaxis${index ? index + 1 : ""}`], { scaleanchor: axesOf(index).xaxis, constrain: "domain" });
     layout.annotations.push({
-      text: escaped(panel.title), showarrow: false, xref: `${axesOf(index).xaxis} domain`, yref: `${axesOf(index).yaxis} domain`,
+      text: escaped(titles[index]).replaceAll("\n", "<br>"), align: "left", showarrow: false, xref: `${axesOf(index).xaxis} domain`, yref: `${axesOf(index).yaxis} domain`,
       x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: { size: 12 },
     });
   });
@@ -145,19 +154,33 @@ function lensHeight(panel, width) {
   return Math.min(300, Math.max(130, width * high / wide)) + 40;
 }
 
-function axisOf(panel, name) {
+// What stands at the left of a panel beyond the margin: names, where its ticks are such.
+function namesWidth(panel) {
+  const longest = Math.max(0, ...Object.values(panel.y.ticks).map((text) => text.length));
+  return Math.max(0, longest * LETTER_PX - 40);
+}
+
+function axisOf(panel, name, length) {
   const axis = panel[name];
   const named = panel.series.some((series) => series[name].some((value) => typeof value === "string"));
   const places = Object.keys(axis.ticks).map(Number);
   const ends = axis.limits ?? endsOf(panel, name);
   const own = axis.log && !places.length ? decades(ends) : [];
   return {
-    title: { text: escaped(axis.label), standoff: 5 }, nticks: 7, type: axis.log ? "log" : named ? "category" : "linear", automargin: true,
+    title: { text: escaped(fitted(axis.label, length)).replaceAll("\n", "<br>"), standoff: 5 }, nticks: 7, type: axis.log ? "log" : named ? "category" : "linear", automargin: true,
     exponentformat: "none", separatethousands: true,
     ...(axis.limits && { range: axis.log ? axis.limits.map(Math.log10) : axis.limits }),
     ...(places.length && { tickvals: places, ticktext: Object.values(axis.ticks).map(escaped) }),
     ...(own.length > 1 && { tickvals: own, ticktext: own.map(written) }),
   };
+}
+
+// A text that is longer than its axis, in two lines: parted at the space nearest to the middle.
+function fitted(text, length) {
+  if (text.length * LETTER_PX <= length) return text;
+  const spaces = [...text.matchAll(/ /g)].map((each) => each.index);
+  const middle = spaces.sort((a, b) => Math.abs(a - text.length / 2) - Math.abs(b - text.length / 2))[0];
+  return middle === undefined ? text : `${text.slice(0, middle)}\n${text.slice(middle + 1)}`;
 }
 
 function endsOf(panel, name) {

@@ -7,9 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.output.charts import Axis, Chart, Panel, Series, band, curve, path, thinned
-from pipeline.output.report.first_run import PLANE, FirstRun, Followed, innovations_of_runs
+from pipeline.output.report.first_run import (
+    MOST_RUNS,
+    PLANE,
+    RUNS,
+    FirstRun,
+    Followed,
+    innovations_of_runs,
+)
+from pipeline.output.words import count
 from recorders.log import read_streams, schemas
 from replay.distributions import chi2
+from replay.engine.streams.sources import LogSource
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 
 Floats = NDArray[np.float64]
@@ -87,15 +96,16 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
             path("truth outside", each.truth[of[is_out[of]]], "outside"),
         ]
         title = (
-            f"{label}: truth outside {int(is_out[of].sum()) or 'none'} of {len(of)}; "
-            f"{100 * float(np.mean(is_out)):.0f} % over the whole run"
+            f"{label}: outside at {int(is_out[of].sum())} of {len(of)}, "
+            f"{100 * float(np.mean(is_out)):.0f} % of this run"
         )
-        panels.append(Panel(x=x, y=y, series=series, title=title, plane=True))
+        drawn = [each for each in series if each.x]
+        panels.append(Panel(x=x, y=y, series=drawn, title=title, plane=True))
     title = (
         f"Lens: {length_s:g} s of the first run, from {begin_s:.1f} s. Ellipses: where each is 95 % "
-        "sure that it is; an honest one has the truth outside in about 5 %"
+        "sure that it is; an honest one has the truth outside about 5 % of the time"
     )
-    return Chart(title=title, panels=panels, legend=False)
+    return Chart(title=title, panels=panels, columns=len(panels), legend=False)
 
 
 def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
@@ -106,18 +116,18 @@ def typical_second(followed: Sequence[Followed]) -> tuple[float, float]:
     length_s = max(LENS_S, np.ceil((DOTS - 1) * step_s))
     begin_s = max(float(each.time_s[0]) for each in followed)
     end_s = min(float(each.time_s[-1]) for each in followed)
-    count = max(int((end_s - begin_s) / length_s), 1)
-    away = np.zeros(count)
+    seconds = max(int((end_s - begin_s) / length_s), 1)
+    away = np.zeros(seconds)
     for each in followed:
         is_out = (each.squared > INSIDE).astype(float)
         place = np.floor((each.time_s - begin_s) / length_s).astype(int)
-        known = (place >= 0) & (place < count)
-        total = np.bincount(place[known], minlength=count)
+        known = (place >= 0) & (place < seconds)
+        total = np.bincount(place[known], minlength=seconds)
         with np.errstate(invalid="ignore"):
-            shares = np.bincount(place[known], is_out[known], count) / total
+            shares = np.bincount(place[known], is_out[known], seconds) / total
         away += np.abs(np.where(total > 0, shares, np.inf) - is_out.mean())
     as_good = np.flatnonzero(away <= away.min() + 1e-9)
-    middle = as_good[np.argmin(np.abs(as_good - 0.5 * (count - 1)))]
+    middle = as_good[np.argmin(np.abs(as_good - 0.5 * (seconds - 1)))]
     return begin_s + int(middle) * float(length_s), float(length_s)
 
 
@@ -206,7 +216,7 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
         and split_topic(name) == (estimator, case)
     ]
     stamps = [time for each in run.output.read(sizes).values() for time in each.publish_time_ns.tolist()]
-    if not stamps:
+    if not stamps or not isinstance(run.output, LogSource):
         return []
     points = []
     for row in np.linspace(0, len(stamps) - 1, CLOUDS).round().astype(int).tolist():
@@ -253,7 +263,9 @@ def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
             panel.series.append(curve("outside", time_s[is_out], foot, "outside"))
         panels.append(panel)
     columns = max(1, min(len(panels), MOST_COLUMNS))
-    title = f"NIS over time{f' of {cases[0]}' if cases[0] else ''}; grey: 95 % if consistent"
+    of = f" of {cases[0]}" if cases[0] else ""
+    runs = count(min(len([*folder.glob(RUNS)]), MOST_RUNS), "run")
+    title = f"NIS over time{of}, {runs} together; grey: 95 % if consistent"
     return Chart(title=title, panels=panels, columns=columns, legend=False)
 
 

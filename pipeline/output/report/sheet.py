@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import NamedTuple
 
-from pipeline.output.report.evidence import MARGIN, MATERIAL, Findings, mean_interval, rms_interval
+import pandas as pd
+
+from pipeline.output.report.evidence import MARGIN, MATERIAL, Findings
 from pipeline.output.results import Measured, MetricTable
 from pipeline.output.words import (
     ACCURACY,
@@ -22,7 +24,7 @@ from pipeline.output.words import (
     quantity,
     scale,
 )
-from replay.judging.errors.differences import target_of
+from replay.judging.errors.differences import mean_interval, rms_interval, target_of
 
 MOST_ROWS = 12
 GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
@@ -70,6 +72,19 @@ def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
     title = f"Median of {len(tables)} cases, from the least to the greatest"
     each = [_sheet(found, table, columns, table.case or "all") for table in tables]
     return _sheet(found, medians, columns, title, spreads=_spreads(tables)), each
+
+
+def table_of_pairs(found: Findings) -> pd.DataFrame:
+    """What one estimator has more than another: a row per pair and quantity, a column per case."""
+    rows: dict[tuple[str, str, str], dict[str, str]] = {}
+    for each in found.pairs:
+        words = quantity(each.quantity.removeprefix("change_in_"))
+        own = scale(words.unit, each.more.value)
+        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_told else ""
+        of = rows.setdefault((each.first, each.second, words.name), {})
+        of[each.case or "all"] = f"{own.text(each.more.value)}{ends} {own.sign}".rstrip()
+    about = ("estimator", "has more than", "of")
+    return pd.DataFrame([dict(zip(about, what, strict=True)) | of for what, of in rows.items()])
 
 
 def _medians(tables: list[MetricTable]) -> MetricTable:

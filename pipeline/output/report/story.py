@@ -8,19 +8,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from pipeline.output.alarms import Cause
-from pipeline.output.report.evidence import MARGIN, Evidence, Findings, Spread, Timings
+from pipeline.output.alarms import Alarm, Cause, Stressing
+from pipeline.output.report.doubts import doubts_of
+from pipeline.output.report.evidence import (
+    MARGIN,
+    Evidence,
+    Findings,
+    Spread,
+    Timings,
+    broken_of,
+    choice_of,
+    in_order,
+    is_withheld,
+    relation,
+)
 from pipeline.output.report.gauge import Gauge, gauge, numbers_of
 from pipeline.output.words import MISSING, Scale, count, interval, listed, number, quantity, scale
 from replay.judging.diagnostics import LEAST_SHARE
 from replay.judging.errors.differences import FEWEST_RUNS
 
-MOST_CARDS = 6
+MOST_CARDS = 4
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
 
 Look = Literal["broken", "careful", "best", "fair"]
-Relation = Literal["draw", "unclear", "beyond chance", "untold"]
 
 
 @dataclass(frozen=True)
@@ -38,6 +49,7 @@ class Card:
     gauge: Gauge | None = None
     numbers: str = ""
     cause: Cause | None = None
+    stress: Stressing | None = None
     notes: list[str] = field(default_factory=list)
     foot: list[str] = field(default_factory=list)
 
@@ -51,7 +63,7 @@ class Story:
         cards: of the estimators, whom to take first, then who cannot be believed.
         draws: sentences on pairs that cannot be told apart, differences: on those that can.
         left_out: estimators that have no card.
-        is_sound: whether each was judged, and none is inconsistent.
+        doubts: what is doubtful, in a few words each, the worst first.
     """
 
     verdict: list[str]
@@ -59,16 +71,24 @@ class Story:
     draws: list[str] = field(default_factory=list)
     differences: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
-    is_sound: bool = False
+    doubts: list[str] = field(default_factory=list)
 
 
-def story(found: Findings, causes: Sequence[Cause] = (), timings: Timings | None = None) -> Story:
-    """The story of estimators that were judged; causes, and what each cost, where they are known."""
+def story(
+    found: Findings,
+    causes: Sequence[Cause] = (),
+    timings: Timings | None = None,
+    alarms: Sequence[Alarm] = (),
+) -> Story:
+    """The story of estimators that were judged.
+
+    Causes, what each cost, and alarms are told where they are known.
+    """
     known = [each for each in found.of.values() if each.error is not None]
-    broken = _broken(found)
+    broken = broken_of(found)
     own = scale(quantity(found.main).unit, *(each.error.value for each in known if each.error))
-    take, equal = _choice(found)
-    ordered = _in_order(found, broken, take, equal)
+    take, equal = choice_of(found)
+    ordered = in_order(found, broken, take, equal)
     by_label = {each.estimator: each for each in causes}
     cards = [
         _card(found, found.of[label], take, equal, own, by_label.get(label), timings or {})
@@ -76,55 +96,8 @@ def story(found: Findings, causes: Sequence[Cause] = (), timings: Timings | None
     ]
     draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
     verdict = _verdict(found, broken, take, equal, own, by_label, timings or {})
-    is_sound = all(each.state(found.runs) == "honest" for each in found.of.values())
-    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:], bool(cards) and is_sound)
-
-
-def _broken(found: Findings) -> list[Evidence]:
-    """Who cannot be believed: who fails, then who is too sure, the worst first."""
-
-    def badness(each: Evidence) -> float:
-        failed = each.state(found.runs) == "failed"
-        return math.inf if failed else each.decisive.factor if each.decisive else 0.0
-
-    bad = [each for each in found.of.values() if each.state(found.runs) in ("failed", "too sure")]
-    return sorted(bad, key=badness, reverse=True)
-
-
-def _choice(found: Findings) -> tuple[str, list[str]]:
-    """Whom to take, empty where there is none, and who draws with it: of those that can be believed."""
-    sound = [
-        each
-        for each in found.of.values()
-        if each.error is not None and each.state(found.runs) not in ("failed", "too sure")
-    ]
-    if not sound:
-        return "", []
-    best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
-    others = [each.estimator for each in sound if each.estimator != best]
-    return best, [label for label in others if relation(found, best, label) in ("draw", "unclear")]
-
-
-def relation(found: Findings, first: str, second: str) -> Relation:
-    """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
-    difference = found.difference(first, second, found.main, "low")
-    if difference is not None and math.isfinite(difference.low):
-        if difference.verdict == "no difference":
-            return "draw"
-        return "unclear" if difference.verdict == "unclear" else "beyond chance"
-    errors = [found.of[label].error for label in (first, second)]
-    one, other = (each.value if each else math.nan for each in errors)
-    return "draw" if abs(other - one) <= MARGIN * abs(one) else "untold"
-
-
-def _in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
-    """Whom to take, then who cannot be believed, the worst first, then the others by their error."""
-    rest = sorted(
-        found.labels,
-        key=lambda label: error.value if (error := found.of[label].error) else math.inf,
-    )
-    first = [each.estimator for each in broken]
-    return list(dict.fromkeys([*filter(None, [take]), *equal, *first, *rest]))
+    doubts = doubts_of(found, alarms, take, equal)
+    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:], doubts)
 
 
 def _verdict(
@@ -183,20 +156,27 @@ def _advice(
             f"{best.estimator} errs least, {_value(best.error, own)}, but mend it before you believe "
             f"its covariance; of the others {take} errs least, {_value(error, own)}."
         )
-    runs = count(found.runs, "run")
+    runs, cases = count(found.runs, "run"), len(found.cases)
+    how = "RMS" if "rmse" in found.main else "mean"
+    of_cases = f" ({how} of {cases} cases)" if cases > 1 else ""
     if equal:
         both = listed([take, *equal])
         either = "either" if len(equal) == 1 else "any of them"
         if all(relation(found, take, each) == "draw" for each in equal):
             return f"{both} tie in {main}: take {either}{_cheapest([take, *equal], timings)}."
+        if any(relation(found, take, each) == "withheld" for each in equal):
+            return (
+                f"No verdict between {both}: changes that should not matter move the {main} "
+                "farther than they differ."
+            )
         return f"A tie so far: {runs} do not tell {both} apart; take {either}."
     if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
         few = found.runs < FEWEST_RUNS
         tells = f"{FEWEST_RUNS} runs or more tell" if few else "is not known"
         chance = f"; whether by chance{',' if few else ''} {tells}"
-        return f"Take {take}: it has the least {main} {alone}, {_value(error, own)}{chance}."
-    return f"Take {take}: it has the least {main}, {_value(error, own)}."
+        return f"Take {take}: it has the least {main} {alone}, {_value(error, own)}{of_cases}{chance}."
+    return f"Take {take}: it has the least {main}, {_value(error, own)}{of_cases}."
 
 
 def _cheapest(labels: list[str], timings: Timings) -> str:
@@ -212,7 +192,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
     """What is said of the only estimator."""
     main = quantity(found.main).name.removesuffix(", RMS")
     errs = f"{only.estimator} has a {main} of {_value(only.error, own)} RMS" if only.error else ""
-    state = only.state(found.runs)
+    state = only.state
     if state in ("too sure", "failed"):
         return [*filter(None, [errs and f"{errs}."]), _doubt(only, causes)]
     if only.decisive is None:
@@ -223,7 +203,7 @@ def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]
 
 def _of_innovations(found: Findings) -> str:
     """What is known without a truth."""
-    honest = [each.estimator for each in found.of.values() if each.state(found.runs) == "honest"]
+    honest = [each.estimator for each in found.of.values() if each.state == "honest"]
     without = "Without a truth nobody's error is known"
     if not honest:
         return f"{without}."
@@ -275,7 +255,8 @@ def _card(
 ) -> Card:
     look, mark, chip = _chip(found, each, take, equal)
     claim = _claim(each, found.runs)
-    card = Card(each.estimator, look, mark, chip, cause=cause, notes=_notes(found, each, take, equal))
+    notes, stress = _notes(found, each, take, equal), found.stress.get(each.estimator)
+    card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
         about = quantity(found.main).name
         if each.error.is_told:
@@ -288,12 +269,12 @@ def _card(
             gauge=gauge(each.decisive),
             numbers=numbers_of(each.decisive),
         )
-    return replace(card, foot=_foot(found, each, take, timings))
+    return replace(card, foot=_foot(each, take, timings))
 
 
 def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple[Look, str, str]:
     """How a card looks, its sign, and its word."""
-    state = each.state(found.runs)
+    state = each.state
     if state == "failed":
         return "broken", "✕", "Fails in every run"
     if state == "too sure":
@@ -313,7 +294,7 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
 
 def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list[str]:
     """What else is worth a sentence."""
-    notes = []
+    notes = _of_tracks(found, each.estimator)
     best = found.of[take].error if take else None
     if each.estimator == take and len(found.labels) > 1 and not equal:
         notes += _in_how_many(found, take)
@@ -331,10 +312,26 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
     return notes
 
 
+def _of_tracks(found: Findings, label: str) -> list[str]:
+    """What a tracker misses, invents and mixes up, on average."""
+    told = []
+    for key, words in (("missed_targets", "missed"), ("false_targets", "false")):
+        values = found.values(label, key)
+        told += [f"{number(sum(values) / len(values), 2)} {words}"] if values else []
+    sentences = [f"Targets at a time: {listed(told)}."] if told else []
+    switches = found.values(label, "switches")
+    if switches:
+        a_run = number(sum(switches) / len(switches), 2)
+        sentences.append(f"Switches of identity: {a_run} a run.")
+    return sentences
+
+
 def _in_how_many(found: Findings, take: str) -> list[str]:
-    """In how many runs the best is the best."""
+    """In how many cases the best is the best, or in how many runs of the only one."""
     import pandas as pd
 
+    if len(found.cases) > 1:
+        return [f"Least in {found.least_in()[take]} of {len(found.cases)} cases."]
     every = pd.concat(
         {label: found.by_run(label, found.main) for label in found.labels}, axis=1
     ).dropna()
@@ -345,7 +342,7 @@ def _in_how_many(found: Findings, take: str) -> list[str]:
     return [f"Least error in {which} {count(len(every), 'run')}."]
 
 
-def _foot(found: Findings, each: Evidence, take: str, timings: Timings) -> list[str]:
+def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
     """What it cost, also beside the one to take, and how often it failed."""
     foot = []
     own, best = (timings.get(label, {}) for label in (each.estimator, take))
@@ -354,11 +351,18 @@ def _foot(found: Findings, each: Evidence, take: str, timings: Timings) -> list[
         one_s = seconds / messages
         beside = ""
         if each.estimator != take and best.get("seconds", 0.0) > 0.0:
-            beside = f"; in all {number(seconds / best['seconds'], 2)} times the time of {take}"
+            beside = _beside(seconds / best["seconds"], take)
         foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} a message{beside}")
     if each.failed is not None:
-        foot.append(f"{each.failed:,} of {count(found.runs, 'run')} failed")
+        foot.append(f"{each.failed:,} of {count(each.runs, 'run')} failed")
     return foot
+
+
+def _beside(factor: float, take: str) -> str:
+    """How much time an estimator needs, beside the one to take."""
+    if CHEAPER <= factor <= 1.0 / CHEAPER:
+        return f"; in all as much time as {take}"
+    return f"; in all {number(factor, 2)} times the time of {take}"
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
@@ -378,6 +382,13 @@ def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[l
         elif difference.verdict == "unclear":
             runs = count(difference.runs, "run")
             draws.append(f"In {main}, {runs} do not tell {take} and {label} apart: {ends}.")
+        elif is_withheld(found, take, label, size):
+            moved = near.with_unit(found.stressed(take, label))
+            draws.append(
+                f"In {main}, the verdict on {take} and {label} is withheld: they differ by "
+                f"{near.with_unit(size)} on average, and changes that should not matter move one by "
+                f"{moved}."
+            )
         else:
             more = "more" if difference.difference > 0 else "less"
             errs = f"{near.with_unit(size)} {more} than {take}"

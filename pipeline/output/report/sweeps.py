@@ -1,165 +1,267 @@
-"""What the page of a sweep opens with: where each estimator errs least, and what chance leaves open."""
+"""What the page of a sweep opens with: whom to take at which point, and what chance leaves open.
 
+Of each estimator the point at which it errs least is told as an experiment of its own: `story` tells
+whom of these to take. Points at which it is overconfident count only where it is so at all of them.
+"""
+
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import pandas as pd
 
-from pipeline.output.report.evidence import MARGIN, Consistency, Spread, runs_of
-from pipeline.output.report.gauge import gauge
-from pipeline.output.report.story import Card, Story
+from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, relation, runs_of
+from pipeline.output.report.story import Card, Story, story
 from pipeline.output.results import Result
-from pipeline.output.words import count, is_error, listed, number, quantity, scale, stated
+from pipeline.output.words import count, is_error, listed, quantity, scale, stated
+from recorders.parameters import unit_of
 
 MOST_POINTS = 4  # more are counted
+RUNS_TABLE = "sweep-runs"  # errors of every run at every point
+Tables = Mapping[str, pd.DataFrame]
 
 
-def story_of_sweep(result: Result, tables: Mapping[str, pd.DataFrame]) -> tuple[str, Story]:
-    """What was tried, and at which point each estimator errs least."""
-    table, points = tables["sweep"], result.settings["sweep"]
-    keys = list(points[0])
-    runs = runs_of(result, tables)
-    main = next((key for key in table["quantity"].unique() if is_error(key)), "")
-    cards: list[Card] = []
-    verdict, still = [], []
-    labels = list(table["estimator"].unique())
-    for label in labels:
-        own = _errors_at_points(table, label, main)
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep's result, and what of it the sentences are made of.
+
+    Attributes:
+        result: what was swept.
+        table: a row per point, estimator, quantity and case.
+        rows: errors of every run at every point; empty where the result does not keep them.
+        runs: how many there are at each point.
+    """
+
+    result: Result
+    table: pd.DataFrame
+    rows: pd.DataFrame
+    runs: int
+
+    @cached_property
+    def points(self) -> list[dict[str, object]]:
+        """The values of the parameters at each point."""
+        return list(self.result.settings["sweep"])
+
+    @cached_property
+    def main(self) -> str:
+        """The error by which points are compared; empty where there is none."""
+        return next((key for key in self.table["quantity"].unique() if is_error(key)), "")
+
+    def errors(self, label: str) -> "pd.Series[float]":
+        """An estimator's error at each point, over all cases."""
+        table = self.table
+        is_own = (table["estimator"] == label) & (table["quantity"] == self.main)
+        own = table[is_own].dropna(subset=["value"])
+        if "rmse" in self.main:
+            squared = own.assign(value=own["value"] ** 2).groupby("point")["value"].mean()
+            return squared**0.5
+        return own.groupby("point")["value"].mean()
+
+    def consistency(self, label: str, point: int) -> Consistency | None:
+        """NEES at a point, where the sweep kept its interval: of the first case."""
+        table = self.table
+        if "bound_low" not in table:
+            return None
+        is_own = (table["estimator"] == label) & (table["quantity"] == "nees")
+        own = table[is_own & (table["point"] == point)].dropna(subset=["value", "bound_low"])
         if own.empty:
-            continue
-        if float(own.max() - own.min()) <= 1e-9 * float(own.max()):
-            unit = scale(quantity(main).unit, float(own.max()))
-            still.append(f"{label} ({unit.with_unit(float(own.max()))})")
-            continue
-        card, sentence = _swept(table, points, label, main, own)
-        cards.append(replace(card, notes=[*card.notes, *_overlap(table, points, label, main, own)]))
-        verdict.append(sentence)
-    if still and cards:
-        is_are = "do not depend" if len(still) > 1 else "does not depend"
-        verdict.append(f"{listed(still)} {is_are} on it.")
-    elif still:
-        verdict.append(f"None of the errors depends on {listed(keys)}.")
-    elif not cards:
-        verdict.append(
-            "Without a truth nobody's error is known; the charts show what the innovations say."
+            return None
+        row = own.iloc[0]
+        ends = float(row["bound_low"]), float(row["bound_high"])
+        return Consistency("NEES", Spread(float(row["value"])), float(row["aim"]), ends)
+
+    def is_too_sure(self, label: str, point: int) -> bool:
+        """Whether an estimator is overconfident at a point."""
+        by = self.consistency(label, point)
+        return by is not None and by.state == "too sure"
+
+    def at(self, places: Mapping[str, tuple[str, int]]) -> Findings:
+        """Estimators at one point each, as if these were an experiment: by name, label and point."""
+        metrics, bounds, rows = {}, {}, []
+        for name, (label, point) in places.items():
+            own = self.table[(self.table["estimator"] == label) & (self.table["point"] == point)]
+            for row in own.to_dict("records"):
+                key = ".".join(filter(None, (name, row["quantity"], row["case"])))
+                metrics[key] = row["value"]
+                if math.isfinite(row.get("bound_low", math.nan)):
+                    bounds[key] = (row["bound_low"], row["bound_high"])
+            if len(self.rows):
+                is_here = (self.rows["estimator"] == label) & (self.rows["point"] == point)
+                rows.append(self.rows[is_here].assign(estimator=name))
+        here = self.result.model_copy(update={"metrics": metrics, "bounds": bounds})
+        return findings(here, {"runs": pd.concat(rows)} if rows else {})
+
+    @property
+    def of_world(self) -> bool:
+        """Whether the scenario is swept too, so that no point is better than another, but only other."""
+        estimators: Mapping[str, Any] = self.result.settings.get("estimators") or {}
+        of_all = {key for values in estimators.values() for key in values}
+        return any(
+            {key.partition(".")[0], key}.isdisjoint({*estimators, *of_all}) for key in self.points[0]
         )
-    over = listed([f"{key} from {_ends([point[key] for point in points])}" for key in keys])
-    source = result.settings.get("record", {}).get("scenario")
+
+    def everywhere(self) -> Findings:
+        """Estimators at all points, as if each of these were a case of an experiment."""
+        metrics, bounds = {}, {}
+        for row in self.table.to_dict("records"):
+            case = ", ".join(filter(None, (self.where(int(row["point"]), brief=True), row["case"])))
+            key = f"{row['estimator']}.{row['quantity']}.{case}"
+            metrics[key] = row["value"]
+            if math.isfinite(row.get("bound_low", math.nan)):
+                bounds[key] = (row["bound_low"], row["bound_high"])
+        here = self.result.model_copy(update={"metrics": metrics, "bounds": bounds})
+        return findings(here, {"runs": self.rows})
+
+    def where(self, point: int, *, brief: bool = False) -> str:
+        """The values at a point in words: with what they are of, or `brief`."""
+        told = []
+        for key, value in self.points[point].items():
+            text = f"{_value(value)} {unit_of(key) if _is_number(value) else ''}".rstrip()
+            told.append(text if brief else f"{self.name(key)} = {text}")
+        return ", ".join(told)
+
+    def name(self, key: str, *, with_key: bool = False) -> str:
+        """What a parameter is: what it means, where that is known."""
+        meaning = str(self.result.settings.get("meanings", {}).get(key, ""))
+        return f"{meaning} ({key})" if meaning and with_key else meaning or key
+
+
+def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings]:
+    """What was tried, whom to take at which point, and the findings that this follows from.
+
+    Where the scenario is swept, nobody chooses the point: estimators are told over all of them.
+    """
+    table = tables["sweep"]
+    sweep = Sweep(result, table, tables.get(RUNS_TABLE, pd.DataFrame()), runs_of(result, tables))
+    labels = [str(each) for each in table["estimator"].unique()]
+    tried = _tried(sweep, labels)
+    errors = {label: own for label in labels if not (own := sweep.errors(label)).empty}
+    if not errors:
+        none = "Without a truth nobody's error is known; the charts show what the innovations say."
+        return tried, Story([none]), Findings([], pd.DataFrame(), sweep.runs, labels)
+    if sweep.of_world:
+        found = sweep.everywhere()
+        return tried, story(found), found
+    best = {label: _best(sweep, label, own) for label, own in errors.items()}
+    still = [label for label, own in errors.items() if _is_still(own)]
+    found = sweep.at({label: (label, point) for label, point in best.items()})
+    told = story(found)
+    if len(still) < len(errors):
+        return tried, _with_points(sweep, told, errors, best, still), found
+    keys = listed([sweep.name(key) for key in sweep.points[0]])
+    return tried, replace(told, verdict=[f"No error depends on {keys}.", *told.verdict]), found
+
+
+def _tried(sweep: Sweep, labels: list[str]) -> str:
+    """Over which values, with how many runs, of whom."""
+    over = []
+    for key in sweep.points[0]:
+        unit = unit_of(key)
+        ends = _ends([point[key] for point in sweep.points])
+        over.append(f"{sweep.name(key, with_key=True)} from {ends} {unit}".rstrip())
+    source = sweep.result.settings.get("record", {}).get("scenario")
     of = f" of {source}" if source else ""
-    swept = f"{over}: {count(len(points), 'point')}, {count(runs, 'run')}{of} at each"
-    tried = f"{swept}, for {listed([str(label) for label in labels])}."
-    return tried, Story(verdict, cards)
+    runs = f"{count(len(sweep.points), 'point')}, {count(sweep.runs, 'run')}{of} at each"
+    text = f"{listed(over)}: {runs}, for {listed(labels)}."
+    return text[:1].upper() + text[1:] if sweep.name(key) != key else text
+
+
+def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:
+    """Where an estimator errs least, of the points at which it is not overconfident if there are any."""
+    sure = [point for point in own.index if sweep.is_too_sure(label, int(point))]
+    left = own.drop(sure) if len(sure) < len(own) else own
+    return int(left.index[int(left.to_numpy().argmin())])
+
+
+def _is_still(own: "pd.Series[float]") -> bool:
+    return float(own.max() - own.min()) <= 1e-9 * float(own.max())
+
+
+def _with_points(
+    sweep: Sweep,
+    told: Story,
+    errors: Mapping[str, "pd.Series[float]"],
+    best: Mapping[str, int],
+    still: list[str],
+) -> Story:
+    """The story of estimators at their best points, with these points."""
+    moved = [label for label in errors if label not in still]
+    sentences = [f"{label} errs least with {sweep.where(best[label])}." for label in moved]
+    if still:
+        are = "do not depend" if len(still) > 1 else "does not depend"
+        sentences.append(f"{listed(still)} {are} on it.")
+    doubts: list[str] = []
+    cards = []
+    for card in told.cards:
+        if card.estimator in moved:
+            own, point = errors[card.estimator], best[card.estimator]
+            alike = _as_good(sweep, card.estimator, own, point)
+            cards.append(_at_its_best(sweep, card, own, point, alike))
+            doubts += _doubts(sweep, card.estimator, own, point, alike)
+        else:
+            cards.append(replace(card, notes=["It is the same at all points.", *card.notes]))
+    first, *others = told.verdict or [""]
+    verdict = [*filter(None, [first]), *sentences, *others]
+    return replace(told, verdict=verdict, cards=cards, doubts=[*doubts, *told.doubts])
+
+
+def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
+    """The other points at which it errs as little, but for chance or less than the margin."""
+    found = sweep.at({str(point): (label, int(point)) for point in own.index})
+    return [
+        int(point)
+        for point in own.index
+        if point != best and relation(found, str(best), str(point)) in ("draw", "unclear")
+    ]
+
+
+def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, alike: list[int]) -> Card:
+    unit = scale(quantity(sweep.main).unit, float(own.min()))
+    ends = f"{unit.text(float(own.min()))} to {unit.with_unit(float(own.max()))}"
+    notes = [f"With {sweep.where(best)}; from {ends} over all points."]
+    if alike:
+        notes.append(f"As good, but for chance or 2 %: {_named(sweep, alike)}.")
+    there = f"{card.consistency} there" if card.consistency else ""
+    return replace(card, consistency=there, notes=[*notes, *card.notes])
+
+
+def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike: list[int]) -> list[str]:
+    """What is doubtful of a best point."""
+    told = []
+    sure = [int(point) for point in own.index if sweep.is_too_sure(label, int(point))]
+    if sure and best not in sure:
+        told.append(f"{label} at {_named(sweep, sure)}, where it is overconfident")
+    if alike:
+        told.append(f"which point is best for {label}, as {_named(sweep, alike)} may be as good")
+    key, *others = sweep.points[0]
+    values = [each for point in sweep.points if _is_number(each := point[key])]
+    if not others and len(values) == len(sweep.points) and sweep.points[best][key] in _ends_of(values):
+        where = sweep.where(best, brief=True)
+        told.append(f"whether {label} errs less beyond {where}, where the range ends")
+    return told
+
+
+def _named(sweep: Sweep, points: list[int]) -> str:
+    where = [sweep.where(point, brief=True) for point in points]
+    return listed(where) if len(where) <= MOST_POINTS else f"{len(where)} other points"
 
 
 def _ends(values: Sequence[object]) -> str:
-    numbers = [float(each) for each in values if isinstance(each, int | float)]
+    numbers = list(filter(_is_number, values))
     if len(numbers) < len(values):
         return ", ".join(dict.fromkeys(map(str, values)))
-    return f"{stated(min(numbers))} to {stated(max(numbers))}"
+    return " to ".join(map(stated, _ends_of(numbers)))
 
 
-def _errors_at_points(table: pd.DataFrame, label: object, main: str) -> "pd.Series[float]":
-    """An estimator's error at each point, over all cases."""
-    own = table[(table["estimator"] == label) & (table["quantity"] == main)].dropna(subset=["value"])
-    if "rmse" in main:
-        squared = own.assign(value=own["value"] ** 2).groupby("point")["value"].mean()
-        return squared**0.5
-    return own.groupby("point")["value"].mean()
+def _ends_of(values: Sequence[Any]) -> tuple[float, float]:
+    return float(min(values)), float(max(values))
 
 
-def _swept(
-    table: pd.DataFrame,
-    points: Sequence[Mapping[str, object]],
-    label: object,
-    main: str,
-    own: "pd.Series[float]",
-) -> tuple[Card, str]:
-    """Where an estimator errs least, where that matters little, and if it is consistent there."""
-    best = int(own.index[int(own.to_numpy().argmin())])
-    unit = scale(quantity(main).unit, float(own.min()))
-    where = ", ".join(f"{key} = {_value(each)}" for key, each in points[best].items())
-    error = quantity(main).name.removesuffix(", RMS")
-    sentence = f"{label} has its least {error}, {unit.with_unit(float(own.min()))}, at {where}"
-    by = _consistency_at(table, label, best)
-    notes = [
-        f"From {unit.text(float(own.min()))} to {unit.with_unit(float(own.max()))} over all points."
-    ]
-    near = [points[place] for place in own.index[own <= (1.0 + MARGIN) * own.min()]]
-    key = next(iter(points[best]))
-    if len(points[best]) == 1 and len(near) > 1:
-        notes.append(
-            f"It makes less than 2 % of a difference from {_ends([each[key] for each in near])}."
-        )
-    look, mark, chip, claim = "fair", "○", f"Best at {where}", ""
-    if by is not None and by.state != "honest":
-        sentence += f"; there it is {by.state}, with NEES {number(by.found.value)} for {number(by.aim)}"
-        look, mark, chip = "careful", "○", f"Best at {where}, but {by.state}"
-    elif by is not None:
-        nees = f"NEES {number(by.found.value)}, {number(by.aim)} is right"
-        sentence += f", and its covariance can be believed there ({nees})"
-        look, mark, claim = "best", "✓", "Its errors are as large as it states there"
-    sure = [
-        ", ".join(_value(each) for each in points[place].values())
-        for place in own.index
-        if (there := _consistency_at(table, label, place)) and there.state == "too sure"
-    ]
-    if sure:
-        notes.append(f"It is overconfident at {', '.join(sure)}.")
-    numbers = f"NEES {number(by.found.value)}; {number(by.aim)} is right" if by else ""
-    card = Card(
-        str(label),
-        "best" if look == "best" else "careful" if look == "careful" else "fair",
-        mark,
-        chip,
-        unit.text(float(own.min())),
-        unit.sign,
-        quantity(main).name,
-        claim,
-        gauge(by) if by else None,
-        numbers,
-        notes=notes,
-    )
-    return card, f"{sentence}."
-
-
-def _overlap(
-    table: pd.DataFrame,
-    points: Sequence[Mapping[str, object]],
-    label: object,
-    main: str,
-    own: "pd.Series[float]",
-) -> list[str]:
-    """At which other points single runs err as little as at the best: there chance may have decided."""
-    rows = table[(table["estimator"] == label) & (table["quantity"] == main)]
-    spreads = rows.groupby("point")[["low", "high"]].agg({"low": "min", "high": "max"}).dropna()
-    best = int(own.index[int(own.to_numpy().argmin())])
-    if best not in spreads.index:
-        return []
-    within = spreads.index[spreads["low"] <= spreads["high"][best]].drop(best)
-    where = [", ".join(_value(each) for each in points[place].values()) for place in within]
-    if not where:
-        return []
-    others = listed(where[:MOST_POINTS]) if len(where) <= MOST_POINTS else f"{len(where)} other points"
-    return [
-        f"The errors of its runs at {others} overlap those at the best point: a sweep does not test "
-        "whether that is chance; fuselog compare does."
-    ]
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float)
 
 
 def _value(value: object) -> str:
     return stated(float(value)) if isinstance(value, int | float) else str(value)
-
-
-def _consistency_at(table: pd.DataFrame, label: object, point: int) -> Consistency | None:
-    """NEES at a point, where the sweep kept its interval: of the first case."""
-    if "bound_low" not in table:
-        return None
-    own = table[
-        (table["estimator"] == label) & (table["quantity"] == "nees") & (table["point"] == point)
-    ].dropna(subset=["value", "bound_low"])
-    if own.empty:
-        return None
-    row = own.iloc[0]
-    return Consistency(
-        "NEES", Spread(float(row["value"])), float(row["aim"]), (row["bound_low"], row["bound_high"])
-    )

@@ -68,7 +68,7 @@ def _chart(every: pd.DataFrame) -> Chart:
     for probability, of_panel in every.groupby("detection_probability", sort=False):
         panel = Panel(
             x=Axis(label="false detections in a scan"),
-            y=Axis(label="mean GOSPA (m), c = 20 m"),
+            y=Axis(label="mean GOSPA (m)"),
             title=f"probability of detection {probability:g}",
         )
         for label, rows in of_panel.groupby("estimator", sort=False):
@@ -77,7 +77,8 @@ def _chart(every: pd.DataFrame) -> Chart:
             panel.series.append(curve(str(label), means.index, mean, "line+markers"))
             panel.bands.append(band(str(label), means.index, low, high))
         panels.append(panel)
-    return Chart(panels=panels, columns=3)
+    title = "GOSPA over clutter; bands: where the mean lies with 95 % over the runs"
+    return Chart(title=title, panels=panels, columns=3)
 
 
 def _measure_growth(every: pd.DataFrame, pairs: list[tuple[str, str]], outcome: Outcome) -> None:

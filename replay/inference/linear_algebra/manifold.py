@@ -16,6 +16,7 @@ from replay.engine.arrays import Floats, Function
 from replay.engine.vectors.tangent import TANGENT_WIDTHS, WIDTHS
 
 Quaternion = tuple[float, float, float, float]
+SETTLED = 1e-15  # rad: a mean of rotations that moves by less is found
 
 
 def tangent_size(kinds: Sequence[str]) -> int:
@@ -164,7 +165,7 @@ def recentring(kinds: tuple[str, ...]) -> Function:
                     values[index, t] = change
             else:
                 x, y, z = shift[t], shift[t + 1], shift[t + 2]
-                if max(abs(x), abs(y), abs(z)) > 1e-15:  # else they are where they were
+                if max(abs(x), abs(y), abs(z)) > SETTLED:  # else they are where they were
                     again = True
                     turned_back = conjugate(from_vector(x, y, z))
                     for index in range(len(values)):

@@ -11,7 +11,7 @@ Should Know About the Bootstrap", The American Statistician 69 (2015). Every met
 import math
 from collections.abc import Callable
 from fnmatch import fnmatch
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ Verdict = Literal["better", "worse", "higher", "lower", "no difference", "unclea
 RESAMPLES = 2000
 # So many numbers of resamples are in memory at once.
 BATCH_NUMBERS = 1 << 22
+# Of more runs the mean square is normal: resamples would take much memory to say the same.
+MANY_RUNS = 500
 # Of fewer runs, resamples say nothing of what others would give.
 FEWEST_RUNS = 5
 # The zero of a log-likelihood is nowhere: a margin of 0.02 is one of 2 nats.
@@ -157,3 +159,30 @@ def _direction(first: Floats, second: Floats, target: Target, difference: float)
         if low > 0 or high < 0:
             return "worse" if low > 0 else "better"
     return "higher" if difference > 0 else "lower"
+
+
+def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
+    """Where the mean of runs (n,) lies with 95 %, by Student's distribution; NaN of few runs."""
+    from scipy.special import stdtrit
+
+    runs = len(values)
+    if runs < FEWEST_RUNS:
+        return math.nan, math.nan
+    half = float(stdtrit(runs - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(runs))
+    return float(values.mean()) - half, float(values.mean()) + half
+
+
+def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
+    """Where the root mean square of runs (n,) lies with 95 %, by the bootstrap; NaN of few runs."""
+    from scipy.special import ndtr, stdtrit
+
+    runs, squares = len(values), values**2
+    if runs < FEWEST_RUNS:
+        return math.nan, math.nan
+    if runs > MANY_RUNS:
+        low, high = mean_interval(squares)
+        return math.sqrt(max(low, 0.0)), math.sqrt(high)
+    drawn = np.random.default_rng(0).integers(0, runs, (RESAMPLES, runs))
+    tail = 1.0 - ndtr(np.sqrt(runs / (runs - 1)) * stdtrit(runs - 1, 0.975))
+    low, high = np.sqrt(np.quantile(squares[drawn].mean(axis=1), [tail, 1.0 - tail]))
+    return float(low), float(high)

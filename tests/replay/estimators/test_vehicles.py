@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
+from scipy.stats import chi2, multivariate_normal
 
 from pipeline.runs.recorded import record_ensemble, replay_in_memory
 from pipeline.studies.vehicles.cases import Scores, scores_of
@@ -16,6 +17,7 @@ from recorders.log import Clock
 from recorders.models.vehicles import into_frame, noise_moments
 from replay.engine.streams.sources import MemorySource
 from replay.estimators.vehicles.association import (
+    GATE_PROBABILITY,
     Scanning,
     all_maps,
     best_maps,
@@ -167,6 +169,21 @@ def test_collapse_has_the_moments_of_the_whole_mixture(scanning: Scanning, count
     mean, covariance = _mixture(joint, rows, detections, scanning)
     assert_allclose(found.mean[0], mean, atol=1e-6)
     assert_allclose(found.covariance[0], covariance, atol=1e-6)
+
+
+def test_detections_are_as_likely_as_their_normal_density_up_to_the_gate() -> None:
+    rng = np.random.default_rng(3)
+    predicted, detections = rng.normal(size=(1, 3, 2)), rng.normal(scale=9.0, size=(1, 40, 2))
+    roots = rng.normal(size=(3, 2, 2))
+    covariance = (roots @ roots.swapaxes(1, 2) + np.eye(2))[None]
+    found = log_likelihoods(predicted, covariance, detections)
+    for vehicle in range(3):
+        normal = multivariate_normal(predicted[0, vehicle], covariance[0, vehicle])
+        off = detections[0] - predicted[0, vehicle]
+        squared = np.einsum("da,da->d", off, np.linalg.solve(covariance[0, vehicle], off.T).T)
+        inside, density = squared < chi2.ppf(GATE_PROBABILITY, 2), normal.logpdf(detections[0])
+        assert_allclose(found[0, vehicle], np.where(inside, density, -np.inf), rtol=1e-12)
+    assert 0 < np.isinf(found).sum() < found.size
 
 
 def test_permanents_and_best_maps_against_all_permutations() -> None:

@@ -1,6 +1,7 @@
 """Programs as filters: those that stream, and those that read a log and write estimates."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,9 @@ import pytest
 import fuselog as fl
 from fuselog import BadInput
 from recorders.log import RunMetadata, make_stream, schemas
+from recorders.log.opening import Topic
 from recorders.recording import Recording
+from replay.engine.replaying.estimator import configure
 from replay.engine.streams.sources import memory_source
 from replay.foreign.description import TopicRead
 from replay.foreign.files.estimates import read_estimates
@@ -147,6 +150,25 @@ def test_a_program_that_reads_a_log(tmp_path: Path, place: str, how: str) -> Non
         assert made["covariance"][0, 0] == (0.0625 if how == "csv" else 0.0)
     assert done.metrics["quantity"].isin(["nees"]).any() == (how == "csv")
     assert done.done.parameters["writes"]["sigma_m"] == 0.25
+
+
+def test_what_holds_for_a_whole_run_is_read_whatever_the_span() -> None:
+    """Priors and maps, of landmarks or of the points of a body; never the truth or others' estimates."""
+    kinds = {
+        "/landmarks": schemas.LANDMARK,
+        "/tags": schemas.BODY_POINT,
+        "/a/prior": schemas.GAUSSIAN_ESTIMATE,
+        "/a/fix": schemas.POSITION_FIX,
+        "/a/priority": schemas.GAUSSIAN_ESTIMATE,
+        "/a/truth": schemas.TRUTH_STATE,
+        "/estimates/b/state": schemas.GAUSSIAN_ESTIMATE,
+    }
+    topics = {name: Topic(name, kind.full_name, "protobuf", (), {}, 1) for name, kind in kinds.items()}
+    topics["/other"] = replace(topics["/a/fix"], name="/other", encoding="json")
+    estimator, values = configure("mine", program("x {log} {out}"))
+    [bound] = estimator.bind("mine", topics, values)
+    assert bound.static == ("/landmarks", "/tags", "/a/prior")
+    assert bound.streams == ("/a/fix", "/a/priority")
 
 
 def test_a_program_that_writes_mcap(tmp_path: Path) -> None:

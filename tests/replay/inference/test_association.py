@@ -12,6 +12,7 @@ from recorders.errors import BadInput
 from replay.inference.association.association import existence_after, marginals
 from replay.inference.association.births import ending
 from replay.inference.association.clusters import MOST_ENUMERATED
+from replay.inference.association.scans import Scans, in_time
 from replay.inference.association.shared_bias import pool_errors, pool_of
 from replay.inference.association.tracks import no_tracks
 
@@ -256,3 +257,31 @@ def test_a_second_track_of_a_target_ends(first_is_confirmed: bool, component: in
             tracks.mean[0, 1, 0, component] += sign * share * limits[component]
             end_tracks(0, tracks, p)
             assert tracks.used[0] == 1 + is_left
+
+
+def test_scans_of_two_sequences_are_merged_with_their_detections_and_keep_their_order_at_equal_stamps():
+    rng, made = np.random.default_rng(1), []
+    for sensor in (0, 1):
+        counts = rng.integers(0, 4, 12)
+        ends, numbers = counts.cumsum(), np.arange(12)
+        detection = np.stack([np.repeat(numbers, counts), np.full(counts.sum(), sensor)], axis=1)
+        same = np.full(12, sensor)
+        origin = np.stack([numbers, same], axis=1)
+        stamps = np.sort(rng.integers(0, 4, 12))
+        made.append(
+            Scans(np.array([0, 12]), stamps, same, same, numbers, ends - counts, ends, origin, detection)
+        )
+    found = in_time(*made)
+    order = sorted(
+        (int(stamp), sensor, number) for sensor in (0, 1) for number, stamp in enumerate(made[sensor][1])
+    )
+    of_scans = np.stack([found.time_ns, found.sensor, found.number], axis=1)
+    np.testing.assert_array_equal(of_scans, order)
+    for (_, sensor, number), first, end, origin in zip(
+        order, found.first, found.end, found.origin, strict=True
+    ):
+        own = made[sensor]
+        here = own.detection[own.first[number] : own.end[number]]
+        np.testing.assert_array_equal(found.detection[first:end], here)
+        np.testing.assert_array_equal(origin, [number, sensor])
+    assert list(found.offsets) == [0, 24]

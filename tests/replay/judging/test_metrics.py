@@ -1,5 +1,7 @@
 """Metrics: the registered ones on errors whose numbers are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from recorders.log import make_stream, schemas
 from replay.engine.streams.blocks import Ragged
 from replay.judging.errors.evaluation import Errors, Innovations, chi_square_interval, rmse_interval
 from replay.judging.metrics.measuring import Output, find_metrics, measure, metric_of_sums
-from replay.judging.metrics.metrics import ACCURACY, FAILURES, INNOVATION, LIKELIHOOD
+from replay.judging.metrics.metrics import ACCURACY, CONSISTENCY, FAILURES, INNOVATION, LIKELIHOOD
 
 
 def make_errors(error: np.ndarray, components: tuple[str, ...]) -> Errors:
@@ -68,6 +70,25 @@ def test_metrics_get_what_they_judge_and_keys_name_estimator_quantity_and_case()
     bad = metric_of_sums("", Errors, lambda errors: {"x": errors.error[9, 9]}, dict)
     with pytest.raises(BadInput, match="metric bad raised IndexError"):
         measure([judged], {"bad": bad})
+
+
+def test_consistency_is_of_state_and_position_where_there_is_a_nees() -> None:
+    """One covariance of four is singular, of the others one is too small and one too large."""
+    errors = make_errors(
+        np.array([[1.0, 1.0, 1.0], [3.0, 3.0, 3.0], [0.01, 0.01, 0.01], [9.0, 9.0, 9.0]]),
+        ("x_m", "y_m", "heading_rad"),
+    )
+    errors = replace(errors, nees=np.append(errors.nees[:3], np.nan))
+    errors.covariance[3] = 0.0
+    assert CONSISTENCY.of(errors) == pytest.approx(
+        {
+            "nees": (3.0 + 27.0 + 0.0003) / 3,
+            "estimates_without_nees": 1.0,
+            "position_nees": (2.0 + 18.0 + 0.0002) / 3,
+            "nees_steps_within_95": 1 / 4,
+        }
+    )
+    assert CONSISTENCY.of(make_errors(np.empty((0, 1)), ("x_m",))) == {}
 
 
 def test_innovations_count_per_measured_component() -> None:

@@ -11,6 +11,7 @@ from pipeline.output.alarms import Alarm
 from pipeline.output.coverage import sentences
 from pipeline.output.terminal import print_others, print_worst
 from replay.engine.replaying.usage import EARLY, SILENT, UNTAKEN, Row
+from replay.judging.consistency.conditioning import Conditioning
 from replay.judging.errors.constant import Constant
 from tests.words.made.printing import printed
 
@@ -141,10 +142,30 @@ def _sums(messages: int, accepted: int, squared: float) -> Any:
     return SimpleNamespace(total=total)
 
 
+def digits() -> Iterator[str]:
+    """Covariances, as rounding leaves them."""
+    innovation = POSE.replace("pose", "innovation")
+    for topic, lost, failed, least in (
+        (POSE, 0, 0, 2e-12),
+        (POSE, 3, 0, 2e-13),
+        (innovation, 3, 0, -1e-16),
+        (POSE, 3, 1, -0.5),
+    ):
+        yield f"{lost} lost, {failed} failed:"
+        found = Conditioning(100, lost, failed, least, 0, 12.34)
+        yield from _words(_judge(conditioning={topic: found}))
+
+
 def _judge(
-    *, innovations: Any = None, metrics: Any = None, bounds: Any = None, constants: Any = None
+    *,
+    innovations: Any = None,
+    metrics: Any = None,
+    bounds: Any = None,
+    constants: Any = None,
+    conditioning: Any = None,
 ) -> Any:
     return SimpleNamespace(
+        conditioning=conditioning or {},
         innovations=innovations or {},
         metrics=metrics or {},
         intervals=lambda _: bounds or {},
@@ -154,4 +175,4 @@ def _judge(
     )
 
 
-ALARMED = (innovations, errors, costs, gates, measurements, many)
+ALARMED = (innovations, errors, costs, digits, gates, measurements, many)

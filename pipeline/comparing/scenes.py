@@ -1,0 +1,32 @@
+"""Puts the estimates of several candidates side by side, and draws them from above."""
+
+from collections.abc import Sequence
+
+from pipeline.comparing.candidates import Candidate
+from pipeline.output.charts import Chart
+from recorders.log import RunMetadata
+from replay.engine.streams.sources import MemorySource, Source
+
+
+def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, MemorySource]:
+    """The log of a run, and what all candidates estimated of it, each under its name."""
+    source = candidates[0].pairs[run][0]
+    streams = {
+        topic: stream
+        for own in (candidate.estimates(run) for candidate in candidates)
+        for topic, stream in own.read([*own.topics]).items()
+    }
+    about = source.run or RunMetadata("unknown", epoch_ns=source.epoch_ns)
+    return source, MemorySource(streams, about, source.name)
+
+
+def scene_of(candidates: Sequence[Candidate], run: str, gap_limit_s: float) -> dict[str, Chart]:
+    """A run from above, and a lens where errors are small; nothing without places in the plane."""
+    from pipeline.output.report.first_run import seen_from_above  # which takes long to import
+    from pipeline.output.report.scene import lens, plan
+
+    found = seen_from_above(*side_by_side(candidates, run), gap_limit_s)
+    if found is None:
+        return {}
+    near = lens(found, [candidate.name for candidate in candidates])
+    return {"scene": plan(found)} | ({"lens": near} if near else {})

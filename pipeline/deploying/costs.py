@@ -1,0 +1,230 @@
+"""Counts what the steps of a filter in C take: operations of their graphs, and of their loops."""
+
+import operator
+from collections.abc import Collection
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.deploying.c_source.names import CFilter
+from pipeline.deploying.c_source.statements import retriangulates
+from replay.inference.kalman.iterated_update import ITERATIONS
+from replay.inference.kalman.regression import MEANS
+from replay.inference.linear_algebra.covariances import COVARIANCES
+from replay.inference.linear_algebra.factors import FACTORS
+from replay.inference.linear_algebra.gaussian import (
+    Innovation,
+    add_through,
+    downdate,
+    inflate,
+    kalman_step,
+    whiten,
+)
+from replay.inference.linear_algebra.manifold import by_right_jacobian
+from replay.inference.linear_algebra.sparse import (
+    measuring_covariance,
+    pattern_of,
+    propagating_covariance,
+)
+from replay.inference.model.corrections import sloping
+from replay.inference.sampled_steps import SampledFunction
+from replay.inference.step_graphs import Step
+from replay.tracing.functions import Argument, Shape, trace
+from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed
+
+_FLOPS = (operator.add, operator.sub, operator.mul, operator.truediv)
+_FREE = (
+    *(CONSTANT, INPUT, SELECT),
+    *(operator.neg, operator.not_, operator.and_, operator.or_, operator.xor),
+    *(operator.lt, operator.le, operator.gt, operator.ge, operator.eq, operator.ne),
+    *(np.absolute, np.isnan, np.isfinite, np.isinf, np.signbit, np.sign, np.fmin, np.fmax),
+)
+
+
+class Cost(NamedTuple):
+    """Holds what a step costs at most: both sides of every condition count, and every iterate.
+
+    Attributes:
+        flops: additions, subtractions, multiplications and divisions.
+        roots: square roots.
+        calls: of libm's other functions, such as sin and fmod.
+    """
+
+    flops: int
+    roots: int = 0
+    calls: int = 0
+
+
+NOTHING = Cost(0)
+Products = tuple[Cost, Cost]
+
+
+def added(*costs: Cost) -> Cost:
+    """Add costs."""
+    return Cost(*(sum(each) for each in zip(*costs, strict=True))) if costs else NOTHING
+
+
+def costs_of(made: CFilter) -> tuple[dict[str, Cost], list[Products]]:
+    """Count what the functions of a filter cost, by name.
+
+    Returns with it, of the motion and every sensor, what products with a Jacobian cost with all its
+    entries, and without those that are known to be zero or one.
+    """
+    t, steps = made.tangent, made.steps
+    products = [_products(steps.predict, "F", t, t, is_root=made.is_root)]
+    costs = {"predict": added(_cost_of_step(steps.predict), products[0][1], _loops(made, 0, t))}
+    for row, ((name, sensor), step) in enumerate(zip(made.sensors, steps.innovate, strict=True)):
+        m, robust = len(sensor.measured), {**made.robustness(row + 1), "reopens_s": np.nan}
+        products.append(_products(step, "H", m, t, is_root=made.is_root))
+        own = added(_cost_of_step(step), products[-1][1], _loops(made, row + 1, m))
+        is_robust = any(value == value for value in robust.values())
+        algebra = _factored_algebra(m, t) if made.is_root else _algebra(m, t, is_robust)
+        times = ITERATIONS if steps.is_iterated else 1
+        costs[f"update_{name}"] = added(*[own, algebra] * times, _correction(made))
+    return costs, products
+
+
+def _cost_of_step(step: Step) -> Cost:
+    return _cost(step.outputs.values())
+
+
+def _cost(outputs: Collection[Node]) -> Cost:
+    flops = roots = calls = 0
+    for node in needed(outputs):
+        if node.operation in _FLOPS:
+            flops += 1
+        elif node.operation is POWER:
+            flops += abs(node.value).bit_length() + abs(node.value).bit_count() - 2 + (node.value < 0)
+        elif node.operation is np.sqrt:
+            roots += 1
+        elif node.operation is np.sinc:  # sin(pi x) / (pi x)
+            flops, calls = flops + 2, calls + 1
+        elif node.operation not in _FREE:
+            calls += 1
+    return Cost(flops, roots, calls)
+
+
+def _traced(function: Any, *arguments: Argument) -> Cost:
+    result = trace(Graph(), function, arguments)
+    return _cost([*result.returned, *(node for _, _, node in result.written)])
+
+
+def _loops(made: CFilter, part: int, size: int) -> Cost:
+    """The cost of the loops of the motion (0) or of a sensor: samples, noise, the factor of both."""
+    step = made.steps.predict if part == 0 else made.steps.innovate[part - 1]
+    sampled, t = made.steps.sampled[part], made.tangent
+    costs = [_entering(step, size)]
+    if sampled is not None:
+        costs.append(_sampling(sampled))
+        costs.append(_spread(sampled, t, part, is_root=made.is_root))
+    columns = t if sampled is None else len(sampled.points)
+    if made.is_root:
+        rows = t if part == 0 else size + t
+        costs += [_filling_root(size), _orthogonalising(rows, columns + size)]
+    return added(*costs)
+
+
+def _entering(step: Step, size: int) -> Cost:
+    """The cost of noise that enters through a gain."""
+    gains = sum(name == "u" for name, _ in step.outputs)
+    if not gains:
+        return NOTHING
+    return _traced(add_through, Shape((size, size)), Shape((size, gains)), Shape((gains,)))
+
+
+def _sampling(sampled: SampledFunction) -> Cost:
+    """The cost of a function at samples, and of the mean of its values, in all rounds that may be."""
+    count, size = sampled.points.shape
+    once = added(
+        _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
+    )
+    own = added(_cost_of_step(sampled.value), Cost(size * size))
+    mean = Cost(2 * count * sampled.size)
+    if sampled.recentre is None:
+        return added(once, *[own] * count, mean, Cost(sampled.size))
+    again = added(mean, _cost_of_step(sampled.move), *[_cost_of_step(sampled.recentre)] * count)
+    return added(once, *[own] * count, *[again] * MEANS)
+
+
+def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:
+    """The cost of what is made of the values: covariances, or the rows of a factor."""
+    count, v = len(sampled.points), sampled.size
+    if is_root:
+        return Cost(count * v)
+    cross = 4 * t * v * count if part else 0
+    return added(Cost(5 * count * v * (v + 1) // 2 + cross), _cholesky(t))
+
+
+def _cholesky(size: int) -> Cost:
+    below = size * (size - 1) // 2
+    return Cost(sum(2 * column * (size - column) for column in range(size)) + below, size)
+
+
+def _orthogonalising(rows: int, columns: int) -> Cost:
+    own = sum(3 * columns + 2 * i + 2 for i in range(rows))
+    return Cost(own + rows * (rows - 1) // 2 * (6 * columns + 1), rows)
+
+
+def _filling_root(size: int) -> Cost:
+    """The cost of a factor of a noise; the search for a pivot divides at each that is larger."""
+    return Cost(size * (1 + 4 * size + size + 2 * size * size), size)
+
+
+@cache
+def _algebra(m: int, t: int, is_robust: bool) -> Cost:
+    """The cost of the update behind an innovation of m components, for t of the tangent space."""
+
+    def update(v: Any, spread: Any, cross: Any, covariance: Any, factor: Any) -> Any:
+        innovation, step = Innovation(v, spread, cross), np.empty(t, object)
+        squared, _ = whiten(innovation, m)
+        if is_robust:
+            inflate(innovation, m, factor)
+        kalman_step(innovation, m, step)
+        downdate(covariance, cross, m)
+        return squared, *step
+
+    return _traced(update, Shape((m,)), Shape((m, m)), Shape((t, m)), Shape((t, t)), None)
+
+
+def _factored_algebra(m: int, t: int) -> Cost:
+    """The same of a factor: S, the whitened innovation, the step, and the factor of P."""
+    square = sum(2 * (column + 1) for row in range(m) for column in range(row + 1))
+    return added(Cost(square + m * m + 2 * m + 3 * t * m + 2 * m), _orthogonalising(t, m + t))
+
+
+def _products(step: Step, jacobian: str, rows: int, t: int, *, is_root: bool) -> Products:
+    """The cost of products with a Jacobian: with all its entries, and without those that are known."""
+    if not step.has(jacobian):
+        return NOTHING, NOTHING
+    known = {
+        (place[0], place[1]): node.value if node.is_constant else None
+        for (name, place), node in step.outputs.items()
+        if name == jacobian
+    }
+    if is_root:  # J L, of a lower factor L: an entry in column k meets k + 1 of the factor
+        return Cost(rows * t * (t + 1)), Cost(sum(2 * (column + 1) for _, column in known))
+    patterns = None, pattern_of(known, rows)
+    square = Shape((t, t))
+    if jacobian == "F":
+        first, last = (_traced(propagating_covariance(each), *(square,) * 4) for each in patterns)
+    else:
+        sizes = square, Shape((rows, t)), Shape((t, rows)), Shape((rows, rows))
+        first, last = (_traced(measuring_covariance(each), *sizes) for each in patterns)
+    return first, last
+
+
+def _correction(made: CFilter) -> Cost:
+    model, step, t = made.filtering.stage.model, made.steps.correct, made.tangent
+    kinds, square = model.kinds, Shape((t, t))
+    mean, vector = Shape((model.size,)), Shape((t,))
+    own = added(_cost_of_step(step), _products(step, "F", t, t, is_root=made.is_root)[1])
+    form = FACTORS if made.is_root else COVARIANCES
+    if model.correct is not None:
+        own = added(own, _traced(sloping(kinds, model.correct, form), mean, square, vector))
+        return added(own, _orthogonalising(t, t)) if made.is_root else own
+    turning = by_right_jacobian(kinds)
+    if not made.is_root:
+        return added(own, _traced(partial(COVARIANCES.turn, turning), vector, square))
+    turned = added(own, _traced(turning, vector, square))
+    return added(turned, _orthogonalising(t, t)) if retriangulates(made) else turned

@@ -1,0 +1,175 @@
+"""Functions at weighted samples of a Gaussian as graphs, see `replay.inference.kalman.regression`.
+
+Samples and rounds are left to loops: a graph is of one sample, or of one round of a mean.
+"""
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.engine.vectors.tangent import WIDTHS
+from replay.inference.linear_algebra.manifold import (
+    boxminus,
+    boxplus,
+    manifold_blocks,
+    recentring,
+    tangent_size,
+)
+from replay.inference.linear_algebra.tuples import tuple_of
+from replay.inference.step_graphs import Step, traced_step
+from replay.sampling.sets import SampleSets
+from replay.tracing.functions import Argument, Shape, TracedFunction
+
+Kinds = tuple[str, ...]
+
+
+class SampledFunction(NamedTuple):
+    """Holds a function of a state, its noise and arguments at weighted samples, with v values.
+
+    Its graphs are of what the step is given, (mean, covariance, ...).
+
+    Attributes:
+        points, weights: (L, t + noises), (L,), samples of N(0, I).
+        variances: the noise's, `variance` (noises).
+        centre: the function at the mean, without noise: `centre`, of its values.
+        value: of (..., away, centre), the function at the mean moved by a tangent vector, behind which
+            the noise stands (t + noises): `value` (v), the tangent vector to there from the centre.
+        move: of (mean, covariance, shift, centre): `centre`, moved by the shift (v).
+        recentre: of (mean, covariance, shift, value): `value` from the moved centre, and `again`,
+            whether the values may still not sum to zero; None where they are linear.
+    """
+
+    points: Floats
+    weights: Floats
+    variances: Step
+    centre: Step
+    value: Step
+    move: Step
+    recentre: Step | None
+
+    @property
+    def steps(self) -> list[Step]:
+        """List its graphs."""
+        found = [self.variances, self.centre, self.value, self.move]
+        return found if self.recentre is None else [*found, self.recentre]
+
+    @property
+    def noises(self) -> int:
+        """Count the numbers of noise."""
+        return len(self.variances.outputs)
+
+    @property
+    def size(self) -> int:
+        """Count the tangent components of its values."""
+        return len(self.value.outputs)
+
+
+class Sampled(NamedTuple):
+    """Says what is sampled.
+
+    Attributes:
+        what: it is, for errors.
+        function: of (state, noise, arguments).
+        variances: (state, what the step is given) -> the noise's.
+        arguments: (what the step is given) -> the function's.
+        kinds, outputs: of the state, and of the function's values.
+    """
+
+    what: str
+    function: Function
+    variances: Function
+    arguments: Function
+    kinds: Kinds
+    outputs: Kinds
+
+
+def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, ...]) -> SampledFunction:
+    """Trace a function at weighted samples.
+
+    Args:
+        sampled: the function.
+        sets: samples that serve every step.
+        given: arguments of the step, mean and covariance first.
+    """
+    what, function, variances, arguments, kinds, outputs = sampled
+    points, weights = sets.points[0], sets.weights[0]
+    t, size = tangent_size(kinds), points.shape[1]
+    values, components, read_state = tangent_size(outputs), len(outputs), tuple_of(len(kinds))
+    add_state, add = boxplus(kinds), boxplus(outputs)
+    gaussian = given[:2]
+
+    def spread(mean: Any, _: Any, *others: Any) -> Any:
+        return {"variance": variances(read_state(mean), others)}
+
+    def at_mean(mean: Any, _: Any, *others: Any) -> Any:
+        return {"centre": function(read_state(mean), (0.0,) * (size - t), arguments(others))}
+
+    def at_sample(mean: Any, _: Any, *others: Any) -> Any:
+        *own, away, centre = others
+        add_state(mean, away)
+        value = function(read_state(mean), tuple(away[t:]), arguments(own))
+        return {"value": _by_block(_difference, outputs, value, centre)}
+
+    def move(_: Any, __: Any, shift: Any, centre: Any) -> Any:
+        add(centre, shift)
+        return {"centre": centre}
+
+    def recentre(_: Any, __: Any, shift: Any, value: Any) -> Any:
+        found, again = [], False
+        for kind, _component, first, width in manifold_blocks(outputs):
+            own = slice(first, first + width)
+            still, *moved = _recentred(kind)(tuple(value[own]), tuple(shift[own]))
+            found += moved
+            again = again | still
+        return {"value": found, "again": [again]}
+
+    shift, centre = Shape((values,)), Shape((components,))
+    straight = set(outputs) <= {"linear"}
+    return SampledFunction(
+        points,
+        weights,
+        traced_step(what, spread, given),
+        traced_step(what, at_mean, given),
+        traced_step(what, at_sample, (*given, Shape((size,)), centre)),
+        traced_step(what, move, (*gaussian, shift, centre)),
+        None if straight else traced_step(what, recentre, (*gaussian, shift, shift)),
+    )
+
+
+def _by_block(function_of: Function, kinds: Kinds, first: Any, second: Any) -> list[Any]:
+    """Apply a function to every number, angle, axis and orientation of two states."""
+    found: list[Any] = []
+    for kind, component, _, _ in manifold_blocks(kinds):
+        own = slice(component, component + WIDTHS[kind])
+        found += function_of(kind)(tuple(first[own]), tuple(second[own]))
+    return found
+
+
+@lru_cache(maxsize=8)
+def _difference(kind: str) -> TracedFunction:
+    """Make one minus another: a graph of its own, so that conditions of several do not multiply."""
+    width = WIDTHS[kind]
+    subtract = boxminus((kind,) * width)
+
+    def difference(first: Any, second: Any) -> Any:
+        row = np.empty((1, tangent_size((kind,) * width)), object)
+        subtract(first, second, row, 0)
+        return tuple(row[0])
+
+    return TracedFunction(difference, (width, width))
+
+
+@lru_cache(maxsize=8)
+def _recentred(kind: str) -> TracedFunction:
+    """Make a tangent vector from a centre one from its shift, behind whether it may not be settled."""
+    kinds = (kind,) * WIDTHS[kind]
+    move, size = recentring(kinds), tangent_size(kinds)
+
+    def recentred(value: Any, shift: Any) -> Any:
+        values = np.array([value], object)
+        again = move(values, shift)
+        return (again, *values[0])
+
+    return TracedFunction(recentred, (size, size))

@@ -1,0 +1,74 @@
+"""Traces the parts of a filter's steps: functions that return arrays by name become graphs.
+
+They are called with traced numbers, so that a graph has their operations in their order, and what is
+known to be zero stands in none of them.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from recorders.errors import BadInput
+from replay.engine.arrays import Function
+from replay.tracing.functions import Argument, trace
+from replay.tracing.graph import Graph, Node
+
+_SPARSE = ("F", "H", "G", "N")
+
+
+class Step(NamedTuple):
+    """Holds a step, or a part of one, as a graph.
+
+    Attributes:
+        graph: the graph.
+        outputs: what it gives, by the array's name and place; of F, H, G and N without what is zero.
+    """
+
+    graph: Graph
+    outputs: Mapping[tuple[str, tuple[int, ...]], Node]
+
+    def has(self, name: str) -> bool:
+        """Tell whether it gives an array of this name."""
+        return any(each == name for each, _ in self.outputs)
+
+    def columns(self, name: str, rows: int) -> list[list[int]]:
+        """List the columns of a matrix that are not known to be zero, row by row."""
+        places = sorted(place for each, place in self.outputs if each == name)
+        return [[place[1] for place in places if place[0] == row] for row in range(rows)]
+
+
+def traced_step(what: str, function: Function, arguments: tuple[Argument, ...]) -> Step:
+    """Trace a function that returns arrays by name.
+
+    Args:
+        what: it is, for the error.
+        function: of the arguments.
+        arguments: as `replay.tracing.functions.trace` takes them.
+
+    Raises BadInput where it is no graph.
+    """
+    graph, places = Graph(), list[tuple[str, tuple[int, ...]]]()
+
+    def flat(*given: Any) -> Any:
+        arrays = {name: np.array(array, object) for name, array in function(*given).items()}
+        places[:] = [
+            (name, place) for name, array in arrays.items() for place in np.ndindex(array.shape)
+        ]
+        return tuple(each for array in arrays.values() for each in array.ravel())
+
+    try:
+        result = trace(graph, flat, arguments)
+    except BadInput as error:
+        raise BadInput(f"{what} cannot be written as C: {error}") from error
+    outputs = {
+        (name, place): node
+        for (name, place), node in zip(places, result.returned, strict=True)
+        if name not in _SPARSE or not node.is_number(0.0)
+    }
+    return Step(graph, outputs)
+
+
+def zeros(*sizes: int) -> Any:
+    """Make an array of zeros that takes traced numbers."""
+    return np.zeros(sizes).astype(object)

@@ -1,0 +1,108 @@
+"""Judges what rounding has left of covariances, from samples of those that a replay gives.
+
+Each is brought to variances of one first, so that units are of no account. The pivots of its Cholesky
+factorisation are then the shares of a variance that the components before do not tell: the largest is
+one, and one below 1e-12 has four of a double's sixteen digits left (Higham, Accuracy and Stability of
+Numerical Algorithms, 2nd edition, theorem 10.7).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.engine.streams.blocks import Ragged
+
+LOST = 1e-12  # a pivot below has lost its digits
+# Of a block so many are looked at, evenly: one of EACH, but at least FEWEST.
+EACH, FEWEST, MOST = 64, 8, 256
+
+
+class Conditioning(NamedTuple):
+    """What samples of a topic's covariances are like.
+
+    Attributes:
+        sampled: how many were looked at.
+        lost: in how many a pivot has lost its digits.
+        failed: how many are not positive definite, beyond rounding.
+        least: the least pivot.
+        run: that of which run, by its number in the ensemble.
+        elapsed_s: and when, since the run's epoch.
+    """
+
+    sampled: int = 0
+    lost: int = 0
+    failed: int = 0
+    least: float = 1.0
+    run: int = 0
+    elapsed_s: float = 0.0
+
+    def plus(self, other: "Conditioning") -> "Conditioning":
+        """Both together."""
+        worst = other if other.least < self.least else self
+        return worst._replace(
+            sampled=self.sampled + other.sampled,
+            lost=self.lost + other.lost,
+            failed=self.failed + other.failed,
+        )
+
+
+def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int = 0) -> Conditioning:
+    """Look at samples of the covariances of a block.
+
+    Args:
+        rows: Gaussian estimates, or innovations.
+        epochs_ns: (runs,) times zero.
+        first_run: the number of the first run.
+    """
+    count = len(rows)
+    if not count:
+        return Conditioning()
+    most = min(count, max(FEWEST, min(count // EACH, MOST)))
+    at = np.arange(most) * (count - 1) // max(1, most - 1)
+    flat = rows["covariance"][at]
+    size = round(flat.shape[1] ** 0.5)
+    if size < 2 or size * size != flat.shape[1]:
+        return Conditioning()
+    least = least_pivots(flat.reshape(-1, size, size))
+    worst = int(np.argmin(least))
+    run = int(np.searchsorted(rows.offsets, at[worst], side="right")) - 1
+    elapsed_s = (int(rows.stream.publish_time_ns[at[worst]]) - int(epochs_ns[run])) * 1e-9
+    lost, failed = (int(np.count_nonzero(least < limit)) for limit in (LOST, -LOST))
+    return Conditioning(most, lost, failed, float(least[worst]), first_run + run, elapsed_s)
+
+
+def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The least pivot (count,) of covariances (count, n, n), as shares of variances.
+
+    A component without variance is known, and one that is not finite is none: both are left out. Where
+    a pivot is not positive there is no factor, and it is the least one.
+    """
+    variances = np.einsum("rii->ri", covariances)
+    if np.isfinite(covariances).all() and (variances > 0.0).all():  # as nearly always
+        scale = variances**-0.5
+        shares = covariances * scale[:, :, None] * scale[:, None, :]
+    else:
+        is_in = np.isfinite(variances) & (variances != 0.0)
+        scale = np.where(is_in, 1.0 / np.sqrt(np.where(is_in, np.abs(variances), 1.0)), 0.0)
+        known = np.nan_to_num(covariances, posinf=0.0, neginf=0.0)
+        shares = known * scale[:, :, None] * scale[:, None, :]
+        np.einsum("rii->ri", shares)[~is_in] = 1.0
+    try:
+        factors = np.linalg.cholesky(shares)
+    except np.linalg.LinAlgError:  # which one it is remains to be found
+        return np.array([_least_pivot(each) for each in shares])
+    return np.asarray(np.einsum("rii->ri", factors).min(axis=1, initial=1.0) ** 2, np.float64)
+
+
+def _least_pivot(left: NDArray[np.float64]) -> float:
+    """That of one matrix (n, n), which is spent; it ends at a pivot that is not positive."""
+    least = 1.0
+    for place in range(len(left)):
+        pivot = float(left[place, place])
+        least = min(least, pivot)
+        if pivot <= 0.0:
+            break
+        column = left[place + 1 :, place]
+        left[place + 1 :, place + 1 :] -= np.outer(column, column) / pivot
+    return least

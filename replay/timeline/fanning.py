@@ -1,0 +1,41 @@
+"""Copies of an estimate that fan out from it: how far each is away, over time, below all else."""
+
+from collections.abc import Sequence
+from itertools import cycle
+from typing import NamedTuple
+
+import rerun.blueprint as rrb
+
+from replay.judging.errors.evaluation import Floats
+from replay.timeline.drawing.canvas import PALETTE, Canvas, Times, entity_path
+from replay.timeline.drawing.plots import LINE, draw_curve, plot_view
+
+Board = rrb.Container | rrb.View
+
+
+class Fan(NamedTuple):
+    """How far one copy is from its estimate.
+
+    Attributes:
+        estimate: what it is a copy of; those of one estimate share a plot.
+        copy: its name.
+        time_ns: (n,) stamps.
+        sigmas: (n,) how many sigmas of the estimate it is away.
+    """
+
+    estimate: str
+    copy: str
+    time_ns: Times
+    sigmas: Floats
+
+
+def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
+    """The layout above a plot for each estimate that copies fan out from."""
+    plots = []
+    for estimate in dict.fromkeys(fan.estimate for fan in fans):
+        plot = entity_path("plots", "stress", estimate)
+        own = [fan for fan in fans if fan.estimate == estimate]
+        for fan, colour in zip(own, cycle(PALETTE), strict=False):
+            draw_curve(canvas, plot, fan.copy, colour, fan.time_ns, fan.sigmas, LINE)
+        plots.append(plot_view(plot, f"{estimate}: sigmas between the estimate and each copy"))
+    return rrb.Vertical(layout, rrb.Tabs(*plots), row_shares=[4.0, 1.0])
