@@ -37,7 +37,7 @@ JUMPS = (
     ("acoustic-sequence", "student", PARAMETERS, "what a report weighs hangs on its residual"),
     ("bingham-2d", "kalman", DROPPED, "a Gaussian of a direction: a little more than a sigma"),
     ("extended-target", "s2kf-25", "start", "25 samples of a sensor far from linear"),
-    ("ispace*", "*", "stamps", "nodes send as they measure: a microsecond later that waits a step"),
+    ("ispace*", "*", "stamps", "nodes send as they measure: what is sent a microsecond before lacks it"),
     ("los-moving", "*", DROPPED, "takes attitudes as stated: too sure; its study has them estimated"),
     ("manoeuvres", "stand", DROPPED, "a model of who stands, for one who drives: too sure"),
     (

@@ -364,6 +364,15 @@ def test_noise_per_prediction_is_a_discontinuity() -> None:
     assert not mended.is_per_prediction
 
 
+def test_what_waits_for_a_microsecond_is_no_noise() -> None:
+    """Nodes that hear each other at once hear each other a step later."""
+    [stressed] = fl.stress(fl.record("ispace", steps=5), "network:naive").stressed
+    assert stressed.verdict("stamps") == "discontinuous or chaotic"
+    assert "a microsecond decides what is taken together" in " ".join(stressed.sentences)
+    assert not stressed.is_per_prediction
+
+
+@pytest.mark.paper
 def test_planted_direction_and_onset() -> None:
     sources = [drive_of(20, 60, seed) for seed in range(5000, 5020)]
     done = fl.replay(sources, {"ekf": EKF, "ukf": UKF})
@@ -400,6 +409,7 @@ def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> No
     assert NOT_TESTED in fuselog("compare", logs[0], "-e", "ekf", "-e", "ukf").out
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, monkeypatch: Any) -> None:
     """A verdict on every estimator, by all runs; what a change moves further than two differ is open."""
     experiment = tmp_path / "near.toml"
@@ -443,6 +453,17 @@ def test_runs_and_their_copies_are_replayed_together(monkeypatch: Any) -> None:
         assert [row["amplification"] for row in alone.rows] == [
             row["amplification"] for row in each.rows
         ]
+
+
+def test_a_copy_that_is_refused_is_not_tried(monkeypatch: Any) -> None:
+    def without_prior(source: Any, *_: Any) -> Any:
+        left = {topic: each for topic, each in source.streams.items() if topic != "/car/prior"}
+        return replace(source, streams=left)
+
+    monkeypatch.setitem(CHANGES, "order", CHANGES["order"]._replace(of_run=without_prior))
+    [stressed] = fl.stress(line([1.0, 2.0, 3.0]), {"ekf": fl.modelled(LINE, "ekf")}).stressed
+    assert "topic /car/prior differs" in stressed.tried["order"].why
+    assert stressed.verdict("start") == "harmless"
 
 
 def test_parameters_that_channels_state_differently_stay(monkeypatch: Any) -> None:
