@@ -214,7 +214,19 @@ def _stressed(
         for name in CHANGES
         if name != PARAMETERS and not _lacking(name, own)
     ]
-    done = _replayed([*sources, *copies(whole, 1.0)], label, settings, how)
+    refused: dict[str, str] = {}
+    try:
+        done = _replayed([*sources, *copies(whole, 1.0)], label, settings, how)
+    except BadInput:
+        _replayed(sources, label, settings, how)  # which raises where it is no fault of a copy
+        for name in CHANGES:
+            own = [what for what in whole if what[1] == name]
+            try:
+                _replayed([*sources, *copies(own, 1.0)], label, settings, how)
+            except BadInput as error:
+                refused[name] = str(error)
+        whole = [what for what in whole if what[1] not in refused]
+        done = _replayed([*sources, *copies(whole, 1.0)], label, settings, how)
     rows = {what: len(sources) + place for place, what in enumerate(whole)}
     base = [done.estimates(run) for run in range(len(sources))]
     other = _with_parameters(done, sources, label, settings, 1.0)
@@ -225,7 +237,7 @@ def _stressed(
                 return Tried(name, why=other)
             return _tried(name, done, run, other, run, base[run])
         if (run, name) not in rows:
-            return Tried(name, why=_lacking(name, inputs[run]))
+            return Tried(name, why=refused.get(name) or _lacking(name, inputs[run]))
         return _tried(name, done, run, done, rows[run, name], base[run])
 
     found = [{name: tried(run, name) for name in CHANGES} for run in range(len(sources))]
@@ -252,6 +264,7 @@ def _stressed(
             base[run],
             {name: done.estimates(row) for (of, name), row in rows.items() if of == run}
             | ({} if isinstance(other, str) else {PARAMETERS: other.estimates(run)}),
+            any(isinstance(each, Recursive) for each in bound),
         )
         for run, source in enumerate(sources)
     ]

@@ -69,6 +69,7 @@ class Stressed:
         sensors: the stamps of each topic that was sensed.
         estimates: those of the unchanged replay, by topic.
         copies: those of each change, whole.
+        is_recursive: whether the estimator goes through time, from prediction to update.
     """
 
     source: MemorySource
@@ -78,6 +79,7 @@ class Stressed:
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
     copies: Mapping[str, Mapping[str, Stream]]
+    is_recursive: bool
 
     @property
     def run(self) -> str:
@@ -126,6 +128,11 @@ class Stressed:
     @property
     def is_per_prediction(self) -> bool:
         """Whether a microsecond changes a covariance: one more prediction brings noise of its own."""
+        return self.is_recursive and self._jumps
+
+    @property
+    def _jumps(self) -> bool:
+        """Whether a microsecond changes a sigma, and half of one as much."""
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
@@ -204,6 +211,11 @@ class Stressed:
             said.append(
                 "noise per prediction, not per second: a microsecond makes one prediction two, and "
                 "that changes the covariance; scale the noise with the duration"
+            )
+        elif self._jumps:
+            said.append(
+                "a microsecond decides what is taken together: what has one stamp is one step, and what "
+                "comes later waits for the next"
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined

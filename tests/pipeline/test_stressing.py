@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ import fuselog as fl
 from pipeline.output.alarms import NOT_TESTED, Stressing
 from pipeline.output.report.kinds import opening
 from pipeline.output.results import RUNS, Result, read_result, read_table
+from pipeline.stressing import stressing
 from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of, parameters_changed
 from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
@@ -362,6 +364,15 @@ def test_noise_per_prediction_is_a_discontinuity() -> None:
     assert not mended.is_per_prediction
 
 
+def test_what_waits_for_a_microsecond_is_no_noise() -> None:
+    """Nodes that hear each other at once hear each other a step later."""
+    [stressed] = fl.stress(fl.record("ispace", steps=5), "network:naive").stressed
+    assert stressed.verdict("stamps") == "discontinuous or chaotic"
+    assert "a microsecond decides what is taken together" in " ".join(stressed.sentences)
+    assert not stressed.is_per_prediction
+
+
+@pytest.mark.paper
 def test_planted_direction_and_onset() -> None:
     sources = [drive_of(20, 60, seed) for seed in range(5000, 5020)]
     done = fl.replay(sources, {"ekf": EKF, "ukf": UKF})
@@ -398,6 +409,7 @@ def test_verdicts_are_withheld(fuselog: Callable[..., Any], tmp_path: Any) -> No
     assert NOT_TESTED in fuselog("compare", logs[0], "-e", "ekf", "-e", "ukf").out
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, monkeypatch: Any) -> None:
     """A verdict on every estimator, by all runs; what a change moves further than two differ is open."""
     experiment = tmp_path / "near.toml"
@@ -419,6 +431,46 @@ def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, mo
     parts = stress_result(kept)
     assert [each.words for each in parts] == [each.words for each in kept.stress]
     assert parts[0].moved == pytest.approx(kept.stress[0].moved)
+
+
+def test_runs_and_their_copies_are_replayed_together(monkeypatch: Any) -> None:
+    """At most twelve replays of each run, in at most four passes; and each as if it were alone."""
+    sizes: list[int] = []
+    replayed = stressing._replayed
+
+    def counted(sources: Sequence[Any], *rest: Any) -> Any:
+        sizes.append(len(sources))
+        return replayed(sources, *rest)
+
+    monkeypatch.setattr(stressing, "_replayed", counted)
+    logs = [fl.record("landmarks", seed=seed, duration_s=2.0) for seed in range(3)]
+    together = fl.stress(logs, "ekf").stressed
+    assert len(sizes) <= 4
+    assert 9 * 3 <= sum(sizes) <= 12 * 3
+    for log, each in zip(logs, together, strict=True):
+        [alone] = fl.stress(log, "ekf").stressed
+        assert alone.sentences == each.sentences
+        assert [row["amplification"] for row in alone.rows] == [
+            row["amplification"] for row in each.rows
+        ]
+
+
+def test_a_copy_that_is_refused_is_not_tried(monkeypatch: Any) -> None:
+    def without_prior(source: Any, *_: Any) -> Any:
+        left = {topic: each for topic, each in source.streams.items() if topic != "/car/prior"}
+        return replace(source, streams=left)
+
+    monkeypatch.setitem(CHANGES, "order", CHANGES["order"]._replace(of_run=without_prior))
+    [stressed] = fl.stress(line([1.0, 2.0, 3.0]), {"ekf": fl.modelled(LINE, "ekf")}).stressed
+    assert "topic /car/prior differs" in stressed.tried["order"].why
+    assert stressed.verdict("start") == "harmless"
+
+
+def test_parameters_that_channels_state_differently_stay(monkeypatch: Any) -> None:
+    stated = {"ekf": {"one": "0.1 (/a)", "two": "0.1 (/a), 0.2 (/b)", "word": "yes (/a)"}}
+    monkeypatch.setattr(stressing, "stated_of", lambda *_: stated)
+    done = SimpleNamespace(bound=(), sources=[None])
+    assert stressing._parameters(done, "ekf") == {"one": 0.1}
 
 
 def test_pages_withhold_what_stress_moves_further() -> None:
