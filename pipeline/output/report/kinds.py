@@ -191,7 +191,8 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
-    doubts = [f"{listed(unclear)}, in which {runs} do not decide"] if unclear else []
+    names = listed([name.removesuffix(", RMS") for name in unclear])
+    doubts = [f"who is better in {names}, which {runs} do not tell"] if unclear else []
     told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
     return Opening(tried, told, found, [*also, *notes], chart)
 
