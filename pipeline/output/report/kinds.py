@@ -19,6 +19,7 @@ from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
 from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
 from pipeline.output.words import count, is_error, listed, meaning_alone, number, quantity, scale
+from recorders.parameters import unit_of
 from replay.judging.errors.evaluation import chi_square_interval
 
 Tables = Mapping[str, pd.DataFrame]
@@ -161,7 +162,8 @@ def _of_tuning(told: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
         )
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
-        sentences.append(f"{what} is likeliest {number(row['value'])}{told_by}{begun}.")
+        unit = f" {sign}" if (sign := unit_of(row["parameter"])) else ""
+        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{told_by}{begun}.")
     return replace(told, verdict=[*sentences, *told.verdict])
 
 
