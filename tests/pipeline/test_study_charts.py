@@ -235,8 +235,7 @@ def of_clutter() -> tuple[Chart, Wanted]:
     wanted: Wanted = {}
     for probability in (0.9, 0.5):
         own = wanted[
-            f"probability of detection {probability:g}: "
-            "mean GOSPA (m) over false detections in a scan"
+            f"probability of detection {probability:g}: mean GOSPA (m) over false detections in a scan"
         ] = {}
         for each in BOTH:
             where = {"estimator": each, "detection_probability": probability}
