@@ -121,6 +121,9 @@ _ATTRIBUTES = re.compile(r"^Attributes:\n(?P<entries>(?: .*(?:\n|$)|\n)*)", re.M
 _ENTRY = re.compile(r"^    (?P<names>\w+(?:, \w+)*): (?P<meaning>\S.*(?:\n {5,}\S.*)*)", re.MULTILINE)
 
 
+MOST_WORDS = 8  # of a name
+
+
 def unit_of(name: str) -> str:
     """The unit of a parameter, as the end of its name says it; empty where it says none.
 
@@ -154,8 +157,16 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
 
 
 def in_few_words(meaning: str) -> str:
-    """Return the first words of what a parameter means."""
-    return re.split("[,.:;]", meaning)[0]
+    """Return the first words of what a parameter means, where they name it; empty where they tell of it.
+
+    >>> in_few_words("standard deviation of a range, as the sensor states it.")
+    'standard deviation of a range'
+    >>> in_few_words("a measurement whose NIS is beyond this quantile is not used.")
+    ''
+    """
+    words = re.split("[,.:;]", meaning)[0]
+    is_name = not re.search(r"\b(is|are|was|has|have)\b", words) and len(words.split()) <= MOST_WORDS
+    return words if is_name else ""
 
 
 def _prose(kind: type[BaseModel]) -> str:

@@ -99,7 +99,7 @@ def test_errors_and_nees_are_of_their_estimators_in_their_unit() -> None:
         chart = error_chart([(errors("ekf", *components), steps(1.0, quantity))], "")
         assert chart.panels[0].y.label == label
         np.testing.assert_allclose(chart.panels[0].series[0].y, 1.0 + TIMES)
-    assert chart.title.startswith("errors, 7 runs")
+    assert chart.title.startswith("errors, over all 7 runs together")
 
 
 def test_modes_particles_and_late_messages_are_of_their_estimators() -> None:

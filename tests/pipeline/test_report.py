@@ -29,6 +29,7 @@ from pipeline.output.charts import (
     interval,
     level,
 )
+from pipeline.output.claims import Claim
 from pipeline.output.report import write_report
 from pipeline.output.report.colours import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.first_run import Followed
@@ -477,6 +478,40 @@ def test_in_a_browser_axe_finds_nothing_at_level_aa(shown: Any) -> None:
     found = shown.evaluate(f"axe.run(document, {options}).then((each) => each.violations)")
     told = [(each["id"], [node["html"][:120] for node in each["nodes"][:3]]) for each in found]
     assert told == []
+
+
+def test_in_a_browser_trackers_and_claims_are_told_on_the_first_screen(
+    browser: Any, tmp_path: Path
+) -> None:
+    """Whom to take, what is doubtful, a card each and one of the claims; on a phone nothing is cut."""
+    long = "the tracker that has all of the sensors is better than every one that lacks one of them"
+    gospa_m = {"nearest": 5.0, "jpda": 4.0, "pmbm": 3.0, "jipda": 3.5, "hungarian": 6.0}
+    runs = [
+        {"estimator": label, "run": run, "gospa_m": value + 0.01 * run}
+        for label, value in gospa_m.items()
+        for run in range(5)
+    ]
+    outcome = Outcome(
+        metrics={f"{label}.gospa_m": value for label, value in gospa_m.items()},
+        claims=[Claim(long, "expected", "", verdict) for verdict in ("refuted", "confirmed") * 4],
+        tables={"runs": pd.DataFrame(runs)},
+    )
+    folder = _written(tmp_path / "r", {"runs": 5}, outcome)
+    write_report([folder], tmp_path / "page.html")
+    for width in (1280, 400):
+        page = browser.new_page(viewport={"width": width, "height": 900})
+        page.goto((tmp_path / "page.html").as_uri())
+        assert page.locator(".verdict .first").inner_text().startswith("Take pmbm: ")
+        assert page.locator(".doubtful").inner_text().startswith("Doubtful: ")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        cards = page.locator(".card")
+        names = cards.locator("h3").all_inner_texts()
+        assert names == ["pmbm", "jipda", "jpda", "claims"]
+        assert long in cards.last.inner_text()
+        if width == 1280:
+            boxes = [each.bounding_box() for each in cards.all()]
+            assert max(box["y"] + box["height"] for box in boxes) <= 900
+        page.close()
 
 
 def test_particles_are_in_the_first_picture_and_their_effective_share_in_a_figure(

@@ -319,7 +319,7 @@ def test_headings_say_what_a_parameter_means() -> None:
     row = {"parameter": "sigma_range_m", "start": 1.0, "value": 0.1, "low": 0.09, "high": 0.11}
     [sentence] = opening(tuned, {"parameters": pd.DataFrame([row])}).story.verdict
     assert sentence == (
-        "The standard deviation of a range (sigma_range_m) is likeliest 0.100 (95 % 0.0900 to 0.110), "
+        "The standard deviation of a range (sigma_range_m) is likeliest 0.100 m (95 % 0.0900 to 0.110), "
         "where the search began at 1."
     )
 

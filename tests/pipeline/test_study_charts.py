@@ -235,8 +235,7 @@ def of_clutter() -> tuple[Chart, Wanted]:
     wanted: Wanted = {}
     for probability in (0.9, 0.5):
         own = wanted[
-            f"probability of detection {probability:g}: "
-            "mean GOSPA (m), c = 20 m over false detections in a scan"
+            f"probability of detection {probability:g}: mean GOSPA (m) over false detections in a scan"
         ] = {}
         for each in BOTH:
             where = {"estimator": each, "detection_probability": probability}
@@ -253,7 +252,7 @@ def of_clutter() -> tuple[Chart, Wanted]:
 def of_ferries() -> tuple[Chart, Wanted]:
     table = made("gospa_m", run=["s2", "s13"], estimator=BOTH)
     wanted = of_both(table, "run", "gospa_m")
-    return autoferry._chart(table), {"mean GOSPA (m), c = 20 m over scenario": wanted}
+    return autoferry._chart(table), {"mean GOSPA (m) over scenario": wanted}
 
 
 def of_ranges() -> tuple[Chart, Wanted]:

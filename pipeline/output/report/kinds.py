@@ -19,6 +19,7 @@ from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
 from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
 from pipeline.output.words import count, is_error, listed, meaning_alone, number, quantity, scale
+from recorders.parameters import unit_of
 from replay.judging.errors.evaluation import chi_square_interval
 
 Tables = Mapping[str, pd.DataFrame]
@@ -161,7 +162,8 @@ def _of_tuning(told: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
         )
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
-        sentences.append(f"{what} is likeliest {number(row['value'])}{told_by}{begun}.")
+        unit = f" {sign}" if (sign := unit_of(row["parameter"])) else ""
+        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{told_by}{begun}.")
     return replace(told, verdict=[*sentences, *told.verdict])
 
 
@@ -191,7 +193,8 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
-    doubts = [f"{listed(unclear)}, in which {runs} do not decide"] if unclear else []
+    names = listed([name.removesuffix(", RMS") for name in unclear])
+    doubts = [f"who is better in {names}, which {runs} do not tell"] if unclear else []
     told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
     return Opening(tried, told, found, [*also, *notes], chart)
 

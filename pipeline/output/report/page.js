@@ -26,6 +26,7 @@ function compare(a, b) {
 // A chart is drawn when it comes near to the window, and again when the window or its colours change.
 const NARROWEST_PANEL = 260;
 const LETTER_PX = 7;
+const TICK_PX = 42;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const drawn = new Map();
 
@@ -128,14 +129,18 @@ function layoutOf(place) {
     hoverlabel: { font: { family: style.fontFamily } }, legend: { orientation: "h", y: -45 / inner, yanchor: "top", x: 0 },
     annotations: [],
   };
-  const gap = { x: columns > 1 ? 0.25 / columns : 0, y: (62 + second) / inner };
+  const gap = { x: 0, y: (62 + second) / inner };
+  const panelHeight = inner * (1 - gap.y * (rows - 1)) / rows;
+  // between columns ticks and an axis label have room, of two lines where it is longer than its axis
+  const isLong = chart.panels.some((panel) => fitted(panel.y.label, panelHeight).includes("\n"));
+  if (columns > 1) gap.x = Math.max(0.25 / columns, (isLong ? 84 : 66) / (place.clientWidth - 70));
   chart.panels.forEach((panel, index) => {
     const at = { x: index % columns, y: rows - 1 - Math.floor(index / columns) };
     const size = { x: (1 - gap.x * (columns - 1)) / columns, y: (1 - gap.y * (rows - 1)) / rows };
     for (const name of ["x", "y"]) {
       const start = at[name] * (size[name] + gap[name]);
       layout[`${name}axis${index ? index + 1 : ""}`] = {
-        ...axisOf(panel, name, { x: panelWidth - namesWidth(panel), y: inner * size.y }[name]), gridcolor: line, linecolor: line, zeroline: false,
+        ...axisOf(panel, name, { x: panelWidth - namesWidth(panel), y: panelHeight }[name]), gridcolor: line, linecolor: line, zeroline: false,
         domain: [start, Math.min(1, start + size[name])], anchor: axesOf(index)[name === "x" ? "yaxis" : "xaxis"],
       };
     }
@@ -167,8 +172,8 @@ function axisOf(panel, name, length) {
   const ends = axis.limits ?? endsOf(panel, name);
   const own = axis.log && !places.length ? decades(ends) : [];
   return {
-    title: { text: escaped(fitted(axis.label, length)).replaceAll("\n", "<br>"), standoff: 5 }, nticks: 7, type: axis.log ? "log" : named ? "category" : "linear", automargin: true,
-    exponentformat: "none", separatethousands: true,
+    title: { text: escaped(fitted(axis.label, length)).replaceAll("\n", "<br>"), standoff: 5 }, nticks: name === "x" ? Math.max(3, Math.min(7, Math.floor(length / TICK_PX))) : 7, type: axis.log ? "log" : named ? "category" : "linear", automargin: true,
+    ...(name === "x" && !named && { tickangle: 0 }), exponentformat: "none", separatethousands: true,
     ...(axis.limits && { range: axis.log ? axis.limits.map(Math.log10) : axis.limits }),
     ...(places.length && { tickvals: places, ticktext: Object.values(axis.ticks).map(escaped) }),
     ...(own.length > 1 && { tickvals: own, ticktext: own.map(written) }),

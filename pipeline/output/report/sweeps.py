@@ -120,12 +120,13 @@ class Sweep:
         for key, value in self.points[point].items():
             text = f"{_value(value)} {unit_of(key) if _is_number(value) else ''}".rstrip()
             told.append(text if brief else f"{self.name(key)} = {text}")
-        return ", ".join(told)
+        return f"({', '.join(told)})" if brief and len(told) > 1 else ", ".join(told)
 
     def name(self, key: str, *, with_key: bool = False) -> str:
         """What a parameter is: what it means, where that is known."""
         meaning = str(self.result.settings.get("meanings", {}).get(key, ""))
-        return f"{meaning} ({key})" if meaning and with_key else meaning or key
+        name = meaning or quantity(key.rpartition(".")[2]).name
+        return f"{name} ({key})" if with_key else name
 
 
 def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings]:
@@ -165,7 +166,7 @@ def _tried(sweep: Sweep, labels: list[str]) -> str:
     of = f" of {source}" if source else ""
     runs = f"{count(len(sweep.points), 'point')}, {count(sweep.runs, 'run')}{of} at each"
     text = f"{listed(over)}: {runs}, for {listed(labels)}."
-    return text[:1].upper() + text[1:] if sweep.name(key) != key else text
+    return text[:1].upper() + text[1:]
 
 
 def _best(sweep: Sweep, label: str, own: "pd.Series[float]") -> int:

@@ -150,10 +150,10 @@ def _farthest(
 
 def _chart(table: pd.DataFrame) -> Chart:
     """GOSPA of every estimator by scenario."""
-    panel = Panel(x=Axis(label="scenario"), y=Axis(label="mean GOSPA (m), c = 20 m"))
+    panel = Panel(x=Axis(label="scenario"), y=Axis(label="mean GOSPA (m)"))
     for label, rows in table.groupby("estimator", sort=False):
         panel.series.append(curve(str(label), rows["run"], rows["gospa_m"], "line+markers"))
-    return Chart(panels=[panel])
+    return Chart(title="GOSPA (cutoff 20 m) by scenario", panels=[panel])
 
 
 AUTOFERRY = Study(
