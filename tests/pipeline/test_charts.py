@@ -302,8 +302,8 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
     time_s, wanted = np.arange(120.0), {}
     degrees = np.where(np.arange(120) % 4, 2, 1)
     found: dict[tuple[str, str], Any] = {}
-    for label, late, where in (("calm", 1.0, "never"), ("half", 9.0, "50 % of the time")):
-        squared = degrees * np.where(time_s < 60.0, 1.0, late)
+    for label, late, where in (("calm", 1.0, "never"), ("late", 9.0, "75 % of the time")):
+        squared = degrees * np.where(time_s < 30.0, 1.0, late)
         runs = [SimpleNamespace(squared=factor * squared, degrees=degrees) for factor in (0.5, 1.5)]
         runs[0].squared[7], runs[1].degrees = np.nan, np.where(time_s == 9.0, 0, degrees)
         found[label, "a"] = [(time_s, each) for each in runs]
@@ -314,21 +314,21 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
         middle = (edges[:-1] + edges[1:]) / 2
         low, high = (chi2.ppf(level, counts) / counts for level in (0.025, 0.975))
         is_out = (mean < low) | (mean > high)
-        assert is_out.mean() == {"never": 0.0}.get(where, 0.5)
+        assert is_out.mean() == {"never": 0.0}.get(where, 0.75)
         own = {label: [middle, mean], "95 % if consistent band": [middle, low, high]}
         wanted[f"{label}: outside {where}: NIS per component over time (s)"] = own
         if is_out.any():
-            own["outside"] = [middle[is_out], np.zeros(30)]
+            own["outside"] = [middle[is_out], np.zeros(45)]
     found["other", "b"] = found["calm", "a"]
     monkeypatch.setattr("pipeline.output.report.scene.innovations_of_runs", lambda _: found)
-    chart = nis_chart(tmp_path, ["half", "calm", "other"])
+    chart = nis_chart(tmp_path, ["late", "calm", "other"])
     assert chart is not None
     drawn = held(chart)
     for own in drawn.values():
         if "outside" in own:  # at the foot
             low = min(np.min(each[1]) for each in own.values())
             assert set(own["outside"][1]) == {low}
-            own["outside"][1] = np.zeros(30)
+            own["outside"][1] = np.zeros(45)
     same(drawn, wanted)
     assert "of a;" in chart.title
     assert nis_chart(tmp_path, ["unknown"]) is None
