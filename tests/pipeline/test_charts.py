@@ -2,17 +2,19 @@
 
 from collections.abc import Mapping
 from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import chi2
 
 from pipeline.comparing.comparing import _chart as difference_chart
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, draw
 from pipeline.output.report.first_run import first_run
-from pipeline.output.report.scene import plan
+from pipeline.output.report.scene import nis_chart, plan
 from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
 from pipeline.runs.sweeps import Over, figures_of
 from pipeline.tuning.outcome import Tuning
@@ -291,6 +293,45 @@ def test_the_first_picture_has_the_paths_in_the_plane(tmp_path) -> None:
     [panel] = chart.panels
     assert panel.plane
     assert [each.reference for each in panel.series] == [True, False, False]
+
+
+def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Of two runs; one of two components each is unknown now and then, and counts nowhere."""
+    time_s, wanted = np.arange(120.0), {}
+    degrees = np.where(np.arange(120) % 4, 2, 1)
+    found: dict[tuple[str, str], Any] = {}
+    for label, late, where in (("calm", 1.0, "never"), ("late", 9.0, "75 % of the time")):
+        squared = degrees * np.where(time_s < 30.0, 1.0, late)
+        runs = [SimpleNamespace(squared=factor * squared, degrees=degrees) for factor in (0.5, 1.5)]
+        runs[0].squared[7], runs[1].degrees = np.nan, np.where(time_s == 9.0, 0, degrees)
+        found[label, "a"] = [(time_s, each) for each in runs]
+        known = [degrees * (time_s != 7.0), runs[1].degrees]
+        sums = [np.nan_to_num(runs[0].squared), runs[1].squared * (time_s != 9.0)]
+        counts, edges = np.histogram(np.tile(time_s, 2), 60, weights=np.concatenate(known))
+        mean = np.histogram(np.tile(time_s, 2), 60, weights=np.concatenate(sums))[0] / counts
+        middle = (edges[:-1] + edges[1:]) / 2
+        low, high = (chi2.ppf(level, counts) / counts for level in (0.025, 0.975))
+        is_out = (mean < low) | (mean > high)
+        assert is_out.mean() == {"never": 0.0}.get(where, 0.75)
+        own = {label: [middle, mean], "95 % if consistent band": [middle, low, high]}
+        wanted[f"{label}: outside {where}: NIS per component over time (s)"] = own
+        if is_out.any():
+            own["outside"] = [middle[is_out], np.zeros(45)]
+    found["other", "b"] = found["calm", "a"]
+    monkeypatch.setattr("pipeline.output.report.scene.innovations_of_runs", lambda _: found)
+    chart = nis_chart(tmp_path, ["late", "calm", "other"])
+    assert chart is not None
+    drawn = held(chart)
+    for own in drawn.values():
+        if "outside" in own:  # at the foot
+            low = min(np.min(each[1]) for each in own.values())
+            assert set(own["outside"][1]) == {low}
+            own["outside"][1] = np.zeros(45)
+    same(drawn, wanted)
+    assert "of a;" in chart.title
+    assert nis_chart(tmp_path, ["unknown"]) is None
 
 
 def test_a_figure_has_what_its_chart_says() -> None:

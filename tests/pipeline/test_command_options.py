@@ -3,6 +3,7 @@
 import re
 from contextlib import chdir
 from hashlib import sha256
+from inspect import Parameter, isfunction, signature
 from pathlib import Path
 from shutil import copytree, rmtree
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from typing import NamedTuple
 import click
 import pytest
 
+import fuselog as fl
 from pipeline.command_line import fuselog
 from tests.pipeline.conftest import run_here
 
@@ -307,3 +309,21 @@ def _is_named(command: str, option: str, spellings: list[str]) -> bool:
         paths = [ROOT / OPTIONS_ELSEWHERE[option]]
     spelt = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, spellings))})(?![\w-])")
     return any(spelt.search(path.read_text(encoding="utf-8")) for path in paths)
+
+
+def test_what_is_not_stated_is_the_same_in_python_and_in_every_command():
+    """One name has one default, but where results go; of commands the text that they parse."""
+    found: dict[str, set[str]] = {}
+    for name in dir(fl):
+        if isfunction(function := getattr(fl, name)):
+            for each in signature(function).parameters.values():
+                found.setdefault(each.name, set()).add(str(each.default))
+    shared = {name for name, defaults in found.items() if len(defaults) > 1}
+    for command in COMMANDS.values():
+        for option in command.params:
+            if isinstance(option, click.Option) and option.default != click.Option(["--any"]).default:
+                found.setdefault(option.name, set()).add(str(option.default))
+    stated = {name: each - {"None", "()", "False", str(Parameter.empty)} for name, each in found.items()}
+    assert {name for name, each in stated.items() if len(each) > 1} == {"out"}
+    assert len(shared) > 10
+    assert stated["gap_limit_s"] == {"0.2"}

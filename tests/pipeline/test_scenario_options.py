@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 from recorders.parameters import build, merge, nested
 from recorders.recording import Recorder, Simulator, record_run
 from recorders.registry import available, load
-from tests.pipeline.moves import bounds_of, moved, settable
+from tests.pipeline.moves import bounds_of, moved, settable, value_of
 
 SCENARIOS = {
     name: each
@@ -163,3 +163,20 @@ def test_bounds_of_parameters_are_kept(name: str):
         for value in refused:
             with pytest.raises(BadInput, match=f"^scenario: parameter '{each.name}' is .*; it should"):
                 build(kind, merge(case.base, nested(each.name, value)), "scenario")
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_one_entry_more_is_refused_or_recorded(name: str):
+    """What has too many entries would be taken for something that was meant."""
+    case, kind, ignored = CASES.get(name, Case()), SCENARIOS[name].parameters, []
+    values = build(kind, case.base, "base").model_dump()
+    for each in settable(kind):
+        value = value_of(values, each.name)
+        if isinstance(value, list | tuple) and value and isinstance(value[0], float):
+            longer = merge(case.base, nested(each.name, [*value, value[-1]]))
+            try:
+                if fingerprint(name, longer) == fingerprint(name, case.base):
+                    ignored.append(each.name)
+            except BadInput:
+                continue
+    assert not ignored

@@ -348,7 +348,9 @@ def test_heading_after_fixes(settings: Any, compass: bool, expected: Expected) -
 
 
 def test_noise_per_prediction_is_a_discontinuity() -> None:
-    stressed = fl.stress(drive_of(20, 80), {"ukf": fl.modelled(PER_PREDICTION, "ukf")}).stressed[0]
+    done = fl.stress(drive_of(20, 80), {"ukf": fl.modelled(PER_PREDICTION, "ukf")})
+    [stressed] = done.stressed
+    assert done.table["change"].tolist() == [row["change"] for row in stressed.rows] != []
     stamps = stressed.tried["stamps"].parting
     assert stamps is not None
     assert stressed.worst == stressed.verdict("stamps") == "discontinuous or chaotic"

@@ -341,6 +341,28 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     assert stream["accepted"].tolist() == [1, 0]  # the last is six standard deviations to the east
 
 
+@pytest.mark.parametrize(("count", "turned"), [(24, [0.04, 0.08, 0.12]), (23, [0.02, 0.03, 0.04])])
+def test_states_are_in_our_axes_with_the_variances_of_old_and_new_firmware(
+    tmp_path: Path, count: int, turned: list[float]
+):
+    """A level vehicle that heads north; old firmware has variances of four numbers of a quaternion."""
+    fields = f"float[24] states;float[{count}] covariances;"
+    layout = f"estimator_states:uint64_t timestamp;uint64_t timestamp_sample;{fields}uint8_t n_states;"
+    states = np.concatenate([[1, 0, 0, 0], [1, 2, 3], [10, 20, 30], np.zeros(14)])
+    turns = [0.005, 0.01, 0.02, 0.03] if count == 24 else turned
+    variances = np.concatenate([turns, [0.1, 0.2, 0.3], [1, 2, 3], np.zeros(count - 6 - len(turns))])
+    body = np.concatenate([states, variances]).astype("<f4").tobytes() + b"\x18"
+    rows = message("D", struct.pack("<HQQ", 20, 1_000_000, 1_000_000) + body)
+    path = tmp_path / "states.ulg"
+    subscribed = message("A", struct.pack("<BH", 0, 20) + b"estimator_states")
+    path.write_bytes(by_hand(subscribed, formats=(layout,), last=rows))
+    stream = streams_of(path)["/estimates/ekf2/vehicle/state"]
+    [mean], [covariance] = stream["mean"], stream["covariance"].reshape(-1, 9, 9)
+    np.testing.assert_allclose(mean[:6], [20, 10, -30, 2, 1, -3])
+    np.testing.assert_allclose(rotate(mean[6:], np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(covariance, np.diag([2, 1, 3, 0.2, 0.1, 0.3, *turned]), atol=1e-6)
+
+
 def test_parameters_are_settings_of_ours_or_it_is_said_why_not():
     """Noise by the sheet, section 1: PX4's defaults are .0015 and .035 for a step of 10 ms."""
     parameters = {

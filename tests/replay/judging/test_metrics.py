@@ -73,19 +73,17 @@ def test_metrics_get_what_they_judge_and_keys_name_estimator_quantity_and_case()
 
 
 def test_consistency_is_of_state_and_position_where_there_is_a_nees() -> None:
-    """One covariance of four is singular, of the others one is too small and one too large."""
-    errors = make_errors(
-        np.array([[1.0, 1.0, 1.0], [3.0, 3.0, 3.0], [0.01, 0.01, 0.01], [9.0, 9.0, 9.0]]),
-        ("x_m", "y_m", "heading_rad"),
-    )
+    """One covariance of four is singular, and one too small for its error."""
+    squared = np.array([1.0, 9.0, 0.1, 81.0])  # of each component; a NEES of .3 is in bounds for three
+    errors = make_errors(np.sqrt(np.tile(squared, (3, 1)).T), ("x_m", "y_m", "heading_rad"))
     errors = replace(errors, nees=np.append(errors.nees[:3], np.nan))
     errors.covariance[3] = 0.0
     assert CONSISTENCY.of(errors) == pytest.approx(
         {
-            "nees": (3.0 + 27.0 + 0.0003) / 3,
+            "nees": (3.0 + 27.0 + 0.3) / 3,
             "estimates_without_nees": 1.0,
-            "position_nees": (2.0 + 18.0 + 0.0002) / 3,
-            "nees_steps_within_95": 1 / 4,
+            "position_nees": (2.0 + 18.0 + 0.2) / 3,
+            "nees_steps_within_95": 2 / 4,
         }
     )
     assert CONSISTENCY.of(make_errors(np.empty((0, 1)), ("x_m",))) == {}

@@ -37,11 +37,12 @@ class View(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """All of a file."""
+    """All of a file; `shared` has for each part that shares its room how much of it which views get."""
 
     moving: dict[str, Columns]
     still: dict[str, Columns]
     views: list[View]
+    shared: list[list[tuple[float, set[str]]]]
 
 
 class Wanted(NamedTuple):
@@ -56,14 +57,15 @@ def picture_of(path: Path) -> Picture:
     """Read a file back."""
     reader = rc.RrdReader(str(path))
     parts: dict[str, dict[str, list]] = {}
+    containers: dict[str, dict[str, list]] = {}
     trails: dict[str, list[str]] = {}
     for chunk in reader.stream(store=reader.blueprints()[0]):
         kind, _, rest = chunk.entity_path.strip("/").partition("/")
         number, _, detail = rest.partition("/")
-        if kind == "view":
+        if kind in ("view", "container"):
             batch = chunk.to_record_batch()
             named = {name: batch.column(name)[0].as_py() for name in batch.schema.names}
-            parts.setdefault(number, {}).update(named)
+            (parts if kind == "view" else containers).setdefault(number, {}).update(named)
             overridden = detail.removeprefix("ViewContents/overrides/").removesuffix("/visualizers")
             if overridden != detail:
                 trails.setdefault(number, []).append(f"/{overridden}")
@@ -76,7 +78,27 @@ def picture_of(path: Path) -> Picture:
             (part.get(each) or [None])[0] for each in ("ScalarAxis:range", "VisualBounds2D:range")
         )
         views.append(View(kind, name, roots, span, bounds, trails.get(number, [])))
-    return Picture(read(path), read(path, static=True), views)
+    kinds = {number: part["ViewBlueprint:class_identifier"][0] for number, part in parts.items()}
+    shared = [
+        [
+            (share, _kinds_of(each, kinds, containers))
+            for share, each in zip(shares, contents, strict=True)
+        ]
+        for container in containers.values()
+        if (contents := container["ContainerBlueprint:contents"])
+        for axis in ("col", "row")
+        if (shares := container.get(f"ContainerBlueprint:{axis}_shares"))
+    ]
+    return Picture(read(path), read(path, static=True), views, shared)
+
+
+def _kinds_of(part: str, kinds: Mapping[str, str], containers: Mapping[str, Any]) -> set[str]:
+    """Of which kinds the views within a part of the layout are."""
+    number = part.partition("/")[2]
+    if number in kinds:
+        return {kinds[number]}
+    within = containers[number]["ContainerBlueprint:contents"]
+    return set().union(*(_kinds_of(each, kinds, containers) for each in within))
 
 
 def _each(columns: Columns, name: str) -> list:
@@ -222,8 +244,14 @@ def quality(errors: Sequence[Errors], case: str) -> tuple[dict[str, Wanted], Tit
 def check_views(picture: Picture, titles: Titles, estimators: Sequence[str] = ("one", "two")) -> None:
     """Each view has its title over what that names, and shows it; an estimator has one colour.
 
-    A title's grid has its steps and y up, paths with a trail are there, and ranges hold curves.
+    A title's grid has its steps and y up, paths with a trail are there, and ranges hold curves. What
+    moves in the plane or in space comes first and has the most room.
     """
+    for shares in picture.shared:
+        is_space = [bool(kinds & {"2D", "3D"}) for _, kinds in shares]
+        assert sorted(is_space, reverse=True) == is_space
+        if is_space[0]:
+            assert shares[0][0] == max(share for share, _ in shares)
     drawn = {*picture.moving, *picture.still}
     named = [(view.name.partition(", grid")[0], view.roots[0]) for view in picture.views]
     assert sorted(named) == sorted(titles), {*named} ^ titles
