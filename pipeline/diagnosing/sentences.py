@@ -107,9 +107,14 @@ def marks_of(
     return marks
 
 
-def notes_of(done: Replay, sentences: Sequence[Sentence]) -> list[str]:
-    """What has to be known of a diagnosis: what was not judged, and how many sentences are not said."""
-    notes = list(done.judge.components_without_truth)
+def notes_of(done: Replay, sentences: Sequence[Sentence], in_doubt: Sequence[Cause] = ()) -> list[str]:
+    """What has to be known of a diagnosis: what is in doubt or not judged, and how much is not said."""
+    notes = [
+        "in doubt, as all that gains less, since the parts of the log disagree about the number by more "
+        f"than chance: {each.words}"
+        for each in in_doubt
+    ]
+    notes += done.judge.components_without_truth
     if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
         notes.append(
             "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"

@@ -192,7 +192,7 @@ def test_causes_that_explain_nearly_as_much_are_said_to() -> None:
     seen = likelihood.begin(base)
     tried = hypotheses(bind("ekf", [faulty], given), base, seen, likelihood.readings)
     alike = [each for each in tried if each.part == "x_m"]
-    [cause], listed = find_causes(likelihood, base, [*alike, replace(alike[0])], 5)
+    [cause], listed, _ = find_causes(likelihood, base, [*alike, replace(alike[0])], 5)
     assert len(cause.others) == 1
     assert (
         "; or else, which this log does not tell from it, /robot1/prior: x_m at the start" in cause.words

@@ -1,6 +1,7 @@
 """Faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
 import re
+from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -24,7 +25,7 @@ from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
 from recorders.log import Stream, Topic
 from recorders.parameters import Parameters, meanings
-from replay.engine.replaying.estimator import Bound, Reading
+from replay.engine.replaying.estimator import Bound, Reading, Recursive
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
 
@@ -37,7 +38,7 @@ STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """The noise that the estimator's parameters state, or channels for them."""
+    """The noise that the estimator's parameters state, channels for them, or that is assumed."""
     parameters = bound[0].parameters
     if parameters is None:
         return
@@ -48,8 +49,9 @@ def of_noises(
         if topic in source.topics
     ]
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
+    assumed = ChainMap(*(dict(each.assumed) for each in bound if isinstance(each, Recursive)))
     for name, topic in noises.items():
-        value = _noise_of(parameters, name, read)
+        value = _noise_of(parameters, name, read, assumed)
         if value is None:
             continue
         kind: Kind = "measurement noise" if topic else "process noise"
@@ -74,11 +76,14 @@ def _noise(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
     return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend)
 
 
-def _noise_of(parameters: Parameters, name: str, read: Sequence[Topic]) -> float | None:
-    """The value of a parameter that is a noise: given, or as a channel states it."""
+def _noise_of(
+    parameters: Parameters, name: str, read: Sequence[Topic], assumed: Mapping[str, float]
+) -> float | None:
+    """The value of a parameter that is a noise: given, as a channel states it, or assumed."""
     value = getattr(parameters, name)
     if value is None:
         value = stated(read, name, type(parameters), needed=False)
+        value = assumed.get(name) if np.isnan(value) else value
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and 0.0 < value < np.inf else None
 
