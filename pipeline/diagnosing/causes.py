@@ -143,7 +143,7 @@ def find_causes(
                 alike = _likeliest(likelihood, one_less, peaks, others, len(tried))[0] or alike
         if not alike:
             break
-        alike[1:1] = _rivals(gains_of, alike[0], least_gain(len(tried)))
+        alike[:1] = _with_rival(gains_of, alike[0], least_gain(len(tried)))
         causes = _causes(gains_of, alike)
         found.append(causes[0]._replace(others=tuple(causes[1:])))
         now = causes[0].hypothesis.without(now, causes[0].value)
@@ -285,18 +285,22 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
     return last > at.gain - DROP_95
 
 
-def _rivals(
+def _with_rival(
     gains_of: GainsOf, pair: tuple[Peak, Hypothesis], apart: float
 ) -> list[tuple[Peak, Hypothesis]]:
-    """Another number of a delay or angle, if it gains so little less that chance may explain it."""
+    """Beside the number of a delay or angle another one, where chance explains the difference.
+
+    The likelier first; it alone, where chance does not.
+    """
     at, of = pair
     may_come_again = of.limit == np.pi or of.kind == "delay"
     if not of.tried or of.size > 1 or not may_come_again:
-        return []
+        return [pair]
     [found] = side_by_side(
         [rival(of, at, at.gain - apart)], lambda asked: gains_of([(of, value) for _, value in asked])
     )
-    return [] if found is None else [(found, of)]
+    both = [at] if found is None else sorted((at, found), key=lambda each: -each.gain)
+    return [(each, of) for each in both if each.gain >= both[0].gain - apart]
 
 
 def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list[Cause]:

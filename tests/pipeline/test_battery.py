@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 import fuselog as fl
 from pipeline.altering.sources import alter
@@ -118,6 +119,28 @@ def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
         assert told.value == pytest.approx(planted, abs=3.0)
     setting = dict([found.setting.split("=")])
     assert fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0, **setting}).sentences == []
+
+
+def test_another_origin_of_positions_is_one_cause_of_two_numbers() -> None:
+    """A lever arm, which turns with the car, is none."""
+    car = drive(SEED)
+    shifted, turned = (
+        recorded(each, has_compass=False, has_prior=True)
+        for each in (
+            car._replace(fix_m=car.fix_m + np.array([40.0, -25.0])),
+            FAULTS["lever (2, .6) m"](car),
+        )
+    )
+    [cause] = seek(shifted, "ekf", OPEN, 1).causes
+    assert "too far along y: its origin is another one" in cause.words
+    assert cause.value == pytest.approx((40.0, -25.0), abs=3.0)
+    mend = cause.hypothesis.mend(cause.value)
+    assert mend is not None
+    assert mend.key == f"{FIX}.origin"
+    mended = alter(shifted, mend.settings).streams[FIX]["position_m"]
+    assert_allclose(mended, car.fix_m, atol=3.0)
+    [other] = seek(turned, "ekf", OPEN, 1).causes
+    assert "origin" not in other.words
 
 
 @pytest.mark.paper

@@ -89,9 +89,13 @@ def test_what_is_inconsistent_and_has_no_name_is_said_to_be(monkeypatch: pytest.
 
 
 class Parabolas(NamedTuple):
-    """Gains that are greatest at 5, of each part of a log so far above or below it."""
+    """Gains that are greatest at 5, of each part of a log so far above or below it.
+
+    And at -8, by so much less.
+    """
 
     apart: float
+    less: float = np.inf
 
     def __call__(self, trials: Sequence[float]) -> list[float]:
         """The gains over all parts."""
@@ -100,7 +104,8 @@ class Parabolas(NamedTuple):
     def over_parts(self, trials: Sequence[float], count: int) -> np.ndarray:
         """The gains over so many parts."""
         best = 5.0 + self.apart * np.resize([1.0, -1.0], PARTS)
-        gains = -0.5 * (np.reshape(trials, (-1, 1)) - best) ** 2
+        at = np.reshape(trials, (-1, 1))
+        gains = np.maximum(-0.5 * (at - best) ** 2, -0.5 * (at + 8.0) ** 2 - self.less / PARTS)
         return gains.reshape(len(trials), count, PARTS // count).sum(axis=2)
 
 
@@ -126,6 +131,27 @@ def test_what_the_parts_of_a_log_disagree_about_is_in_doubt(apart: float, *, is_
     named, in_doubt = sought(10.0, apart)
     assert [*named, *in_doubt] == pytest.approx([5.0], abs=0.02)
     assert bool(named) == is_named
+
+
+@pytest.mark.parametrize(
+    ("less", "values"),
+    [(5.0, [5.0]), (2.0, [5.0, -8.0]), (-2.0, [-8.0, 5.0]), (-5.0, [-8.0])],
+)
+def test_what_another_number_explains_as_well_is_not_determined(
+    less: float, values: list[float]
+) -> None:
+    """Chance explains a difference of 3.3."""
+    likelihood: Any = Parabolas(0.0, less)
+    tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), 10.0, lambda _, at: at, late, lambda _: None)  # type: ignore[arg-type,return-value]
+    [[cause], *_] = find_causes(likelihood, 0.0, [tried], 1)  # type: ignore[arg-type]
+    assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
+    other = f"; this log does not determine it: as likely, {values[-1]:.2f} late;"
+    assert (other in cause.words) == (len(values) > 1)
+
+
+def late(at: float, *_: float) -> str:
+    """What is wrong."""
+    return f"{at:.2f} late"
 
 
 def test_a_gate_that_is_set_is_no_advice() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import STATED
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
+from pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_RAD
 from pipeline.diagnosing.hypotheses.hypothesis import (
     IS_SO,
     SCALES,
@@ -120,6 +121,7 @@ def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> I
     """The parameters that may be estimated: those of one unit that the same functions read are a vector.
 
     Those that are the bias or factor of a number of a topic are left out: that is tried by itself.
+    Angles are tried one by one as well, all around: a unit is mounted a quarter turn off, not by three.
     """
     parameters = bound[0].parameters
     groups: dict[tuple[Any, ...], list[str]] = {}
@@ -132,13 +134,21 @@ def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> I
             group = groups.setdefault((unit_of(name), kind, topics), [])
             if name not in group:
                 group.append(name)
-    for (unit, _, topics), names in groups.items():
-        values = tuple(float(getattr(parameters, name)) for name in names)
-        yield _parameters(names, values, STEPS.get(unit, STEPS[""]), topics)
+    for (unit, kind, topics), names in groups.items():
+        apart = [[name] for name in names] if kind == "angle" and len(names) > 1 else []
+        for some in (names, *apart):
+            values = tuple(float(getattr(parameters, name)) for name in some)
+            step = STEPS.get(unit, STEPS[""])
+            yield _parameters(some, values, step, topics, is_angle=kind == "angle")
 
 
 def _parameters(
-    names: Sequence[str], values: tuple[float, ...], step: float, topics: Sequence[str]
+    names: Sequence[str],
+    values: tuple[float, ...],
+    step: float,
+    topics: Sequence[str],
+    *,
+    is_angle: bool,
 ) -> Hypothesis:
     """Some parameters have other values; the numbers are by how much."""
     size = len(names)
@@ -168,8 +178,18 @@ def _parameters(
         return Advice(name, value, free=" ".join(names) if size == 1 else "", more=tuple(more))
 
     tried: tuple[Any, ...] = ((step,) * size,) if size > 1 else (-step, step, -10.0 * step, 10.0 * step)
+    is_round = is_angle and size == 1
     return Hypothesis(
-        "parameter", names[0], ", ".join(names[1:]), tried, np.inf, without, words, mend, size=size
+        "parameter",
+        names[0],
+        ", ".join(names[1:]),
+        ANGLES_RAD if is_round else tried,
+        np.pi if is_round else np.inf,
+        without,
+        words,
+        mend,
+        TURNS_RAD if is_round else {},
+        size,
     )
 
 
