@@ -157,6 +157,22 @@ def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     assert found.sentences[0].setting == "/car/odometry.turn_scale=-1"
 
 
+def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_start() -> None:
+    """A prior states the heading of the body, and a unit's yaw is only known by that."""
+    log = fl.record("navigation", seed=3, duration_s=12.0, unit={"rate_hz": 25.0})
+    turned = {
+        f"/body/inertial.{each}_matrix": "0,-1,0,1,0,0,0,0,1" for each in ("specific_force", "turn_rate")
+    }
+    sought = [seek(alter(log, each), "ekf", OPEN, 1) for each in (turned, {})]
+    [cause], nothing = (each.causes for each in sought)
+    assert nothing == []
+    assert (cause.hypothesis.topic, cause.value) == (
+        "mounting_yaw_rad",
+        pytest.approx(-0.5 * np.pi, abs=0.1),
+    )
+    assert "which this log does not tell from it, /body/prior: heading at the start" in cause.words
+
+
 def test_the_battery_is_counted_by_cell() -> None:
     """Every cell is counted by itself, and clean logs beside the others."""
     cells = [*battery.cells(), *battery.cells(has_prior=True)]

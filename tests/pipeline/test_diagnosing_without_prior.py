@@ -173,7 +173,7 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     fl.write(log, car(2000))
     found = fuselog("diagnose", log, "-e", "ekf", "--json").json
     assert found["found"] == [
-        f"nothing found: of {found['hypotheses']} faults none gains {found['least_gain']:.3g} in "
+        f"nothing found: of {found['hypotheses']} faults none surely gains {found['least_gain']:.3g} in "
         "log-likelihood"
     ]
     fl.write(log, car(2000, 1 / 256))

@@ -74,7 +74,7 @@ def _noise(name: str, meaning: str, value: float, kind: Kind) -> Hypothesis:
     def mend(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
 
-    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend)
+    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor)
 
 
 def _noise_of(
@@ -110,7 +110,14 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
         # undone by a covariance that is larger, where it is stated too small
         without = partial(_spread, stream.topic, spread)
         kind: Kind = "measurement noise"
-        yield Hypothesis(kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend)
+        yield Hypothesis(
+            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor
+        )
+
+
+def _factor(logarithm: float) -> float:
+    """How many times as large a standard deviation should be."""
+    return float(np.exp(logarithm))
 
 
 def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float) -> Trial:
