@@ -12,6 +12,7 @@ from pipeline.diagnosing.hypotheses.hypothesis import (
     Hypothesis,
     Number,
     gains_over,
+    inflation_over,
 )
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
@@ -118,55 +119,82 @@ def least_gain(count: int, size: int = 1) -> float:
 
 def find_causes(
     likelihood: Likelihood, base: Trial, tried: Sequence[Hypothesis], most: int
-) -> tuple[list[Cause], list[Tried]]:
-    """At most so many causes, the likeliest first, and what each hypothesis gains of the log as it is.
+) -> tuple[list[Cause], list[Tried], list[Cause]]:
+    """At most so many causes, the likeliest first; what each hypothesis gains; and one that is in doubt.
 
-    Each gains most after all before it are undone: most in log-likelihood less what its numbers cost.
+    Each cause gains most after all before it are undone: most in log-likelihood less what its numbers
+    cost. What the hypotheses gain is of the log as it is. In doubt is what gains most after all causes,
+    or more than the last, where the parts of the log disagree about its number.
     """
-    found, listed = list[Cause](), list[Tried]()
+    found, listed, doubtful = list[Cause](), list[Tried](), list[tuple[Peak, Hypothesis]]()
     candidates, now = list(tried), base
     while candidates and len(found) < most:
         gains_of = gains_over(likelihood, now)
         peaks = _peaks(gains_of, candidates, len(tried))
         listed = listed or [Tried(each, at) for each, at in zip(candidates, peaks, strict=True)]
-        alike = _likeliest(gains_of, peaks, candidates, len(tried))
-        if alike and _is_gross(*alike[0]):
+        alike, doubtful = _likeliest(likelihood, now, peaks, candidates, len(tried))
+        if any(_is_gross(*pair) for pair in (*alike[:1], *doubtful)):
             beside = _companion(likelihood, now, peaks, candidates)
             if beside is not None:
-                gains_of = gains_over(likelihood, beside.without(now))
+                one_less = beside.without(now)
+                gains_of = gains_over(likelihood, one_less)
                 others = [each for each in candidates if each is not beside.of]
                 peaks = _peaks(gains_of, others, len(tried))
-                alike = _likeliest(gains_of, peaks, others, len(tried)) or alike
+                alike = _likeliest(likelihood, one_less, peaks, others, len(tried))[0] or alike
         if not alike:
             break
-        alike[1:1] = _rivals(gains_of, alike[0], least_gain(len(tried)))
+        alike[:1] = _with_rival(gains_of, alike[0], least_gain(len(tried)))
         causes = _causes(gains_of, alike)
         found.append(causes[0]._replace(others=tuple(causes[1:])))
         now = causes[0].hypothesis.without(now, causes[0].value)
         gone = {id(each) for _, each in alike}
         candidates = [each for each in candidates if id(each) not in gone]
-    return found, listed
+    in_doubt = _causes(gains_over(likelihood, now), doubtful[:1]) if doubtful else []
+    return found, listed, _over_halves(likelihood, now, in_doubt) if in_doubt else []
 
 
 def _likeliest(
-    gains_of: GainsOf, peaks: Sequence[Peak], candidates: Sequence[Hypothesis], count: int
-) -> list[tuple[Peak, Hypothesis]]:
-    """The hypothesis that gains most, and those that the log does not tell from it; none by chance."""
+    likelihood: Likelihood,
+    now: Trial,
+    peaks: Sequence[Peak],
+    candidates: Sequence[Hypothesis],
+    count: int,
+) -> tuple[list[tuple[Peak, Hypothesis]], list[tuple[Peak, Hypothesis]]]:
+    """The hypothesis that gains most, and those that the log does not tell from it; none by chance.
+
+    And those in doubt. How much the parts of a log disagree is the log's: what they disagree about in
+    what gains more holds of what gains less as well. Burnham and Anderson, Model Selection and
+    Multimodel Inference, 2nd ed. 2002, section 2.5, divide all by one factor too.
+    """
+    gains_of, inflation_of = gains_over(likelihood, now), inflation_over(likelihood, now)
+    doubtful, inflation = list[tuple[Peak, Hypothesis]](), 1.0
+
+    def is_sure(pair: tuple[Peak, Hypothesis]) -> bool:
+        nonlocal inflation
+        at, of = pair
+        if _is_at_end(gains_of, at, of):
+            return False
+        inflation = max(inflation, inflation_of(of, at.value, at.gain))
+        if at.gain > least_gain(count, of.size) * inflation:
+            return True
+        doubtful.append(pair)
+        return False
+
     ranked = sorted(
         ((at, each) for at, each in zip(peaks, candidates, strict=True) if _is_named(at, each, count)),
         key=lambda pair: -pair[0].score(pair[1]),
     )
-    first = next((pair for pair in ranked if not _is_at_end(gains_of, *pair)), None)
-    if first is None:
-        return []
+    place = next((place for place, pair in enumerate(ranked) if is_sure(pair)), None)
+    if place is None:
+        return [], doubtful
+    first, before = ranked[place], list(doubtful)
     least = first[0].score(first[1]) - RIVAL
     near = [
         pair
-        for pair in ranked
-        if pair is not first and (pair[0].score(pair[1]) > least or _is_other_name(pair, first))
+        for pair in ranked[place + 1 :]
+        if pair[0].score(pair[1]) > least or _is_other_name(pair, first)
     ]
-    alike = [first, *(pair for pair in near if not _is_at_end(gains_of, *pair))]
-    return sorted(alike, key=_is_early)
+    return sorted([first, *filter(is_sure, near)], key=_is_early), before
 
 
 class _Supposed(NamedTuple):
@@ -257,18 +285,22 @@ def _is_at_end(gains_of: GainsOf, at: Peak, of: Hypothesis) -> bool:
     return last > at.gain - DROP_95
 
 
-def _rivals(
+def _with_rival(
     gains_of: GainsOf, pair: tuple[Peak, Hypothesis], apart: float
 ) -> list[tuple[Peak, Hypothesis]]:
-    """Another number of a delay or angle, if it gains so little less that chance may explain it."""
+    """Beside the number of a delay or angle another one, where chance explains the difference.
+
+    The likelier first; it alone, where chance does not.
+    """
     at, of = pair
     may_come_again = of.limit == np.pi or of.kind == "delay"
     if not of.tried or of.size > 1 or not may_come_again:
-        return []
+        return [pair]
     [found] = side_by_side(
         [rival(of, at, at.gain - apart)], lambda asked: gains_of([(of, value) for _, value in asked])
     )
-    return [] if found is None else [(found, of)]
+    both = [at] if found is None else sorted((at, found), key=lambda each: -each.gain)
+    return [(each, of) for each in both if each.gain >= both[0].gain - apart]
 
 
 def _causes(gains_of: GainsOf, pairs: Sequence[tuple[Peak, Hypothesis]]) -> list[Cause]:
@@ -320,13 +352,9 @@ def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -
             each if own == place else cause.hypothesis.without(each, cause.value)
             for own, each in enumerate(trials)
         ]
-    *lacking, mended = likelihood(trials)
-    *lacking_first, mended_first = likelihood([each._replace(share=0.5) for each in trials])
-    found = []
-    for cause, of_all, of_first in zip(causes, lacking, lacking_first, strict=True):
-        first = mended_first - of_first
-        found.append(cause._replace(of_halves=(first, mended - of_all - first)))
-    return found
+    *lacking, mended = likelihood.over_parts(trials, 2)
+    gains = [(mended - without).tolist() for without in lacking]
+    return [cause._replace(of_halves=(a, b)) for cause, (a, b) in zip(causes, gains, strict=True)]
 
 
 class Sought(NamedTuple):
@@ -335,12 +363,14 @@ class Sought(NamedTuple):
     Attributes:
         causes: the likeliest first.
         tried: every hypothesis, with what it gains of the log as it is.
+        in_doubt: what would be likeliest, but that the parts of the log disagree about its number.
         log_likelihood: of the log as it is; NaN where its innovations have none, and nothing is tried.
     """
 
-    causes: Sequence[Cause]
-    tried: Sequence[Tried]
-    log_likelihood: float
+    causes: Sequence[Cause] = ()
+    tried: Sequence[Tried] = ()
+    in_doubt: Sequence[Cause] = ()
+    log_likelihood: float = np.nan
 
 
 def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: int) -> Sought:
@@ -358,9 +388,9 @@ def seek(source: MemorySource, label: str, settings: Mapping[str, Any], most: in
     seen = likelihood.begin(base)
     [before] = likelihood([base])
     if not np.isfinite(before):
-        return Sought([], [], np.nan)
+        return Sought()
     bound = bind(label, [source], settings)
-    causes, tried = find_causes(
+    causes, tried, in_doubt = find_causes(
         likelihood, base, hypotheses(bound, base, seen, likelihood.readings), most
     )
-    return Sought(_over_halves(likelihood, base, causes), tried, before)
+    return Sought(_over_halves(likelihood, base, causes), tried, in_doubt, before)

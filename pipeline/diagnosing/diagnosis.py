@@ -20,7 +20,7 @@ from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Advice, Trying
-from pipeline.diagnosing.causes import Cause, Told, Tried, least_gain, seek, tried_table
+from pipeline.diagnosing.causes import Sought, Told, least_gain, seek, tried_table
 from pipeline.diagnosing.consistency import (
     judged_by_itself,
     nis_charts,
@@ -98,7 +98,9 @@ class Diagnosis:
     def told(self) -> list[str]:
         """The sentences, numbered; or that nothing was found."""
         if not self.sentences:
-            why = f"of {self.hypotheses} faults none gains {self.least_gain:.3g} in log-likelihood"
+            why = (
+                f"of {self.hypotheses} faults none surely gains {self.least_gain:.3g} in log-likelihood"
+            )
             return [f"{NOTHING}: {why}" if self.hypotheses else NOTHING]
         return [f"{number}. {each.words}" for number, each in enumerate(self.sentences, start=1)]
 
@@ -246,18 +248,13 @@ def diagnose(
     gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes = [*why]
-    causes: Sequence[Cause] = []
-    tried: Sequence[Tried] = []
-    least, likely, end_ns = np.inf, np.nan, None
+    sought, end_ns = Sought(), None
     opened = merge({"kind": label, **settings}, OPEN if gate < 1.0 else {})
-    has_likelihood = innovations.state("log_likelihood")
-    if has_likelihood:
+    if innovations.state("log_likelihood"):
         part, end_ns, note = first_part(source, bound, streamed)
         notes += [note] if note else []
-        causes, tried, likely = seek(part, label, opened, MOST_SENTENCES)
-        least = least_gain(len(tried))
-        has_likelihood = bool(np.isfinite(likely))
-    if not has_likelihood:
+        sought = seek(part, label, opened, MOST_SENTENCES)
+    if not np.isfinite(sought.log_likelihood):
         notes.append(
             f"{label} states no likelihood of its innovations: faults are named by unusual "
             "measurements alone"
@@ -265,7 +262,7 @@ def diagnose(
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
-    sentences += ranked(causes, without_filter(source, streamed), trying, rest)
+    sentences += ranked(sought.causes, without_filter(source, streamed), trying, rest)
     no_judges = judged_by_itself(source, streamed)
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
@@ -273,22 +270,22 @@ def diagnose(
         *of_estimates(Outputs(done, schemas.GAUSSIAN_ESTIMATE)),
         *(
             each
-            for each in unseen_errors(done, label, has_causes=bool(causes))
+            for each in unseen_errors(done, label, has_causes=bool(sought.causes))
             if each.topic not in no_judges
         ),
     ]
     if not sentences and not findings:
-        findings += unnamed(done, innovations, len(tried), no_judges)
+        findings += unnamed(done, innovations, len(sought.tried), no_judges)
     sentences += [Sentence.of(each) for each in findings]
     return Diagnosis(
         label,
         done,
         sentences[:MOST_SENTENCES],
         component_table(innovations),
-        tried_table(tried),
-        least,
-        [*notes, *no_judges.values(), *notes_of(done, sentences)],
-        likely,
+        tried_table(sought.tried),
+        least_gain(len(sought.tried)),
+        [*notes, *no_judges.values(), *notes_of(done, sentences, sought.in_doubt)],
+        sought.log_likelihood,
     )
 
 

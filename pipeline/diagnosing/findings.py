@@ -11,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
+from pipeline.diagnosing.advice import number
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from recorders.log import Stream
 from recorders.plausibility.checks import BLOCK, findings_in
@@ -127,7 +128,7 @@ def of_innovations(
         is_in = stream["accepted"] != 0
         times_ns = stream.publish_time_ns
         share = float(np.mean(~is_in)) if len(stream) else 0.0
-        of_all, reopened, opened = f"{100.0 * share:.2g} % of the measurements", "", ""
+        of_all, reopened, opened = f"{number(100.0 * share, 2)} % of the measurements", "", ""
         if gate is not None:
             of_all += f", where {100.0 * (1.0 - gate):.2g} % are expected"
             reopened = "; --set gate_probability=1, or gate_reopens_s=1"
@@ -214,9 +215,9 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
             yield Finding(
                 "lost messages",
                 stream.topic,
-                f"{stream.topic}: {100.0 * share:.2g} % of its messages are lost: {lost} are missing "
-                f"from steps of {usual * 1e-9:.3g} s, in {len(gaps)} gaps; look for them where the "
-                "log is recorded",
+                f"{stream.topic}: {number(100.0 * share, 2)} % of its messages are lost: {lost} are "
+                f"missing from steps of {usual * 1e-9:.3g} s, in {len(gaps)} gaps; look for them where "
+                "the log is recorded",
                 int(stamps_ns[gaps[0]]),
             )
         longest = int(np.argmax(steps))

@@ -44,13 +44,11 @@ class Trial(NamedTuple):
 
     `stretched` is by topic the logarithm of how many times larger the volumes are in which a message's
     measurement lies, compared with the log's: a density of numbers in other units is another one.
-    `share` is of the measurements: these first ones alone count.
     """
 
     source: MemorySource
     settings: Mapping[str, Any]
     stretched: Mapping[str, float] = {}
-    share: float = 1.0
 
 
 class Scored(NamedTuple):
@@ -62,7 +60,6 @@ class Scored(NamedTuple):
         left: by estimate, what the broad model says of the others.
         beyond: by estimate, how many these are.
         stretch: by estimate, what is added since measurements are in other units than the log's.
-        share: of its measurements, that counts.
     """
 
     source: MemorySource
@@ -70,7 +67,6 @@ class Scored(NamedTuple):
     left: Mapping[str, float]
     beyond: Mapping[str, int]
     stretch: Mapping[str, float]
-    share: float
 
 
 @dataclass
@@ -135,10 +131,17 @@ class Likelihood:
 
     def __call__(self, trials: Sequence[Trial]) -> list[float]:
         """The log-likelihoods; minus infinity where the estimator fails or loses measurements."""
+        return [float(each) for [each] in self.over_parts(trials, 1)]
+
+    def over_parts(self, trials: Sequence[Trial], count: int) -> Floats:
+        """The log-likelihoods (trials, count) of equal shares of the measurements, in their order.
+
+        Minus infinity where the estimator fails or loses measurements.
+        """
         together: dict[str, list[int]] = {}
         for place, trial in enumerate(trials):
             together.setdefault(_key(trial), []).append(place)
-        found = [-np.inf] * len(trials)
+        found = np.full((len(trials), count), -np.inf)
         for places in (part for each in together.values() for part in self._parts(trials, each)):
             of_key = [trials[place] for place in places]
             try:
@@ -148,7 +151,7 @@ class Likelihood:
             scored = [self._scored(trial, bound) for trial in of_key]
             outputs = self._innovations(of_key, scored)
             for place, part, of_run in zip(places, scored, outputs, strict=True):
-                found[place] = self._total(part, of_run)
+                found[place] = self._totals(part, of_run, count)
         return found
 
     def _parts(self, trials: Sequence[Trial], places: Sequence[int]) -> Iterable[Sequence[int]]:
@@ -191,7 +194,7 @@ class Likelihood:
         if self.later_ns:
             streams = {topic: _later(stream, self.later_ns) for topic, stream in streams.items()}
         source = replace(trial.source, streams=streams)
-        return Scored(source, min(begins) + self.later_ns, left, count, stretch, trial.share)
+        return Scored(source, min(begins) + self.later_ns, left, count, stretch)
 
     def _innovations(
         self, trials: Sequence[Trial], scored: Sequence[Scored]
@@ -218,13 +221,21 @@ class Likelihood:
         runs = [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(sources))]
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
-    def _total(self, scored: Scored, parts: Sequence[Mapping[str, Stream]]) -> float:
-        found = [self._of_part(scored, part) for part in parts]
-        total = sum(mean_likelihood(found).values()) if any(found) else -np.inf
-        return total if np.isfinite(total) else -np.inf
+    def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
+        """The log-likelihoods of equal shares of the measurements, each given what is before it."""
+        until = []
+        for share in np.arange(1, count + 1) / count:
+            found = [self._of_start(scored, part, share) for part in parts]
+            total = sum(mean_likelihood(found).values()) if any(found) else -np.inf
+            until.append(total if np.isfinite(total) else -np.inf)
+        if not np.isfinite(until).all():
+            return np.full(count, -np.inf)
+        return np.diff(until, prepend=0.0)
 
-    def _of_part(self, scored: Scored, innovations: Mapping[str, Stream]) -> dict[str, float]:
-        """The log-likelihood of what is seen of each thing; nothing where too much lacks."""
+    def _of_start(
+        self, scored: Scored, innovations: Mapping[str, Stream], share: float
+    ) -> dict[str, float]:
+        """The log-likelihood of a share of what is seen of each thing; nothing where too much lacks."""
         found = {}
         for name, all_ in self.count.items():
             topic = _topic(name)
@@ -236,20 +247,20 @@ class Likelihood:
             lacking = all_ - scored.beyond.get(name, 0) - len(stream)
             if len(stream) < LEAST_SCORED * all_ or (lacking and name not in self.readings):
                 return {}
-            stream = stream.take(slice(round(scored.share * len(stream))))
+            stream = stream.take(slice(round(share * len(stream))))
             is_in = stream["accepted"] != 0
             total = float(np.sum(stream["log_likelihood"][is_in]))
             if not is_in.all():
                 missing = np.isnan(stream["innovation"][~is_in])
                 total -= float(np.sum(np.where(missing, 0.0, np.log(self.volumes[topic]))))
-                share = len(missing) / len(stream)
-                if share < 1.0:
-                    total += len(missing) * np.log(share) + is_in.sum() * np.log(1.0 - share)
+                kept_out = len(missing) / len(stream)
+                if kept_out < 1.0:
+                    total += len(missing) * np.log(kept_out) + is_in.sum() * np.log(1.0 - kept_out)
             if name in self.readings:
                 own = [self.broad[each] for each in self.readings[name].kinds if each in self.broad]
                 more = lacking * float(np.mean(own)) if lacking else 0.0
                 more += scored.left.get(name, 0.0) + scored.stretch.get(name, 0.0)
-                total += scored.share * more
+                total += share * more
             found[name] = total
         return found
 

@@ -1,6 +1,6 @@
 """What a diagnosis says: causes and what stands in the log by itself, as sentences in their order."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,12 +66,15 @@ def ranked(
     mends = [cause.hypothesis.mend(cause.value) for cause in causes]
     advised = {key for mend in mends if mend is not None for key in mend.settings}
     of_stamps = [each for each in of_log if each.kind in FIRST]
-    named = {each.hypothesis.topic for cause in causes for each in (cause, *cause.others)}
+    alike = [each.hypothesis for cause in causes for each in (cause, *cause.others)]
+    named = {each.topic for each in alike}
+    kinds = {(each.kind, each.topic) for each in alike}
     others = [
         each
         for each in of_log
         if each.kind not in FIRST
-        and (each.setting.partition("=")[0] not in advised if each.setting else each.topic not in named)
+        and (each.kind, each.topic) not in kinds
+        and (not _is_advised(each.setting, advised) if each.setting else each.topic not in named)
     ]
     is_consequence = bool(causes) and causes[0].hypothesis.kind not in OF_FORM
     before = [
@@ -83,6 +86,12 @@ def ranked(
         *(_sentence(each, trying, of_stamps, rest) for each in causes),
         *map(Sentence.of, after),
     ]
+
+
+def _is_advised(setting: str, advised: Collection[str]) -> bool:
+    """Whether a setting, or that of the whole vector that it is an entry of, is advised."""
+    stem = setting.partition("=")[0].removesuffix("_scale")
+    return any(stem.startswith(each.removesuffix("_scale")) for each in advised)
 
 
 def marks_of(
@@ -107,9 +116,14 @@ def marks_of(
     return marks
 
 
-def notes_of(done: Replay, sentences: Sequence[Sentence]) -> list[str]:
-    """What has to be known of a diagnosis: what was not judged, and how many sentences are not said."""
-    notes = list(done.judge.components_without_truth)
+def notes_of(done: Replay, sentences: Sequence[Sentence], in_doubt: Sequence[Cause] = ()) -> list[str]:
+    """What has to be known of a diagnosis: what is in doubt or not judged, and how much is not said."""
+    notes = [
+        "in doubt, as all that gains less, since the parts of the log disagree about the number by more "
+        f"than chance: {each.words}"
+        for each in in_doubt
+    ]
+    notes += done.judge.components_without_truth
     if not any(split_metric(key)[1] == "nees" for key in done.judge.bounds):
         notes.append(
             "no truth: errors and NEES are left out; a fault that innovations do not see stays unseen"

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 import fuselog as fl
 from pipeline.altering.sources import alter
@@ -120,6 +121,28 @@ def test_another_origin_of_geodetic_fixes_is_found_and_advised() -> None:
     assert fl.diagnose(shifted, "ekf", set={"gate_probability": 1.0, **setting}).sentences == []
 
 
+def test_another_origin_of_positions_is_one_cause_of_two_numbers() -> None:
+    """A lever arm, which turns with the car, is none."""
+    car = drive(SEED)
+    shifted, turned = (
+        recorded(each, has_compass=False, has_prior=True)
+        for each in (
+            car._replace(fix_m=car.fix_m + np.array([40.0, -25.0])),
+            FAULTS["lever (2, .6) m"](car),
+        )
+    )
+    [cause] = seek(shifted, "ekf", OPEN, 1).causes
+    assert "too far along y: its origin is another one" in cause.words
+    assert cause.value == pytest.approx((40.0, -25.0), abs=3.0)
+    mend = cause.hypothesis.mend(cause.value)
+    assert mend is not None
+    assert mend.key == f"{FIX}.origin"
+    mended = alter(shifted, mend.settings).streams[FIX]["position_m"]
+    assert_allclose(mended, car.fix_m, atol=3.0)
+    [other] = seek(turned, "ekf", OPEN, 1).causes
+    assert "origin" not in other.words
+
+
 @pytest.mark.paper
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
@@ -132,6 +155,22 @@ def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     assert len(found.sentences) == 1
     assert found.tried["gain"].iloc[0] == pytest.approx(found.tried["gain"].iloc[3])
     assert found.sentences[0].setting == "/car/odometry.turn_scale=-1"
+
+
+def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_start() -> None:
+    """A prior states the heading of the body, and a unit's yaw is only known by that."""
+    log = fl.record("navigation", seed=3, duration_s=12.0, unit={"rate_hz": 25.0})
+    turned = {
+        f"/body/inertial.{each}_matrix": "0,-1,0,1,0,0,0,0,1" for each in ("specific_force", "turn_rate")
+    }
+    sought = [seek(alter(log, each), "ekf", OPEN, 1) for each in (turned, {})]
+    [cause], nothing = (each.causes for each in sought)
+    assert nothing == []
+    assert (cause.hypothesis.topic, cause.value) == (
+        "mounting_yaw_rad",
+        pytest.approx(-0.5 * np.pi, abs=0.1),
+    )
+    assert "which this log does not tell from it, /body/prior: heading at the start" in cause.words
 
 
 def test_the_battery_is_counted_by_cell() -> None:
@@ -244,14 +283,16 @@ def test_causes_of_a_part_are_tried_on_the_rest(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(("first_row", "is_said"), [(0, False), (100, True)])
-def test_what_is_so_in_one_half_alone_is_said(first_row: int, *, is_said: bool) -> None:
+def test_what_is_so_in_one_half_alone_is_in_doubt(first_row: int, *, is_said: bool) -> None:
     """Covariances of fixes are stated 9 times too large, in all of the log or in its second half."""
     log = recorded(drive(SEED), has_compass=False, has_prior=True)
     fixes = log.streams[FIX]
     stated = fixes["covariance_m2"].copy()
     stated[first_row:] *= 9.0
     wide = replace(fixes, columns={**fixes.columns, "covariance_m2": stated})
-    [cause] = seek(replace(log, streams={**log.streams, FIX: wide}), "ekf", OPEN, 1).causes
+    sought = seek(replace(log, streams={**log.streams, FIX: wide}), "ekf", OPEN, 1)
+    assert (len(sought.causes), len(sought.in_doubt)) == ((0, 1) if is_said else (1, 0))
+    [cause] = [*sought.causes, *sought.in_doubt]
     assert "so that R is too large" in cause.words
     assert ("but over the first half of the log it loses" in cause.words) == is_said
 

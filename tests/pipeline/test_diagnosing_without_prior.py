@@ -1,9 +1,9 @@
 """Diagnosing and tuning on a log without a prior: the sheet of sensors, section 3, principle 1."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ import fuselog as fl
 from pipeline.diagnosing import causes as seeking
 from pipeline.diagnosing.battery.car import car
 from pipeline.diagnosing.causes import find_causes
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from replay.engine.replaying.estimator import bind
@@ -88,18 +88,70 @@ def test_what_is_inconsistent_and_has_no_name_is_said_to_be(monkeypatch: pytest.
     assert well.sentences == []
 
 
+class Parabolas(NamedTuple):
+    """Gains that are greatest at 5, of each part of a log so far above or below it.
+
+    And at -8, by so much less.
+    """
+
+    apart: float
+    less: float = np.inf
+
+    def __call__(self, trials: Sequence[float]) -> list[float]:
+        """The gains over all parts."""
+        return [float(each) for [each] in self.over_parts(trials, 1)]
+
+    def over_parts(self, trials: Sequence[float], count: int) -> np.ndarray:
+        """The gains over so many parts."""
+        best = 5.0 + self.apart * np.resize([1.0, -1.0], PARTS)
+        at = np.reshape(trials, (-1, 1))
+        gains = np.maximum(-0.5 * (at - best) ** 2, -0.5 * (at + 8.0) ** 2 - self.less / PARTS)
+        return gains.reshape(len(trials), count, PARTS // count).sum(axis=2)
+
+
+def sought(limit: float, apart: float) -> tuple[list[float], list[float]]:
+    """The numbers that are named, and those that are in doubt."""
+    tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), limit, lambda _, at: at, *[str, str])  # type: ignore[arg-type,return-value]
+    found, _, in_doubt = find_causes(Parabolas(apart), 0.0, [tried], 1)  # type: ignore[arg-type]
+    return [each.value for each in found], [each.value for each in in_doubt]
+
+
 def test_a_number_at_the_end_of_its_search_is_no_cause() -> None:
     """A parabola about 5 that is searched up to 1, and up to 10."""
+    assert sought(1.0, 0.0) == ([], [])
+    assert sought(10.0, 0.0) == (pytest.approx([5.0], abs=0.02), [])
 
-    def causes(limit: float) -> list[float]:
-        tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), limit, lambda _, at: at, *[str, str])  # type: ignore[arg-type,return-value]
-        found, _ = find_causes(
-            lambda at: [1000.0 - 10.0 * (each - 5.0) ** 2 for each in at], 0.0, [tried], 1
-        )  # type: ignore[arg-type,union-attr]
-        return [each.value for each in found]
 
-    assert causes(1.0) == []
-    assert causes(10.0) == pytest.approx([5.0], abs=0.02)
+@pytest.mark.parametrize(("apart", "is_named"), [(1.0, True), (7.0, True), (9.5, False)])
+def test_what_the_parts_of_a_log_disagree_about_is_in_doubt(apart: float, *, is_named: bool) -> None:
+    """Each part knows its best number to 1: a gain of 250 counts 1 / (20 / 19 apart^2) of that.
+
+    Of one fault it has to be 3.3.
+    """
+    named, in_doubt = sought(10.0, apart)
+    assert [*named, *in_doubt] == pytest.approx([5.0], abs=0.02)
+    assert bool(named) == is_named
+
+
+@pytest.mark.parametrize(
+    ("less", "values"),
+    [(5.0, [5.0]), (2.0, [5.0, -8.0]), (-2.0, [-8.0, 5.0]), (-5.0, [-8.0])],
+)
+def test_what_another_number_explains_as_well_is_not_determined(
+    less: float, values: list[float]
+) -> None:
+    """Chance explains a difference of 3.3."""
+    likelihood: Any = Parabolas(0.0, less)
+    tried = Hypothesis("delay", "/fix", "", (-0.1, 0.1), 10.0, lambda _, at: at, late, lambda _: None)  # type: ignore[arg-type,return-value]
+    [[cause], *_] = find_causes(likelihood, 0.0, [tried], 1)  # type: ignore[arg-type]
+    assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
+    other = f"; this log does not determine it: as likely, {values[-1]:.2f} late;"
+    assert (other in cause.words) == (len(values) > 1)
+
+
+def late(at: float, *_: float) -> str:
+    """What is wrong."""
+    return f"{at:.2f} late"
 
 
 def test_a_gate_that_is_set_is_no_advice() -> None:
@@ -121,7 +173,7 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     fl.write(log, car(2000))
     found = fuselog("diagnose", log, "-e", "ekf", "--json").json
     assert found["found"] == [
-        f"nothing found: of {found['hypotheses']} faults none gains {found['least_gain']:.3g} in "
+        f"nothing found: of {found['hypotheses']} faults none surely gains {found['least_gain']:.3g} in "
         "log-likelihood"
     ]
     fl.write(log, car(2000, 1 / 256))

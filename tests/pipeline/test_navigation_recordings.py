@@ -80,7 +80,7 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
 
     def seek(source: fl.MemorySource, *_: Any) -> Sought:
         sought.append(source)
-        return Sought([], [], np.nan)
+        return Sought()
 
     monkeypatch.setattr(diagnosis, "seek", seek)
     walk = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
@@ -95,6 +95,37 @@ def test_a_walk_that_no_filter_follows_is_diagnosed(
         rates, right = (each.streams["/inertial"]["turn_rate_radps"] for each in (mended, walk))
         assert np.allclose(rates[:1000], right[:1000], rtol=1e-3)
     assert len(sought) == 2
+
+
+@pytest.mark.paper
+def test_what_is_planted_into_a_walk_is_named_first(
+    navigation: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing of a walk as it is, whose receiver's covariances fit one solution, not the other.
+
+    18 s of 12 to 30 s, with every sixth sample of the unit: what is named is that of the whole walk.
+    """
+    monkeypatch.setattr(diagnosis, "MOST_SENTENCES", 1)
+    whole = fl.import_("table", navigation / "gnss_imu_rtk" / "walk_0827", mapping="walk")
+    first_ns = whole.streams["/fix"].publish_time_ns[0]
+    streams = {}
+    for topic, stream in whole.streams.items():
+        since_s = 1e-9 * (stream.publish_time_ns - first_ns)
+        part = stream.take((since_s >= 12.0) & (since_s < 30.0))
+        streams[topic] = part.take(slice(None, None, 6)) if topic == "/inertial" else part
+    walk = replace(whole, streams=streams)
+    first = {
+        name: fl.diagnose(walk, "ekf", set=PLANTED[name][0]).sentences[0]
+        for name in ("nothing", "turn rate's sign", "degrees", "velocity x 3.6", "18 s, fixes")
+    }
+    assert first["nothing"].kind == "unnamed"
+    assert first["turn rate's sign"].setting == "/inertial.turn_rate_scale=1.0"
+    assert "turn_rate_radps has the wrong sign" in first["turn rate's sign"].words
+    assert "turn_rate_radps is 57.3 times" in first["degrees"].words
+    assert re.search(
+        r"/velocity: velocity_mps is 3\.[56]\d* times .* too large", first["velocity x 3.6"].words
+    )
+    assert first["18 s, fixes"].words.startswith("/fix: its stamps are 18 s late")
 
 
 @pytest.mark.paper

@@ -138,8 +138,10 @@ def of_components(
             yield _turn(stream.topic, field)
         if reading is None or len(places) < 2:
             continue
-        if not is_control:
-            yield _factor(stream.topic, Entry(field, None, field, False, None, 1.0), len(places), None)
+        whole = Entry(field, None, field, False, None, 1.0)
+        yield _factor(stream.topic, whole, 0.0 if is_control else len(places), None)
+        if len(places) > 2:  # of two it is half a turn
+            yield _sign(stream.topic, whole)
         for pair in combinations(places, 2):
             yield _exchange(stream.topic, field, pair)
 

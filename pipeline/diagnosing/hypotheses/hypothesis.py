@@ -10,6 +10,7 @@ from pipeline.altering import alterations as alter
 from pipeline.diagnosing.advice import Advice, number
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from recorders.parameters import Parameters
+from replay.distributions import chi2
 
 Kind = Literal[
     "measurement noise",
@@ -36,6 +37,9 @@ Kind = Literal[
 ]
 Number = Any  # a float; of a fault of several numbers a tuple of floats
 SCALES = (-0.7, 0.7, -2.0, 2.0)  # logarithms
+PARTS = 20  # of a log, whose slopes are compared
+FALL = 2.0  # of log-likelihood, about, from its greatest to where its slope is taken
+BY_CHANCE = float(chi2.isf(0.001, PARTS - 1)) / (PARTS - 1)  # an inflation in 1 of 1,000 logs
 
 
 @dataclass(frozen=True)
@@ -144,3 +148,34 @@ def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
     return lambda asked: [
         found - before for found in likelihood([each.without(now, at) for each, at in asked])
     ]
+
+
+def inflation_over(likelihood: Likelihood, now: Trial) -> Callable[[Hypothesis, Number, float], float]:
+    """How many times wider than a filter says the number of a fault is known, by its gain over a trial.
+
+    Where the log's parts disagree about the number more than their likelihoods say, a gain is so many
+    times smaller than it looks: the variance of the slopes of PARTS of the log, at the greatest gain, is
+    compared with the curvature of all, which is the same where the model is right. Kent, Robust
+    properties of likelihood ratio tests, Biometrika 69, 1982, pages 19 to 27. It is 1 where chance may
+    explain it, and of what is so or is not, where no number is known.
+    """
+
+    def inflation(of: Hypothesis, value: Number, gain: float) -> float:
+        if not of.tried:
+            return 1.0
+        step = min(1.0, (FALL / gain) ** 0.5)  # the gain is about a parabola from zero
+        below, at, above = likelihood.over_parts(
+            [of.without(now, _times(value, each)) for each in (1.0 - step, 1.0, 1.0 + step)], PARTS
+        )
+        bend = float(np.sum(2.0 * at - below - above)) / step**2
+        if not np.isfinite(bend) or bend <= 0.0:
+            return 1.0
+        variance = PARTS * float(np.var((above - below) / (2.0 * step), ddof=1))
+        found = variance / bend
+        return found if found > BY_CHANCE else 1.0
+
+    return inflation
+
+
+def _times(value: Number, factor: float) -> Number:
+    return tuple(factor * each for each in value) if isinstance(value, tuple) else factor * value

@@ -47,7 +47,7 @@ def hypotheses(
         if len(stream) < FEWEST:
             continue
         found += of_covariances(stream)
-        found += of_origin(stream)
+        found += of_origin(stream, reading)
         found += of_components(stream, reading, parameters, first_ns)
         if len(streamed) > 1:
             controls = reading.controls if reading else ()

@@ -1,25 +1,53 @@
-"""Faults of the origin that geodetic fixes are taken into a plane by."""
+"""Faults of the origin that positions are given from, or geodetic fixes are taken into a plane by."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from pipeline.altering import alterations as alter
-from pipeline.diagnosing.advice import Advice, number
-from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
+from pipeline.diagnosing.advice import Advice, number, precise
+from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis, Kind
 from pipeline.diagnosing.likelihood import Trial
 from recorders.log import Stream
 from recorders.log.planes import Origin, stated_in
 from recorders.models.geodesy import out_of_tangent_plane
+from replay.engine.replaying.estimator import Reading
 
 STEP_M = 1.0
 Metres = tuple[float, float]
 
 
-def of_origin(stream: Stream) -> Iterator[Hypothesis]:
-    """The plane has another origin than the fixes' channel states; none where it states none."""
+def of_origin(stream: Stream, reading: Reading | None) -> Iterator[Hypothesis]:
+    """The plane has another origin than a topic's positions are given in, or geodetic fixes state."""
+    if "latitude_deg" in stream.columns:
+        yield from _of_geodetic(stream)
+    elif "position_m" in stream.columns and reading and stream.topic not in reading.controls:
+        yield _of_positions(stream)
+
+
+def _of_positions(stream: Stream) -> Hypothesis:
+    def without(trial: Trial, by_m: Metres) -> Trial:
+        source = trial.source
+        for entry, by in enumerate(by_m):
+            source = alter.altered(source, stream.topic, alter.shifted("position_m", entry), -by)
+        return trial._replace(source=source)
+
+    def words(at: Metres, low: Metres, high: Metres) -> str:
+        x, y = _too_far(at, low, high)
+        return (
+            f"{stream.topic}: its positions are {x} along x and {y} along y: its origin is another one"
+        )
+
+    def mend(at: Metres) -> Advice:
+        return Advice(f"{stream.topic}.origin", ",".join(f"{precise(-each)}" for each in at))
+
+    return _origin(stream, "x_m, y_m", without, words, mend)
+
+
+def _of_geodetic(stream: Stream) -> Iterator[Hypothesis]:
+    """None where the fixes state no origin."""
     stated = stated_in(stream.topic, stream.metadata)
-    if stated is None or "latitude_deg" not in stream.columns:
+    if stated is None:
         return
     origin = stated
 
@@ -36,10 +64,7 @@ def of_origin(stream: Stream) -> Iterator[Hypothesis]:
         return trial._replace(source=source)
 
     def words(at: Metres, low: Metres, high: Metres) -> str:
-        east, north = (
-            f"{number(value)} ({number(least)} to {number(most)}) m too far"
-            for value, least, most in zip(at, low, high, strict=True)
-        )
+        east, north = _too_far(at, low, high)
         return (
             f"{stream.topic}: its fixes are {east} east and {north} north: the origin of the plane is "
             "another one"
@@ -49,14 +74,23 @@ def of_origin(stream: Stream) -> Iterator[Hypothesis]:
         mended = right(at)
         return Advice(f"{stream.topic}.origin", f"{mended.latitude_deg:.8f},{mended.longitude_deg:.8f}")
 
-    yield Hypothesis(
-        "bias or turned frame",
-        stream.topic,
-        "east_m, north_m",
-        ((STEP_M, STEP_M),),
-        np.inf,
-        without,
-        words,
-        mend,
-        size=2,
-    )
+    yield _origin(stream, "east_m, north_m", without, words, mend)
+
+
+def _too_far(at: Metres, low: Metres, high: Metres) -> list[str]:
+    return [
+        f"{number(value)} ({number(least)} to {number(most)}) m too far"
+        for value, least, most in zip(at, low, high, strict=True)
+    ]
+
+
+def _origin(
+    stream: Stream,
+    part: str,
+    without: Callable[[Trial, Metres], Trial],
+    words: Callable[[Metres, Metres, Metres], str],
+    mend: Callable[[Metres], Advice],
+) -> Hypothesis:
+    kind: Kind = "bias or turned frame"
+    tried = ((STEP_M, STEP_M),)
+    return Hypothesis(kind, stream.topic, part, tried, np.inf, without, words, mend, size=2)

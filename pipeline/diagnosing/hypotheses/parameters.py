@@ -1,5 +1,6 @@
 """Faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
+from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 from pipeline.altering import alterations as alter
 from pipeline.altering.changes import STATED
 from pipeline.diagnosing.advice import Advice, number, precise, rounded
+from pipeline.diagnosing.hypotheses.components import ANGLES_RAD, TURNS_RAD
 from pipeline.diagnosing.hypotheses.hypothesis import (
     IS_SO,
     SCALES,
@@ -23,7 +25,7 @@ from pipeline.tuning.objective import with_values
 from recorders.importers.units import unit_of
 from recorders.log import Stream, Topic
 from recorders.parameters import Parameters, in_few_words, meanings
-from replay.engine.replaying.estimator import Bound, Reading
+from replay.engine.replaying.estimator import Bound, Reading, Recursive
 from replay.engine.streams.channels import stated
 from replay.engine.streams.sources import MemorySource
 
@@ -36,7 +38,7 @@ STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """The noise that the estimator's parameters state, or channels for them."""
+    """The noise that the estimator's parameters state, channels for them, or that is assumed."""
     parameters = bound[0].parameters
     if parameters is None:
         return
@@ -47,8 +49,9 @@ def of_noises(
         if topic in source.topics
     ]
     noises = {name: topic for reading in readings.values() for name, topic in reading.noises.items()}
+    assumed = ChainMap(*(dict(each.assumed) for each in bound if isinstance(each, Recursive)))
     for name, topic in noises.items():
-        value = _noise_of(parameters, name, read)
+        value = _noise_of(parameters, name, read, assumed)
         if value is None:
             continue
         kind: Kind = "measurement noise" if topic else "process noise"
@@ -69,14 +72,17 @@ def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
     def mend(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
 
-    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend)
+    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor)
 
 
-def _noise_of(parameters: Parameters, name: str, read: Sequence[Topic]) -> float | None:
-    """The value of a parameter that is a noise: given, or as a channel states it."""
+def _noise_of(
+    parameters: Parameters, name: str, read: Sequence[Topic], assumed: Mapping[str, float]
+) -> float | None:
+    """The value of a parameter that is a noise: given, as a channel states it, or assumed."""
     value = getattr(parameters, name)
     if value is None:
         value = stated(read, name, type(parameters), needed=False)
+        value = assumed.get(name) if np.isnan(value) else value
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return float(value) if is_number and 0.0 < value < np.inf else None
 
@@ -102,7 +108,14 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
         # undone by a covariance that is larger, where it is stated too small
         without = partial(_spread, stream.topic, spread)
         kind: Kind = "measurement noise"
-        yield Hypothesis(kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend)
+        yield Hypothesis(
+            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor
+        )
+
+
+def _factor(logarithm: float) -> float:
+    """How many times as large a standard deviation should be."""
+    return float(np.exp(logarithm))
 
 
 def _spread(topic: str, spread: alter.Alteration, trial: Trial, logarithm: float) -> Trial:
@@ -113,6 +126,7 @@ def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> I
     """The parameters that may be estimated: those of one unit that the same functions read are a vector.
 
     Those that are the bias or factor of a number of a topic are left out: that is tried by itself.
+    Angles are tried one by one as well, all around: a unit is mounted a quarter turn off, not by three.
     """
     parameters = bound[0].parameters
     groups: dict[tuple[Any, ...], list[str]] = {}
@@ -125,13 +139,21 @@ def of_augmentable(bound: Sequence[Bound], readings: Mapping[str, Reading]) -> I
             group = groups.setdefault((unit_of(name), kind, topics), [])
             if name not in group:
                 group.append(name)
-    for (unit, _, topics), names in groups.items():
-        values = tuple(float(getattr(parameters, name)) for name in names)
-        yield _parameters(names, values, STEPS.get(unit, STEPS[""]), topics)
+    for (unit, kind, topics), names in groups.items():
+        apart = [[name] for name in names] if kind == "angle" and len(names) > 1 else []
+        for some in (names, *apart):
+            values = tuple(float(getattr(parameters, name)) for name in some)
+            step = STEPS.get(unit, STEPS[""])
+            yield _parameters(some, values, step, topics, is_angle=kind == "angle")
 
 
 def _parameters(
-    names: Sequence[str], values: tuple[float, ...], step: float, topics: Sequence[str]
+    names: Sequence[str],
+    values: tuple[float, ...],
+    step: float,
+    topics: Sequence[str],
+    *,
+    is_angle: bool,
 ) -> Hypothesis:
     """Some parameters have other values; the numbers are by how much."""
     size = len(names)
@@ -161,8 +183,18 @@ def _parameters(
         return Advice(name, value, free=" ".join(names) if size == 1 else "", more=tuple(more))
 
     tried: tuple[Any, ...] = ((step,) * size,) if size > 1 else (-step, step, -10.0 * step, 10.0 * step)
+    is_round = is_angle and size == 1
     return Hypothesis(
-        "parameter", names[0], ", ".join(names[1:]), tried, np.inf, without, words, mend, size=size
+        "parameter",
+        names[0],
+        ", ".join(names[1:]),
+        ANGLES_RAD if is_round else tried,
+        np.pi if is_round else np.inf,
+        without,
+        words,
+        mend,
+        TURNS_RAD if is_round else {},
+        size,
     )
 
 

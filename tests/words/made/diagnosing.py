@@ -18,7 +18,7 @@ from pipeline.diagnosing.hypotheses.exchanges import of_numbers
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
 from pipeline.diagnosing.likelihood import Likelihood, Trial
-from pipeline.diagnosing.sentences import ranked
+from pipeline.diagnosing.sentences import notes_of, ranked
 from recorders.log import Stream, make_stream, schemas
 from replay.engine.replaying.estimator import bind
 
@@ -116,6 +116,10 @@ def order() -> Iterator[str]:
     yield "in one half alone:"
     for of_halves in ((-11.6, 250.0), (250.0, -1.93), (250.0, -1.91)):
         yield f"  {Cause(hypothesis, 1.0, (0.5, 1.5), 238.0, (), of_halves).words}"
+    yield "in doubt:"
+    judge: Any = SimpleNamespace(judge=SimpleNamespace(components_without_truth=[], bounds={}))
+    doubt = Cause(hypothesis, 1.0, (0.5, 1.5), 238.0, (), (-30.6, 268.6))
+    yield from (f"  {each}" for each in notes_of(judge, [], [doubt]))
     yield "advised already:"
     found = ranked([], [unit, other], TRYING, None)
     yield from (f"  {each.words}" for each in found)
