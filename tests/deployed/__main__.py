@@ -1,5 +1,7 @@
 """Deploys every model by every method that deploys, compiles it, and compares it with the replay.
 
+By every compiler that is here, and with the sanitizers where it has them.
+
 `python -m tests.deployed [MODEL or METHOD ...]` prints a line for every pair, of our models and those of
 the pages; the exit code is 1 where one differs. `--keep` keeps all of it in docs/deploy.json, of which
 the page's tables are made, with what filters of a robot take on the emulated target.
@@ -19,7 +21,7 @@ import click
 from pipeline.deploying.certificate import CERTIFICATE
 from recorders.errors import BadInput
 from tests.claims.pages import DEPLOYED
-from tests.deployed.building import compiled, furthest, missing_of_target, on_target
+from tests.deployed.building import COMPILERS, furthest_of_all, missing_of_target, on_target
 from tests.deployed.models import Tried, deployed, models, robot_log
 
 METHODS = ("ekf", "iekf", "ukf", "lrkf:s2kf-25", "sqrt:ekf", "sqrt:ukf")
@@ -40,6 +42,8 @@ def costs(folder: Path) -> dict[str, Any]:
 @click.option("--keep", is_flag=True, help="Keep all pairs in docs/deploy.json.")
 def main(names: tuple[str, ...], keep: bool) -> None:
     """Deploy all pairs, or those of these models and methods."""
+    if not COMPILERS:
+        raise click.ClickException("there is no C compiler here")
     found: dict[str, dict[str, Any]] = {}
     unfit = wrong = 0
     with TemporaryDirectory() as place:
@@ -56,7 +60,7 @@ def main(names: tuple[str, ...], keep: bool) -> None:
                     wrong, unfit = wrong + fits, unfit + 1 - fits
                     said = str(error).partition(".mcap: ")[2]
                 else:
-                    away = furthest(compiled(made))
+                    away = furthest_of_all(made)
                     wrong += not away <= EQUAL
                     found.setdefault(tried.model, {})[method] = {"furthest": away, **costs(made)}
                     said = f"furthest {away:.1e}"

@@ -3,14 +3,27 @@
 import re
 import shutil
 import subprocess
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 from pipeline.deploying.c_target import target_lines
 
 COMPILERS = [each for each in ("gcc", "clang") if shutil.which(each)]
 WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror")
+SANITIZERS = ("-fsanitize=address,undefined",)
 STRICT = ("-std=c99", "-O2", "-ffp-contract=off", *WARNINGS)
+
+
+@cache
+def sanitizes(compiler: str) -> bool:
+    """Whether the compiler has the sanitizers' libraries, which Debian packs by themselves for clang."""
+    with TemporaryDirectory() as place:
+        source = Path(place) / "nothing.c"
+        source.write_text("int main(void) { return 0; }")
+        command = [compiler, *SANITIZERS, str(source), "-o", f"{source}.out"]
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 class Taken(NamedTuple):
@@ -42,6 +55,16 @@ def furthest(program: Path) -> float:
     assert said.returncode == 0, said.stdout + said.stderr
     assert not said.stderr
     return _compared(said.stdout)
+
+
+def furthest_of_all(folder: Path) -> float:
+    """The furthest of programs by all compilers, and with sanitizers, which say nothing."""
+    found = []
+    for compiler in COMPILERS:
+        found.append(furthest(compiled(folder, compiler=compiler)))
+        if sanitizes(compiler):
+            found.append(furthest(compiled(folder, *SANITIZERS, compiler=compiler)))
+    return max(found)
 
 
 def _compared(said: str) -> float:
