@@ -196,10 +196,12 @@ def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False)
 
 
 def _named(cause: Cause) -> Iterator[Right]:
-    """What a cause names, and what the log does not tell from it."""
+    """What a cause names, and what the log does not tell from it; factors of noise by their logarithm."""
     for each in (cause, *cause.others):
+        kind, topic = each.hypothesis.kind, each.hypothesis.topic
         for told in each.numbers:
-            yield Right(each.hypothesis.kind, each.hypothesis.topic, told.part, told.value)
+            value = np.log(told.value) if kind.endswith(" noise") else told.value
+            yield Right(kind, topic, told.part, value)
 
 
 def results(
