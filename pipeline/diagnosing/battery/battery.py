@@ -196,7 +196,7 @@ def tried_together(faults: Sequence[str], seed: int, *, has_prior: bool = False)
 
 
 def _named(cause: Cause) -> Iterator[Right]:
-    """What a cause names, and what the log does not tell from it; factors of noise by their logarithm."""
+    """What a cause names, and what the log does not tell from it; factors of noise as logarithms."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
         for told in each.numbers:
