@@ -34,6 +34,7 @@ from pipeline.diagnosing.findings import (
     of_estimates,
     of_innovations,
     of_plausibility,
+    undone_by,
     without_filter,
 )
 from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded
@@ -262,7 +263,8 @@ def diagnose(
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
-    sentences += ranked(sought.causes, without_filter(source, streamed), trying, rest)
+    of_log = without_filter(source, streamed, undone_by(bound))
+    sentences += ranked(sought.causes, of_log, trying, rest)
     no_judges = judged_by_itself(source, streamed)
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [
