@@ -37,7 +37,7 @@ from pipeline.diagnosing.findings import (
     undone_by,
     without_filter,
 )
-from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded
+from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded, silent
 from pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
 from pipeline.output.charts import Chart
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -242,10 +242,7 @@ def diagnose(
     bound = bind(label, [source], {"kind": label, **settings})
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
-        raise BadInput(
-            f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
-            "filter of the same model, such as -e ekf"
-        )
+        raise silent(source.name, label, bound)
     gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes = [*why]

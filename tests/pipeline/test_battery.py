@@ -172,6 +172,19 @@ def test_what_a_parameter_undoes_is_not_said_of_the_log(fault: str, settings: di
     assert found["mended"] == []
 
 
+def test_fixes_of_another_name_are_offered() -> None:
+    log = recorded(drive(SEED), has_compass=False, has_prior=True)
+    renamed = {
+        ODOMETRY: log.streams[ODOMETRY],
+        "/car/prior": log.streams["/car/prior"],
+        "/car/place": replace(log.streams[FIX], topic="/car/place"),
+    }
+    with pytest.raises(
+        fl.BadInput, match=r"it does not take /car/place; with --set topics\.fix=/car/place it does"
+    ):
+        fl.diagnose(replace(log, streams=renamed), "ekf")
+
+
 def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_start() -> None:
     """A prior states the heading of the body, and a unit's yaw is only known by that."""
     log = fl.record("navigation", seed=3, duration_s=12.0, unit={"rate_hz": 25.0})
