@@ -34,9 +34,10 @@ from pipeline.diagnosing.findings import (
     of_estimates,
     of_innovations,
     of_plausibility,
+    undone_by,
     without_filter,
 )
-from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded
+from pipeline.diagnosing.portion import Outputs, first_part, on_the_rest, recorded, silent
 from pipeline.diagnosing.sentences import MOST_SENTENCES, Sentence, marks_of, notes_of, ranked
 from pipeline.output.charts import Chart
 from pipeline.output.outputs import TIMELINE, check_files, check_folder
@@ -241,10 +242,7 @@ def diagnose(
     bound = bind(label, [source], {"kind": label, **settings})
     innovations = Outputs(done, schemas.INNOVATION)
     if not innovations:
-        raise BadInput(
-            f"{source.name}: {label} gives no innovations, and a diagnosis needs them; give a "
-            "filter of the same model, such as -e ekf"
-        )
+        raise silent(source.name, label, bound)
     gate = float(getattr(bound[0].parameters, "gate_probability", None) or 1.0)
     streamed = list(dict.fromkeys(topic for each in bound for topic in each.streams))
     notes = [*why]
@@ -262,7 +260,8 @@ def diagnose(
     trying = Trying(label, alterations_of(source), is_own=isinstance(settings.get("kind"), Estimator))
     rest = partial(on_the_rest, source, label, opened, end_ns=end_ns) if end_ns else None
     sentences = [Sentence.of(each) for each in mended]
-    sentences += ranked(sought.causes, without_filter(source, streamed), trying, rest)
+    of_log = without_filter(source, streamed, undone_by(bound))
+    sentences += ranked(sought.causes, of_log, trying, rest)
     no_judges = judged_by_itself(source, streamed)
     has_outliers = any(each.kind == "outliers" for each in sentences)
     findings: list[Finding] = [

@@ -3,7 +3,7 @@
 Thresholds are far from what chance does to a log that is as its model says; each is beside its name.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,7 @@ from recorders.log import Stream
 from recorders.plausibility.checks import BLOCK, findings_in
 from recorders.plausibility.finding import Cause
 from replay.distributions import chi2
+from replay.engine.replaying.estimator import Bound, Recursive
 from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from replay.judging.consistency.whiteness import whitened, whiteness
 from replay.judging.errors.evaluation import split_topic
@@ -69,12 +70,40 @@ KINDS: Mapping[Cause, Kind] = {
 }
 
 
-def without_filter(source: LogSource | MemorySource, streamed: Collection[str]) -> list[Finding]:
-    """All that the topics of an estimator say by themselves, each once: the worst of the log first."""
-    implausible = list(of_plausibility(source, streamed))
+def without_filter(
+    source: LogSource | MemorySource,
+    streamed: Collection[str],
+    undone: Collection[tuple[Kind, str]] = (),
+) -> list[Finding]:
+    """All that the topics of an estimator say by themselves, each once: the worst of the log first.
+
+    But for kinds of topics that are `undone`.
+    """
+    implausible = [
+        each for each in of_plausibility(source, streamed) if (each.kind, each.topic) not in undone
+    ]
     known = [(each.kind, each.topic) for each in implausible]
     of_topics = of_messages((source.read([topic])[topic] for topic in streamed), source.epoch_ns)
     return [*implausible, *(each for each in of_topics if (each.kind, each.topic) not in known)]
+
+
+def undone_by(bound: Sequence[Bound]) -> list[tuple[Kind, str]]:
+    """What parameters of the estimator undo already: a topic is late, or a number of it multiplied."""
+    found = list[tuple[Kind, str]]()
+    for each in bound:
+        if not isinstance(each, Recursive) or each.reading is None or each.parameters is None:
+            continue
+        reading, fields = each.reading(), type(each.parameters).model_fields
+        named: list[tuple[str, Kind, str]] = [
+            *((name, "delay", topic) for topic, name in reading.delays.items()),
+            *((name, "values", topic) for (topic, _), name in reading.factors.items()),
+        ]
+        found += [
+            (kind, topic)
+            for name, kind, topic in named
+            if getattr(each.parameters, name) != fields[name].default
+        ]
+    return found
 
 
 def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str]) -> Iterator[Finding]:

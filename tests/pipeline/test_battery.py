@@ -27,6 +27,7 @@ from pipeline.diagnosing.battery.car import (
 )
 from pipeline.diagnosing.causes import seek
 from pipeline.diagnosing.consistency import judged_by_itself
+from pipeline.diagnosing.findings import undone_by, without_filter
 from pipeline.diagnosing.likelihood import Likelihood, Trial
 from pipeline.tuning.measured import until_last_measured
 from recorders.log.planes import Origin
@@ -155,6 +156,33 @@ def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     assert len(found.sentences) == 1
     assert found.tried["gain"].iloc[0] == pytest.approx(found.tried["gain"].iloc[3])
     assert found.sentences[0].setting == "/car/odometry.turn_scale=-1"
+
+
+@pytest.mark.parametrize(
+    ("fault", "settings"),
+    [("fixes .3 s late", {"fix_delay_s": 0.3}), ("speed x 3.6", {"forward_scale": 1.0 / 3.6})],
+)
+def test_what_a_parameter_undoes_is_not_said_of_the_log(fault: str, settings: dict[str, float]) -> None:
+    log = recorded(faulty(SEED, fault), has_compass=False)
+    found = {
+        name: without_filter(log, [ODOMETRY, FIX], undone_by(bind("ekf", [log], {**OPEN, **given})))
+        for name, given in (("as it is", {}), ("mended", settings))
+    }
+    assert len(found["as it is"]) == 1
+    assert found["mended"] == []
+
+
+def test_fixes_of_another_name_are_offered() -> None:
+    log = recorded(drive(SEED), has_compass=False, has_prior=True)
+    renamed = {
+        ODOMETRY: log.streams[ODOMETRY],
+        "/car/prior": log.streams["/car/prior"],
+        "/car/place": replace(log.streams[FIX], topic="/car/place"),
+    }
+    with pytest.raises(
+        fl.BadInput, match=r"it does not take /car/place; with --set topics\.fix=/car/place it does"
+    ):
+        fl.diagnose(replace(log, streams=renamed), "ekf")
 
 
 def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_start() -> None:
