@@ -1149,7 +1149,7 @@ DRAWN = [
         "tests/replay/timeline/test_set_timelines.py tests/replay/timeline/test_drawn_sets.py",
     ),
     Fault(
-        "replay/foreign/processes/isolation.py",
+        "replay/foreign/processes/orphans.py",
         "each.kill()",
         "each.terminate()",
         "tests/replay/foreign/test_isolation.py",

@@ -1,7 +1,7 @@
 """Faults of three more draws: at lines that seeds chose, made by operators and not by hand.
 
-Signs, comparisons, limits off by one, exchanged arguments and titles, constants, keys, dropped conditions,
-`and` for `or`, the least for the greatest, units. What changes nothing that is seen was left out. The tests
+Signs, comparisons, limits off by one, exchanged arguments and titles, constants, keys, conditions that
+are dropped, the least for the greatest, units. What changes nothing that is seen was left out. The tests
 are those that caught it, else the nearest by imports; some faults are caught by mypy alone.
 """
 
