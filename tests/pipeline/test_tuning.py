@@ -25,6 +25,7 @@ from pipeline.tuning.tuning import ENOUGH
 from recorders.log import RunMetadata
 from recorders.recording import Recording
 from replay.engine.streams.sources import memory_source
+from replay.judging.consistency.whiteness import whitened
 from tests.replay.inference.scalar import EPOCH_NS, SCALAR, ScalarParameters, source
 from tests.replay.inference.sheet_robot import DENSITY, FREE, of_sigmas, recorded
 
@@ -89,6 +90,15 @@ def test_the_robot_of_the_sheet() -> None:
     np.testing.assert_allclose(np.log(high / low), 2 * 1.96 * told.errors, rtol=1e-4)
     nis = found.metrics.query("quantity == 'nis_per_component'")["value"]
     assert (400 * nis).tolist() == pytest.approx([63.3, 398.5], abs=0.05)
+    white = found.whiteness.set_index(["estimator", "component"])
+    for label in ("start", "tuned"):
+        innovations = found.replay.estimates[0][f"/estimates/{label}/robot/innovation"]
+        for component, column in zip(innovations.components, whitened(innovations).T, strict=True):
+            told_of = white.loc[(label, component)]
+            off = column - column.mean()
+            next_one = np.sum(off[1:] * off[:-1]) / np.sum(off**2)
+            assert told_of["next_correlation"] == pytest.approx(next_one, rel=1e-9)
+            assert told_of["mean_square"] == pytest.approx(np.mean(column**2), rel=1e-9)
 
 
 @pytest.fixture(scope="module")
