@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from pipeline.comparing.comparing import _chart as difference_chart
 from pipeline.output.charts import Axis, Chart, Panel, band, curve, draw
 from pipeline.output.report.first_run import first_run
-from pipeline.output.report.scene import nis_chart, plan
+from pipeline.output.report.scene import nis_chart, plan, tracked
 from pipeline.output.summary import effective_chart, error_chart, late_chart, late_counts, mode_chart
 from pipeline.runs.sweeps import Over, figures_of
 from pipeline.tuning.outcome import Tuning
@@ -332,6 +332,49 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
     same(drawn, wanted)
     assert "of a;" in chart.title
     assert nis_chart(tmp_path, ["unknown"]) is None
+
+
+def test_trackers_are_seen_from_above_over_the_true_ways(tmp_path) -> None:
+    """A panel for each in the order that is asked for, at one scale; a gap between any two tracks."""
+    stamps, steps = np.arange(4) * 10**9, np.arange(4.0)
+    state = np.stack([10.0 * steps, -steps], axis=1)
+    truths = [
+        make_stream(
+            f"/target{number}/truth",
+            schemas.TRUTH_STATE,
+            stamps,
+            metadata={"components": "x_m,y_m", "kinds": "linear,linear"},
+            state=state + 5.0 * number,
+        )
+        for number in range(2)
+    ]
+    made = [
+        make_stream(
+            f"/estimates/{name}/track",
+            schemas.TRACK_ESTIMATE,
+            stamps,
+            metadata={"components": "y_m,x_m", "kinds": "linear,linear"},
+            track_id=np.array([7, 3, 7, 3]),
+            mean=state[:, ::-1] + off,
+            covariance=np.zeros((4, 4)),
+        )
+        for name, off in (("near", 0.5), ("far", 2.5))
+    ]
+    case, run = tmp_path / "clutter-10", RunMetadata("own", epoch_ns=0)
+    for folder, streams in (("logs", truths), ("estimates", made)):
+        (case / folder).mkdir(parents=True)
+        write_log(case / folder / "run-0000.mcap", streams, run)
+    chart = tracked(tmp_path, ["far", "absent", "near"])
+    assert chart is not None
+    assert chart.title.startswith("First run of clutter-10 from above")
+    assert [panel.title for panel in chart.panels] == ["far", "near"]
+    assert len({str(panel.x.limits) for panel in chart.panels}) == 1
+    truth, far = chart.panels[0].series
+    assert truth.reference
+    assert truth.x == [0.0, 10.0, 20.0, 30.0, None, 5.0, 15.0, 25.0, 35.0, None]
+    assert far.x == [12.5, 32.5, None, 2.5, 22.5, None]  # track 3, then track 7
+    assert far.y == [1.5, -0.5, None, 2.5, 0.5, None]
+    assert tracked(tmp_path, ["absent"]) is None
 
 
 def test_a_figure_has_what_its_chart_says() -> None:

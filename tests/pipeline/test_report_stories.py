@@ -268,6 +268,28 @@ def test_a_page_of_claims_alone_has_a_card() -> None:
     assert (card.unit, card.foot) == ("of 2 claims confirmed", ["1 not shown"])
 
 
+def test_of_a_study_nobody_is_taken_for_an_error_that_others_have_not() -> None:
+    """Nor is what a study measures beside its estimators one of them."""
+    stated = {"estimators": {"a": {}, "b": {}}, "runs": 5}
+    metrics = {"a.rule_error_m": 0.1, "b.ratio": 0.5, "published.rule_error_m": 0.05}
+    result = Result(
+        experiment="x",
+        fuselog="1",
+        settings=stated,
+        input_sha256="",
+        metrics=metrics,
+        claims=[Claim("A", "", "", "confirmed")],
+    )
+    told = opening(result, {}).story
+    assert told.verdict == ["The only claim is confirmed."]
+    assert [card.estimator for card in told.cards] == ["claims"]
+    both = result.model_copy(update={"metrics": {**metrics, "b.rule_error_m": 0.3, "b.nees": 3.0}})
+    told = opening(both, {}).story
+    assert told.verdict[0].startswith("Take a: ")
+    assert [card.estimator for card in told.cards] == ["a", "b", "claims"]
+    assert "the covariances of a, which nothing here judges" in told.doubts
+
+
 def test_what_the_checks_of_a_replay_find_is_doubtful_in_words() -> None:
     """Each kind with its estimators, once; of few runs what they leave open."""
     rows = {label: {"position_rmse_m": [1.0 + size] * 2} for size, label in enumerate("ab")}

@@ -29,7 +29,7 @@ from pipeline.output.report.first_run import first_run, picture_of_timeline
 from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
 from pipeline.output.report.naming import distinct_names, title_of
-from pipeline.output.report.scene import lens, nis_chart, plan
+from pipeline.output.report.scene import lens, nis_chart, plan, tracked
 from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
 from pipeline.output.report.sweeps import RUNS_TABLE
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
@@ -197,7 +197,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     looks += _first_run(folder, order, viewer=viewer)
     looks += [each for name in SCENES for each in figures if each.name == name]
     figures = [each for each in figures if each.name not in SCENES]
-    if "sweep" in result.settings or not looks:
+    if "sweep" in result.settings or not looks or looks[-1].name == "tracks":
         looks, figures = [*looks, *figures[:2]], figures[2:]
     over_time = [each for each in figures if each.name.startswith("errors")][:1]
     nis = nis_chart(folder, [label for label in labels if label in begun.found.labels])
@@ -285,7 +285,8 @@ def _first_run(folder: Path, order: Sequence[str], *, viewer: bool) -> list[Show
         return [Shown("", "first run, in the viewer", "The first run in the viewer", picture=address)]
     run = first_run(folder)
     if run is None:
-        return []
+        tracks = tracked(folder, order)
+        return [_chart("tracks", tracks)] if tracks else []
     near = lens(run, order)
     return [_chart("scene", plan(run)), *([_chart("lens", near)] if near else [])]
 

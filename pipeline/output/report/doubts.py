@@ -115,7 +115,11 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
 def _of_what_is_not_known(found: Findings) -> list[str]:
     """Who was not judged, or not compared."""
     told = []
-    unjudged = [label for label, each in found.of.items() if each.decisive is None]
+    unjudged = [
+        label
+        for label, each in found.of.items()
+        if each.decisive is None and not found.has_any(label, "nees", "nis")
+    ]
     if unjudged and found.main:
         whose = named(unjudged, len(found.labels))
         told.append(f"the covariances of {whose}, which nothing here judges")

@@ -217,6 +217,15 @@ class Findings:
         numbers = [each.value for each in found if each is not None]
         return [float(each) for each in numbers if isinstance(each, int | float)]
 
+    def has_any(self, label: str, *stems: str) -> bool:
+        """Whether an estimator has a quantity with one of these in its name."""
+        return any(
+            stem in key and label in of
+            for table in self.tables
+            for key, of in table.quantities.items()
+            for stem in stems
+        )
+
     def _evidence(self, label: str) -> Evidence:
         failed = self.values(label, "failed_runs")
         nees, nis = self._of_nees(label), self._of_nis(label)

@@ -67,7 +67,7 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
         meanings = result.settings.get("meanings", {})
         return Opening(tried, _of_tuning(told, tables, meanings), found, notes)
     if result.claims:
-        told = _with_claims(told if found.compared else Story([], doubts=told.doubts), result)
+        told = _with_claims(_of_a_study(result, found, timings), result)
     return Opening(tried, told, found, notes)
 
 
@@ -102,6 +102,18 @@ def _length(tables: Tables) -> str:
             seconds = float(tables[name][column].max())
             return f" of {number(round(seconds))} s" if seconds >= 1.5 else f" of {number(seconds, 2)} s"
     return ""
+
+
+def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Story:
+    """The story of an experiment's estimators, whatever else its study measures; of no single one.
+
+    What only one of several has is no error by which to choose.
+    """
+    stated = result.settings.get("estimators") or {}
+    own = replace(found, labels=[label for label in found.labels if label in stated] or found.labels)
+    told = story(own, result.causes, timings, result.alarms)
+    is_compared = len(own.compared) > 1 or len(own.labels) == len(own.compared)
+    return told if is_compared else Story([], doubts=told.doubts)
 
 
 def _with_claims(told: Story, result: Result) -> Story:

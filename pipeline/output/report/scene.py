@@ -16,7 +16,7 @@ from pipeline.output.report.first_run import (
     innovations_of_runs,
 )
 from pipeline.output.words import count
-from recorders.log import read_streams, schemas
+from recorders.log import open_log, read_streams, schemas
 from replay.distributions import chi2
 from replay.engine.streams.sources import LogSource
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
@@ -228,6 +228,71 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
             columns = [cloud.components.index(name) for name in PLANE]
             points.append(cloud["mean"][np.searchsorted(ends, positions)][:, columns])
     return [path(f"{estimator}, particles", np.concatenate(points), "dots")] if points else []
+
+
+def tracked(folder: Path, labels: Sequence[str]) -> Chart | None:
+    """The first run of trackers from above: tracks over the true ways, a panel for each of the first.
+
+    None where no run has both. Raises BadInput where a log is damaged.
+    """
+    for log in sorted(folder.rglob("logs/run-0000.mcap")):
+        estimates = log.parent.parent / "estimates" / log.name
+        if not estimates.is_file():
+            continue
+        source, output = LogSource(open_log(log)), LogSource(open_log(estimates))
+        ways = _ways(source)
+        if not ways:
+            continue
+        ends = [(float(of.min()), float(of.max())) for of in np.concatenate(ways).T]
+        x, y = (
+            Axis(label=label, limits=(low - SMALL * (high - low), high + SMALL * (high - low)))
+            for label, (low, high) in zip(("x (m)", "y (m)"), ends, strict=True)
+        )
+        truth = path("truth", _parted(ways), reference=True)
+        panels = []
+        for label in labels:
+            found = _tracks(output, label)
+            if found:
+                series = [truth, path(label, _parted(found))]
+                panels.append(Panel(x=x, y=y, series=series, title=label, plane=True))
+        if panels:
+            case = log.parent.parent.relative_to(folder)
+            of = f" of {case}" if case.parts else ""
+            title = f"First run{of} from above: tracks over the true ways, which are grey"
+            shown = panels[:MOST_LENSES]
+            return Chart(title=title, panels=shown, columns=len(shown), legend=False)
+    return None
+
+
+def _ways(source: LogSource) -> list[Floats]:
+    """The true ways of the targets of a log, each (n, 2)."""
+    topics = [
+        topic
+        for topic, each in source.topics.items()
+        if each.schema_name == schemas.TRUTH_STATE.full_name
+    ]
+    truths = [each for each in source.read(topics).values() if set(PLANE) <= {*each.components}]
+    return [
+        each["state"][:, [each.components.index(name) for name in PLANE]][thinned(len(each))]
+        for each in truths
+        if len(each)
+    ]
+
+
+def _tracks(output: LogSource, label: str) -> list[Floats]:
+    """The tracks that an estimator told of, each (n, 2)."""
+    topic = f"/estimates/{label}/track"
+    if topic not in output.topics or not set(PLANE) <= {*output.empty(topic).components}:
+        return []
+    told = output.read([topic])[topic]
+    places = told["mean"][:, [told.components.index(name) for name in PLANE]]
+    return [places[told["track_id"] == number] for number in np.unique(told["track_id"])]
+
+
+def _parted(ways: Sequence[Floats]) -> Floats:
+    """Ways one after the other, NaN between them."""
+    gap = np.full((1, 2), np.nan)
+    return np.concatenate([part for way in ways for part in (way, gap)])
 
 
 def nis_chart(folder: Path, labels: Sequence[str]) -> Chart | None:
