@@ -28,10 +28,10 @@ from replay.inference.linear_algebra.sparse import (
     propagating_covariance,
 )
 from replay.inference.model.corrections import sloping
-from replay.inference.sampled_steps import SampledFunction
+from replay.inference.sampled_steps import SETTLING, SampledFunction
 from replay.inference.step_graphs import Step
 from replay.tracing.functions import Argument, Shape, trace
-from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed
+from replay.tracing.graph import CONSTANT, INPUT, POWER, SELECT, Graph, Node, needed, steady
 
 _FLOPS = (operator.add, operator.sub, operator.mul, operator.truediv)
 _FREE = (
@@ -86,12 +86,12 @@ def costs_of(made: CFilter) -> tuple[dict[str, Cost], list[Products]]:
 
 
 def _cost_of_step(step: Step) -> Cost:
-    return _cost(step.outputs.values())
+    return _cost(needed(step.outputs.values()))
 
 
-def _cost(outputs: Collection[Node]) -> Cost:
+def _cost(nodes: Collection[Node]) -> Cost:
     flops = roots = calls = 0
-    for node in needed(outputs):
+    for node in nodes:
         if node.operation in _FLOPS:
             flops += 1
         elif node.operation is POWER:
@@ -107,7 +107,7 @@ def _cost(outputs: Collection[Node]) -> Cost:
 
 def _traced(function: Any, *arguments: Argument) -> Cost:
     result = trace(Graph(), function, arguments)
-    return _cost([*result.returned, *(node for _, _, node in result.written)])
+    return _cost(needed([*result.returned, *(node for _, _, node in result.written)]))
 
 
 def _loops(made: CFilter, part: int, size: int) -> Cost:
@@ -139,12 +139,21 @@ def _sampling(sampled: SampledFunction) -> Cost:
     once = added(
         _cost_of_step(sampled.variances), _cost_of_step(sampled.centre), Cost(0, sampled.noises)
     )
-    own = added(_cost_of_step(sampled.value), Cost(size * size))
+    values = _in_loop(sampled.value, sampled.varying, count)
+    own = added(once, values, Cost(size * size * count))
     mean = Cost(2 * count * sampled.size)
     if sampled.recentre is None:
-        return added(once, *[own] * count, mean, Cost(sampled.size))
-    again = added(mean, _cost_of_step(sampled.move), *[_cost_of_step(sampled.recentre)] * count)
-    return added(once, *[own] * count, *[again] * MEANS)
+        return added(own, mean, Cost(sampled.size))
+    again = added(mean, _cost_of_step(sampled.move), _in_loop(sampled.recentre, SETTLING, count))
+    return added(own, *[again] * MEANS)
+
+
+def _in_loop(step: Step, varying: Collection[int], count: int) -> Cost:
+    """The cost of a step for every sample; calls that are always the same stand before the loop."""
+    outputs = list(step.outputs.values())
+    same = steady(outputs, lambda at: at[0] in varying)
+    inside = [node for node in needed(outputs, same) if node not in same]
+    return added(_cost(needed(same)), *[_cost(inside)] * count)
 
 
 def _spread(sampled: SampledFunction, t: int, part: int, *, is_root: bool) -> Cost:

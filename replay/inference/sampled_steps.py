@@ -23,6 +23,7 @@ from replay.sampling.sets import SampleSets
 from replay.tracing.functions import Argument, Shape, TracedFunction
 
 Kinds = tuple[str, ...]
+SETTLING = (3,)  # which argument of `SampledFunction.recentre` differs from sample to sample: value
 
 
 class SampledFunction(NamedTuple):
@@ -39,6 +40,7 @@ class SampledFunction(NamedTuple):
         move: of (mean, covariance, shift, centre): `centre`, moved by the shift (v).
         recentre: of (mean, covariance, shift, value): `value` from the moved centre, and `again`,
             whether the values may still not sum to zero; None where they are linear.
+        given: how many arguments the step is given.
     """
 
     points: Floats
@@ -48,12 +50,18 @@ class SampledFunction(NamedTuple):
     value: Step
     move: Step
     recentre: Step | None
+    given: int
 
     @property
     def steps(self) -> list[Step]:
         """List its graphs."""
         found = [self.variances, self.centre, self.value, self.move]
         return found if self.recentre is None else [*found, self.recentre]
+
+    @property
+    def varying(self) -> tuple[int]:
+        """Return which argument of `value` differs from sample to sample: away."""
+        return (self.given,)
 
     @property
     def noises(self) -> int:
@@ -117,12 +125,13 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
         return {"centre": centre}
 
     def recentre(_: Any, __: Any, shift: Any, value: Any) -> Any:
-        found, again = [], False
+        found, again = list[Any](), False
         for kind, _component, first, width in manifold_blocks(outputs):
             own = slice(first, first + width)
             still, *moved = _recentred(kind)(tuple(value[own]), tuple(shift[own]))
             found += moved
-            again = again | still
+            if kind != "linear":
+                again = still if again is False else again | still
         return {"value": found, "again": [again]}
 
     shift, centre = Shape((values,)), Shape((components,))
@@ -135,6 +144,7 @@ def sampled_function(sampled: Sampled, sets: SampleSets, given: tuple[Argument, 
         traced_step(what, at_sample, (*given, Shape((size,)), centre)),
         traced_step(what, move, (*gaussian, shift, centre)),
         None if straight else traced_step(what, recentre, (*gaussian, shift, shift)),
+        len(given),
     )
 
 

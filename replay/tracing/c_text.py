@@ -9,6 +9,7 @@ import operator
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,7 +134,11 @@ class _Text(NamedTuple):
 
 
 def c_lines(
-    named: Mapping[str, Node], inputs: Mapping[Any, str], precision: Precision, of: str = "v"
+    named: Mapping[str, Node],
+    inputs: Mapping[Any, str],
+    precision: Precision,
+    of: str = "v",
+    known: Mapping[Node, str] = MappingProxyType({}),
 ) -> Iterator[str]:
     """Write every named node as `const double name = ...;`, each behind the lines that it needs.
 
@@ -142,16 +147,17 @@ def c_lines(
         inputs: names of what the graph is given, by place.
         precision: of the numbers.
         of: the letter that names of lines begin with.
+        known: names of nodes that stand in lines before these.
     """
-    everything = needed(named.values())
+    everything = needed(named.values(), known)
     uses = Counter(argument for node in everything for argument in node.arguments)
     uses.update(named.values())
     squared = {node.arguments[0] for node in everything if node.operation is POWER}
-    taken = {*inputs.values(), *named}
+    taken = {*inputs.values(), *named, *known.values()}
     free = (name for name in map(f"{of}{{}}".format, range(1, len(everything) + 1)) if name not in taken)
-    found: dict[Node, _Text] = {}
+    found = {node: _Text(name, _WHOLE) for node, name in known.items()}
     for name, output in named.items():
-        for node in needed([output]):
+        for node in needed([output], known):
             if node in found:
                 continue
             text = _text_of(node, [found[each] for each in node.arguments], inputs, precision)
@@ -196,6 +202,8 @@ def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str], precisio
         return _Text(text, _SIGN if text.startswith("-") else _WHOLE)
     if operation is SELECT:
         condition, yes, no = given
+        if node.is_truth and [each.value for each in node.arguments[1:]] == [False, True]:
+            return _Text(f"!({condition.text})", _SIGN)
         sides = [
             text if node.is_truth else _real(side, text, precision)
             for side, text in zip(node.arguments[1:], (yes, no), strict=True)

@@ -7,7 +7,7 @@ something costs nothing.
 
 import math
 import operator
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from hashlib import blake2b
 from typing import Any
 
@@ -28,6 +28,13 @@ _TRUTHS = (
     operator.or_,
     operator.xor,
     operator.not_,
+)
+
+# what costs about as much as it takes to fetch a number
+_CHEAP = (
+    *(INPUT, CONSTANT, POWER, SELECT, np.absolute, np.sign),
+    *(operator.add, operator.sub, operator.mul, operator.truediv, operator.neg),
+    *_TRUTHS,
 )
 
 _COMMUTATIVE = (operator.add, operator.mul)
@@ -173,16 +180,38 @@ def _power(base: float, exponent: int) -> float:
     return found if exponent > 0 else float(np.float64(1.0) / found)
 
 
-def needed(outputs: Iterable[Node]) -> list[Node]:
-    """All nodes that some are made of, and these, in the order in which they can be computed."""
+def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
+    """All nodes that some are made of, and these, in the order in which they can be computed.
+
+    What is known already stands among them, and nothing that only this is made of.
+    """
     found: set[Node] = set()
     waiting = list(outputs)
     while waiting:
         node = waiting.pop()
         if node not in found:
             found.add(node)
-            waiting += node.arguments
+            waiting += () if node in known else node.arguments
     return sorted(found, key=lambda node: node.number)
+
+
+def steady(outputs: Collection[Node], varies: Callable[[Any], bool]) -> list[Node]:
+    """Find what is worth computing before a loop: parts with a function's call that stay the same in it.
+
+    Args:
+        outputs: of the loop.
+        varies: (place) -> whether this input changes from round to round.
+    """
+    varying, costly, wanted = set[Node](), set[Node](), set(outputs)
+    nodes = needed(outputs)
+    for node in nodes:
+        if (node.operation is INPUT and varies(node.value)) or not varying.isdisjoint(node.arguments):
+            varying.add(node)
+        if node.operation not in _CHEAP or not costly.isdisjoint(node.arguments):
+            costly.add(node)
+    for node in nodes:
+        wanted.update(node.arguments if node in varying or node.is_truth else ())
+    return [each for each in nodes if each in wanted & costly - varying and not each.is_truth]
 
 
 def described(outputs: Iterable[Node]) -> Iterator[str]:

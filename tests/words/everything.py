@@ -5,12 +5,22 @@ from pathlib import Path
 
 from tests.claims import limits
 from tests.words import commands
-from tests.words.made import alarms, claims, comparing, diagnosing, plausibility, reporting, tuning
+from tests.words.made import (
+    alarms,
+    claims,
+    comparing,
+    deploying,
+    diagnosing,
+    plausibility,
+    reporting,
+    tuning,
+)
 
 # By command, a case's title is its docstring, and it gives sentences that its command may print.
 MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
     "check": comparing.CHECKED,
     "compare": comparing.COMPARED,
+    "deploy": deploying.DEPLOYED,
     "diagnose": diagnosing.DIAGNOSED,
     "info": plausibility.FOUND,
     "replay": alarms.ALARMED,

@@ -11,7 +11,6 @@ from replay.inference.model.model import Sensor
 _COVARIANCE = """\
 /* The covariance, of the lower factor L that the filter carries: L L'. */
 void NAME_covariance(const NAME *filter, REAL covariance[NAME_TANGENT][NAME_TANGENT]);
-
 """
 
 

@@ -4,14 +4,16 @@ Names as in `algebra`; SAMPLES, DRAWN, VALUES and PLACES are how many samples, n
 components and components of a function's values there are at most.
 """
 
+from collections.abc import Collection
 from typing import Any
 
 from pipeline.deploying.c_source.names import CFilter, filled
 from pipeline.deploying.c_source.statements import Inputs, body, entries
 from replay.inference.kalman.regression import MEANS
 from replay.inference.linear_algebra.manifold import SETTLED
-from replay.inference.sampled_steps import SampledFunction
+from replay.inference.sampled_steps import SETTLING, SampledFunction
 from replay.tracing.c_text import c_lines, truth_text
+from replay.tracing.graph import Node, steady
 
 SETTLED_IN_SINGLE = 1e-7  # see `manifold.SETTLED`
 
@@ -157,6 +159,7 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
     values = {
         f"samples->values[index][{place[0]}]": node for (_, place), node in sampled.value.outputs.items()
     }
+    before, inside = _in_loop(made, values, names, sampled.varying)
     own = {"away": "samples->offsets[index]", "centre": "samples->centre"}
     used = [each for each in own if any(text.startswith(f"{each}[") for text in names.values())]
     first = size - len(variances)
@@ -168,10 +171,11 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
             for k, each in enumerate(variances)
         ),
         *c_lines(at_mean, names, made.precision),
+        *before,
         f"for (int index = 0; index < {count}; index++) {{",
         *(f"    const REAL *const {each} = {own[each]};" for each in used),
         f"    draw(samples, index, {size}, points_{size}[index]);",
-        *(f"    {each}" for each in c_lines(values, names, made.precision, "w")),
+        *(f"    {each}" for each in inside),
         "}",
     ]
     if sampled.recentre is not None:
@@ -197,6 +201,19 @@ def _sampling(made: CFilter, number: int) -> tuple[str, str]:
     return filled(made, head + text + "}\n"), f"sample_{name}({call});"
 
 
+def _in_loop(
+    made: CFilter, named: dict[str, Node], names: dict[Any, str], varying: Collection[int]
+) -> tuple[list[str], list[str]]:
+    """Write the lines of a loop over samples, and before it those of calls that are always the same.
+
+    `varying` are the arguments that differ from sample to sample.
+    """
+    outputs = list(named.values())
+    same = {node: f"same{i}" for i, node in enumerate(steady(outputs, lambda at: at[0] in varying), 1)}
+    before = c_lines({name: node for node, name in same.items()}, names, made.precision, "s")
+    return [*before], [*c_lines(named, names, made.precision, "w", same)]
+
+
 def _settling(made: CFilter, number: int) -> list[str]:
     """Write the rounds in which a centre becomes the mean of values with angles or orientations."""
     sampled, name = made.steps.sampled[number], made.parts[number]
@@ -208,6 +225,7 @@ def _settling(made: CFilter, number: int) -> list[str]:
     values = {f"value_{i}": outputs["value", (i,)] for i in range(sampled.size)}
     move_names, _ = Inputs(made, name).names(sampled.move, "shift", "centre")
     names, _ = Inputs(made, name).names(sampled.recentre, "shift", "value")
+    before, inside = _in_loop(made, values, names, SETTLING)
     again = truth_text(outputs["again", (0,)], names, made.precision)
     if made.precision.ending:
         again = again.replace(made.precision.number(SETTLED), made.precision.number(SETTLED_IN_SINGLE))
@@ -218,9 +236,10 @@ def _settling(made: CFilter, number: int) -> list[str]:
         f"    find_shift(samples, {weighed(sampled)}, {sampled.size});",
         *(f"    {each}" for each in c_lines(moved, move_names, made.precision)),
         *(f"    centre[{i}] = moved_{i};" for i in range(len(moved))),
+        *(f"    {each}" for each in before),
         f"    for (int index = 0; index < {len(sampled.points)}; index++) {{",
         "        REAL *const value = samples->values[index];",
-        *(f"        {each}" for each in c_lines(values, names, made.precision, "w")),
+        *(f"        {each}" for each in inside),
         f"        again = again || ({again});",
         *(f"        value[{i}] = value_{i};" for i in range(sampled.size)),
         "    }",
