@@ -330,7 +330,7 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
             assert set(own["outside"][1]) == {low}
             own["outside"][1] = np.zeros(45)
     same(drawn, wanted)
-    assert "of a;" in chart.title
+    assert "of a, " in chart.title
     assert nis_chart(tmp_path, ["unknown"]) is None
 
 
