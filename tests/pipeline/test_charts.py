@@ -321,6 +321,9 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
             own["outside"] = [middle[is_out], np.zeros(45)]
     found["other", "b"] = found["calm", "a"]
     monkeypatch.setattr("pipeline.output.report.scene.innovations_of_runs", lambda _: found)
+    (tmp_path / "estimates").mkdir()
+    for run in range(2):
+        (tmp_path / f"estimates/run-000{run}.mcap").touch()
     chart = nis_chart(tmp_path, ["late", "calm", "other"])
     assert chart is not None
     drawn = held(chart)
@@ -330,7 +333,7 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
             assert set(own["outside"][1]) == {low}
             own["outside"][1] = np.zeros(45)
     same(drawn, wanted)
-    assert "of a, " in chart.title
+    assert "of a, 2 runs together;" in chart.title
     assert nis_chart(tmp_path, ["unknown"]) is None
 
 
