@@ -185,6 +185,7 @@ def test_fixes_of_another_name_are_offered() -> None:
         fl.diagnose(replace(log, streams=renamed), "ekf")
 
 
+@pytest.mark.paper
 def test_a_unit_mounted_a_quarter_turn_off_is_one_cause_with_the_heading_at_the_start() -> None:
     """A prior states the heading of the body, and a unit's yaw is only known by that."""
     log = fl.record("navigation", seed=3, duration_s=12.0, unit={"rate_hz": 25.0})
