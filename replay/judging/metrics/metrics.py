@@ -99,7 +99,7 @@ def _add_nees(state: Consistent, errors: Errors) -> Consistent:
         known = squared[np.isfinite(squared)]
         state.places += len(known)
         state.of_places += float(known.sum())
-    state.by_step.add(errors.step, errors.nees[:, None])
+    state.by_step.add(errors.step[finite], errors.nees[finite, None])
     return state
 
 

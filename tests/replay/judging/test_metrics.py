@@ -83,7 +83,7 @@ def test_consistency_is_of_state_and_position_where_there_is_a_nees() -> None:
             "nees": (3.0 + 27.0 + 0.3) / 3,
             "estimates_without_nees": 1.0,
             "position_nees": (2.0 + 18.0 + 0.2) / 3,
-            "nees_steps_within_95": 2 / 4,
+            "nees_steps_within_95": 2 / 3,
         }
     )
     assert CONSISTENCY.of(make_errors(np.empty((0, 1)), ("x_m",))) == {}
