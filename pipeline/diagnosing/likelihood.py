@@ -247,7 +247,7 @@ class Likelihood:
             lacking = all_ - scored.beyond.get(name, 0) - len(stream)
             if len(stream) < LEAST_SCORED * all_ or (lacking and name not in self.readings):
                 return {}
-            stream = stream.take(slice(round(share * len(stream))))
+            stream = stream.take(first_of_each(stream, share))
             is_in = stream["accepted"] != 0
             total = float(np.sum(stream["log_likelihood"][is_in]))
             if not is_in.all():
@@ -322,6 +322,20 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
         if topic in broad and rows.any() and squares < is_known[rows].sum():
             found[topic] = min(broad[topic], float(innovations["log_likelihood"][rows].mean()))
     return found
+
+
+def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
+    """Whether rows are of the first share of their sensor's, told by what is measured.
+
+    Of all rows it would be other measurements where a delay changes their order.
+    """
+    known = np.isfinite(innovations["innovation"])
+    sensor = known @ 2.0 ** np.arange(known.shape[1])
+    is_first = np.zeros(len(innovations), bool)
+    for each in np.unique(sensor):
+        rows = np.flatnonzero(sensor == each)
+        is_first[rows[: round(share * len(rows))]] = True
+    return is_first
 
 
 def _later(stream: Stream, by_ns: int) -> Stream:

@@ -14,7 +14,7 @@ from pipeline.diagnosing.battery.car import car
 from pipeline.diagnosing.causes import find_causes
 from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial
+from pipeline.diagnosing.likelihood import Likelihood, Trial, first_of_each
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
@@ -147,6 +147,26 @@ def test_what_another_number_explains_as_well_is_not_determined(
     assert [each.value for each in (cause, *cause.others)] == pytest.approx(values, abs=0.02)
     other = f"; this log does not determine it: as likely, {values[-1]:.2f} late;"
     assert (other in cause.words) == (len(values) > 1)
+
+
+def test_a_part_of_a_log_has_the_same_measurements_in_any_order() -> None:
+    """A delay of one sensor exchanges its messages with those of another."""
+    rows = np.arange(12)
+    values = np.where(np.stack([rows % 2 == 0, rows % 2 == 1], axis=1), rows[:, None], np.nan)
+    for order in (rows, rows.reshape(-1, 2)[:, ::-1].ravel()):
+        innovations = fl.make_stream(
+            "/estimates/ekf/innovation",
+            fl.schemas.INNOVATION,
+            rows,
+            metadata={"components": "x_m,v_mps", "kinds": "linear,linear"},
+            target_id=np.zeros(12),
+            accepted=np.ones(12),
+            innovation=values[order],
+            covariance=np.ones((12, 4)),
+            normalised_innovation_squared=np.ones(12),
+            log_likelihood=np.ones(12),
+        )
+        assert sorted(order[first_of_each(innovations, 0.5)]) == list(range(6))
 
 
 def late(at: float, *_: float) -> str:
