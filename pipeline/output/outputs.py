@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.output.results import RESULT_FILE, read_result
+from pipeline.output.results import RESULT_FILE, read_result, require_ours
 from recorders.atomic import settled
 from recorders.errors import BadInput
 from recorders.log import RunMetadata, open_log
@@ -69,11 +69,16 @@ def check_folder(folder: Path, inputs: Mapping[str, Iterable[Path]]) -> None:
 def check_outputs(
     folder: Path | None, timeline: Path | None, inputs: Mapping[str, Iterable[Path]]
 ) -> None:
-    """Raise BadInput where a command may not write its result folder or its timeline, if it does."""
+    """Raise BadInput where a command may not write its result folder or its timeline, if it does.
+
+    Before its work, of which nothing would be left where the folder has to stay as it is.
+    """
     if timeline is not None:
         check_files([(timeline, TIMELINE)], inputs)
     if folder is not None:
         check_folder(folder, {**inputs, "output": list(filter(None, [timeline]))})
+        if settled(folder).exists():
+            require_ours(settled(folder), folder)
 
 
 def _refuse_link(path: Path) -> None:

@@ -210,10 +210,10 @@ def result_folder(folder: Path) -> AbstractContextManager[Path]:
     Raises BadInput where something else than a result of ours is in the place, where another process
     is filling it, or where it cannot be written.
     """
-    return whole_folder(folder, lambda found: _require_ours(found, folder))
+    return whole_folder(folder, lambda found: require_ours(found, folder))
 
 
-def _require_ours(found: Path, place: Path) -> None:
+def require_ours(found: Path, place: Path) -> None:
     """Raise BadInput unless a folder holds a result of ours, as it was written, and nothing else."""
     try:
         result = read_result(found)

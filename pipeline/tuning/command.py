@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.logs.folders import logs_in
-from pipeline.output.outputs import check_folder
+from pipeline.output.outputs import check_outputs
 from pipeline.output.results import plain
 from pipeline.output.terminal import print_json, print_metrics, print_table, say, status, warn
 from pipeline.runs.settings import settings_of_estimators, split_texts
@@ -46,7 +46,9 @@ def tune_logs(
     """
     logs, held_out = ([log for path in paths for log in logs_in(path)] for paths in (logs, held_out))
     _check_apart(logs, held_out)
-    check_folder(out, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))})
+    check_outputs(
+        out, None, {"log": [*logs, *held_out], "settings": list(filter(None, [settings_file]))}
+    )
     alterations, own = split_texts(settings)
     chosen = settings_of_estimators([label], own, settings_file, model=model)
     if not as_json:

@@ -76,8 +76,13 @@ def recorded(scenario: str, settings: str) -> MemorySource:
 
 def fingerprint(situation: Situation, settings: Mapping[str, Any]) -> str:
     """Of all that is estimated."""
-    source = recorded(situation.scenario, json.dumps(situation.recorded))
-    outputs = replay_in_memory([source], {"tried": settings})
+    return fingerprint_of(situation.scenario, json.dumps(situation.recorded), json.dumps(settings))
+
+
+@cache
+def fingerprint_of(scenario: str, recorded_as: str, settings: str) -> str:
+    """Once for all parameters that are tried against the same usual values."""
+    outputs = replay_in_memory([recorded(scenario, recorded_as)], {"tried": json.loads(settings)})
     digest = hashlib.sha256()
     for topic, ragged in outputs.items():
         digest.update(repr((topic, sorted(ragged.stream.metadata.items()))).encode())

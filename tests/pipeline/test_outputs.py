@@ -198,9 +198,12 @@ def test_no_file_of_the_user_is_changed(command: str, by_turns: str, here: Path,
 def test_a_result_with_notes_or_edits_stays(
     command: str, change: Callable[[Path], None], here: Path, before: Path
 ) -> None:
+    """And that is said first, not after work that is lost then."""
     _place_ours(before, command, Path("out"))
     change(Path("out"))
-    _check_refusal(_run(COMMANDS[command], Path("out")), here, _state(here), "out")
+    said = _run(COMMANDS[command], Path("out"))
+    _check_refusal(said, here, _state(here), "out")
+    assert said.out == ""
 
 
 def test_a_page_with_notes_stays(here: Path, before: Path) -> None:
