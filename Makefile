@@ -36,21 +36,20 @@ fast-replay-lane: .venv/with-test
 	$(BIN)/pytest -m "not paper" tests --ignore=tests/docs --ignore=tests/house --ignore=tests/pipeline
 
 estimators-lane: .venv/with-test
-	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py \
-		tests/pipeline/test_campaigns.py
+	$(BIN)/pytest tests/replay/estimators tests/replay/test_goldens.py tests/pipeline/test_*stud*.py
 
 inference-lane: .venv/with-test
-	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py \
+	$(BIN)/pytest tests/replay tests/pipeline/test_tuning.py tests/pipeline/test_campaigns.py \
 		--ignore=tests/replay/estimators --ignore=tests/replay/test_goldens.py
 
 pipeline-lane: .venv/with-test
 	$(BIN)/pytest tests/pipeline --ignore-glob='*stud*.py' --ignore=tests/pipeline/test_faults.py \
 		--ignore=tests/pipeline/test_outputs.py --ignore=tests/pipeline/test_tuning.py \
-		--ignore=tests/pipeline/test_campaigns.py
+		--ignore=tests/pipeline/test_campaigns.py --ignore-glob='*test_command_*.py'
 
 rooms-lane: .venv/with-test
 	$(BIN)/pytest tests/claims tests/docs tests/house tests/mutants tests/recorders tests/words \
-		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py
+		tests/pipeline/test_faults.py tests/pipeline/test_outputs.py tests/pipeline/test_command_*.py
 
 # what no test runs, by lines and branches; kernels are machine code, of which no line is seen
 coverage: .venv/with-test
