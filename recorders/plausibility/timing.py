@@ -11,7 +11,7 @@ from recorders.plausibility.windows import FEWEST, Windows
 Account = Callable[[Series, Floats, Floats], Floats]  # of windows, from their begin to their end
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
 GAINS = np.linspace(-0.1, 0.1, 41)
-FEW = 400  # windows by which a clock is sought
+FEW = 100  # windows at least by which a lag or a clock is sought: more of them overlap by half
 NEAR_S = 1.0  # a lag within it is as likely as all that are longer
 
 
@@ -37,8 +37,10 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     """The lag, and gain, of the best correlation; None where too few windows can tell."""
     if len(windows) < FEWEST or not np.ptp(windows.values):
         return None
+    count = _independent(windows)
     lags_s = np.arange(-LONGEST_S, LONGEST_S + 0.5 * STEP_S, STEP_S)
-    coarse = _likeness(windows, source, account, lags_s)
+    few = _thinned(windows, max(FEW, 2 * count))
+    coarse = _likeness(few, source, account, lags_s)
     if not np.isfinite(coarse).any():
         return None
     best_s = float(lags_s[np.nanargmax(np.abs(coarse))])
@@ -46,9 +48,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
     near = _likeness(windows, source, account, fine_s)
     best = int(np.nanargmax(np.abs(near)))
     lag_s, likeness = float(fine_s[best]), float(near[best])
-    few = windows.take(slice(None, None, -(-len(windows) // FEW)))
     gain, gained_s, gained = _gained(few, source, account)
-    count = _independent(windows)
     if _evidence(count, gained, likeness) > max(10.0, 0.05 * count) and abs(gain) > 0.005:
         lag_s, likeness = gained_s, gained
     else:
@@ -97,11 +97,15 @@ def _share_within(windows: Windows, source: Series, lag_s: float) -> float:
     return float(is_within.mean())
 
 
-def _independent(windows: Windows) -> float:
+def _thinned(windows: Windows, most: int) -> Windows:
+    """Every second, third, ... window, so that at most so many are left."""
+    return windows.take(slice(None, None, -(-len(windows) // most)))
+
+
+def _independent(windows: Windows) -> int:
     """How many windows do not overlap."""
     span_s = float(np.median(windows.end_s - windows.begin_s))
-    covered = np.unique(np.floor(windows.begin_s / span_s))
-    return float(len(covered))
+    return len(np.unique(np.floor(windows.begin_s / span_s)))
 
 
 def _evidence(count: float, likeness: float, usual: float) -> float:
