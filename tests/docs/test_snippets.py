@@ -89,7 +89,6 @@ def test_the_golden_of_compare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.paper
-@pytest.mark.usefixtures("uncompiled")
 def test_a_model_of_ones_own_is_tuned_and_deployed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

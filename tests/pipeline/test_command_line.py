@@ -563,6 +563,7 @@ def test_names_beyond_the_locale(world: Path) -> None:
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     code = (
         "import sys; from pipeline.command_line import main; log, folder, timeline = sys.argv[1:]\n"
+        "from matplotlib.figure import Figure; Figure.draw = lambda *_: None\n"
         "run = main(['run', 'landmarks', '--runs', '1', '--set', 'duration_s=1', '--out', folder])\n"
         "print(run, *[main(['view', log, '--save', timeline]) for _ in range(2)])"
     )

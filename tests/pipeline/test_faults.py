@@ -8,7 +8,7 @@ from tests.faults import campaigns, files, kills, outputs
 pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 
-@pytest.mark.parametrize(("part", "most"), [(outputs, 40), (kills, 1), (files, 9), (campaigns, 2)])
+@pytest.mark.parametrize(("part", "most"), [(outputs, 40), (kills, 1), (files, 5), (campaigns, 1)])
 def test_a_slice_of_the_faults_holds(part, most):
     tally = part.run(60.0, np.random.default_rng(1), most)
     assert tally.notes == []

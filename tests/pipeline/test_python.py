@@ -186,6 +186,7 @@ def test_a_recording_is_written_as_the_command_writes_it(fuselog: Fuselog) -> No
         fl.write("mine.mcap", recorded)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_replay_says_what_the_command_says(
     fuselog: Fuselog, recordings: list[fl.MemorySource]
 ) -> None:
@@ -400,6 +401,7 @@ def test_estimates_are_kept_as_long_as_the_replay(
     assert caplog.records == []
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_an_experiment_is_run_as_the_command_runs_it(fuselog: Fuselog) -> None:
     done = fl.run("landmarks", runs=2, seed=4, set={"duration_s": 3.0, "ekf": {"gate_probability": 0.9}})
     assert done.folder == Path("out/landmarks")

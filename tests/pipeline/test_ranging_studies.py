@@ -7,13 +7,21 @@ import numpy as np
 import pytest
 
 from pipeline.runs.experiment import load_experiment, run_experiment
+from pipeline.runs.runner import Runner
 from pipeline.studies.ranging.ranging import Recording, Replayed
 from pipeline.studies.ranging.uwb_outdoor import Window, printed, published_rmse, scored_truth
 from recorders.errors import BadInput
 from recorders.recording import import_run
 from replay.engine.streams.sources import memory_source
 
-pytestmark = pytest.mark.usefixtures("blank_figures")
+pytestmark = pytest.mark.usefixtures("blank_figures", "no_timelines")
+
+
+@pytest.fixture
+def no_timelines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is drawn of these recordings is looked at in tests/replay/timeline."""
+    monkeypatch.setattr(Runner, "draw", lambda *_: None)
+
 
 CASES = {
     "Trajectory_A/Case_1": ((51.625, 191.375), {"LS": (1.0384, 1.5735), "ESKF": (1.1158, None)}),

@@ -39,7 +39,7 @@ from pipeline.output.results import Outcome, read_result, result_folder, write_o
 from recorders.errors import BadInput
 from recorders.log import open_log, read_streams
 
-pytestmark = pytest.mark.paper
+pytestmark = [pytest.mark.paper, pytest.mark.usefixtures("blank_figures")]
 
 Fuselog = Callable[..., Any]
 WINDOWS = [(width, scheme) for width in (1280, 400) for scheme in ("light", "dark")]

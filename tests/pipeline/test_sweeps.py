@@ -13,6 +13,8 @@ from pipeline.runs import experiment
 from pipeline.runs.sweeps import heat_maps, parse_over, points_of
 from recorders.errors import BadInput
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SHORT = ["--runs", "4", "--set", "duration_s=3"]
 
 

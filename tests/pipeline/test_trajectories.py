@@ -82,6 +82,7 @@ def test_two_files(fuselog: Fuselog) -> None:
 
 
 @pytest.mark.paper
+@pytest.mark.usefixtures("blank_figures")
 def test_estimates_of_a_log_in_another_frame(fuselog: Fuselog) -> None:
     """Where the truth is turned, shifted and scaled, the aligned judgement is the same."""
     recording, run = record_run("landmarks", {"duration_s": 5.0}, 3)

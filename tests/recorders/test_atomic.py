@@ -119,8 +119,8 @@ KILLED = """
 @pytest.mark.unix
 @pytest.mark.parametrize(("name", "inside"), [("f.txt", "f.txt"), ("r", "r/a")])
 def test_killed_at_any_line_nothing_is_lost_and_the_next_one_clears(tmp_path, name, inside):
-    """SIGKILL before every third line: the place holds the old or the new, or gets it back."""
-    for moment in range(0, 200, 3):
+    """SIGKILL before every fifth line: the place holds the old or the new, or gets it back."""
+    for moment in range(0, 200, 5):
         folder = tmp_path / str(moment)
         (folder / inside).parent.mkdir(parents=True)
         (folder / inside).write_text("old")

@@ -8,7 +8,7 @@ from tests.faults import crafted, cuts, damaged_logs, flips
 
 
 @pytest.mark.paper
-@pytest.mark.parametrize(("campaign", "most"), [(flips, 30), (cuts, 30), (crafted, 12)], ids=str)
+@pytest.mark.parametrize(("campaign", "most"), [(flips, 30), (cuts, 30), (crafted, 8)], ids=str)
 def test_faults_hold(campaign, most):
     """Exactly the right numbers, a stated part of them, or one sentence."""
     tally = campaign.run(60.0, np.random.default_rng(0), most)

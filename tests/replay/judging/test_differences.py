@@ -13,8 +13,8 @@ CALLED = ("better", "worse", "higher", "lower")
 
 @pytest.fixture(scope="module")
 def alike() -> Candidate:
-    """An EKF over 300 runs: any 50 of them are as good as any others."""
-    logs = [fl.record("landmarks", seed=11, run=run, duration_s=5.0) for run in range(300)]
+    """An EKF over 200 runs: any 50 of them are as good as any others."""
+    logs = [fl.record("landmarks", seed=11, run=run, duration_s=4.0) for run in range(200)]
     return of_replay("alike", fl.replay(logs, ["ekf"]), 0.2).candidate("ekf", "ekf")
 
 
