@@ -83,13 +83,30 @@ def test_a_card_says_what_a_message_cost() -> None:
         {label: {"position_rmse_m": list(size + NOISE[0])} for size, label in enumerate("abc", start=1)},
         timings={
             "a": {"seconds": 0.02, "messages": 5000},
-            "b": {"seconds": 0.026, "messages": 5000},
+            "b": {"seconds": 0.013, "messages": 2500},
             "c": {"seconds": 0.0, "messages": 0},
         },
     )
     feet = {card.estimator: card.foot for card in told.cards}
-    beside = "5.2 µs a message; in all 1.3 times the time of a"
+    beside = "5.2 µs a message; in all 0.65 times the time of a, with 0.50 times its messages"
     assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
+
+
+def test_who_is_too_careful_in_every_run_is_not_honest_however_few_there_are() -> None:
+    """As the scatter over the runs says, where chance over the covariances would leave it open."""
+    told = _told(
+        {
+            "a": {"position_rmse_m": list(1.0 + NOISE[0]), "nees": list(3.0 + NOISE[1])},
+            "b": {"position_rmse_m": list(2.0 + NOISE[0]), "nees": list(2.5 + NOISE[2])},
+            "c": {"position_rmse_m": list(3.0 + NOISE[0]), "nees": list(2.5 + 20.0 * NOISE[2])},
+            "d": {"position_rmse_m": list(4.0 + NOISE[0]), "nis_per_component": list(0.6 + NOISE[1])},
+        },
+        {f"{label}.nees": HONEST for label in "abc"},
+    )
+    words = {card.estimator: card.chip for card in told.cards}
+    assert words["b"] == words["d"] == "Too careful"
+    assert words["c"] == "Honest, less accurate"
+    assert told.doubts == ["the covariances of b and d, which are too large"]
 
 
 @pytest.mark.parametrize(
@@ -265,7 +282,7 @@ def test_a_page_of_claims_alone_has_a_card() -> None:
     )
     [card] = opening(result, {}).story.cards
     assert (card.look, card.chip, card.value) == ("careful", "Not all confirmed", "1")
-    assert (card.unit, card.foot) == ("of 2 claims confirmed", ["1 not shown"])
+    assert (card.unit, card.foot) == ("of 2 claims confirmed", ["1 not shown beyond chance"])
 
 
 def test_of_a_study_nobody_is_taken_for_an_error_that_others_have_not() -> None:

@@ -132,6 +132,7 @@ def _with_claims(told: Story, result: Result) -> Story:
         look = ("careful", "○", "Not all confirmed")
     of_all = f"of {count(len(result.claims), 'claim')} confirmed"
     rest = [f"{counts[each]} {each}" for each in ("not shown", "not reproducible") if counts[each]]
+    rest = [each.replace("not shown", "not shown beyond chance") for each in rest]
     card = Card("claims", *look, str(counts["confirmed"]), of_all, notes=notes, foot=rest)
     cards = told.cards[: MOST_CARDS - 1]
     left_out = [each.estimator for each in told.cards[MOST_CARDS - 1 :]] + told.left_out
@@ -189,7 +190,8 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
     told = story(found)
     differ = rows[rows["verdict"].isin(["better", "worse", "higher", "lower"])]
-    unclear = [quantity(key).name for key in rows[rows["verdict"] == "unclear"]["quantity"].unique()]
+    open_rows = rows[rows["verdict"] == "unclear"]
+    unclear = [quantity(key).name for key in open_rows["quantity"].unique()]
     margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
     runs = count(found.runs, "run")
     if found.runs and rows["low"].isna().all():
@@ -205,8 +207,11 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
-    names = listed([name.removesuffix(", RMS") for name in unclear])
-    doubts = [f"who is better in {names}, which {runs} do not tell"] if unclear else []
+    doubts = []
+    for pair, of_pair in open_rows.groupby(["first", "second"], sort=False):
+        names = [quantity(key).name.removesuffix(", RMS") for key in of_pair["quantity"].unique()]
+        doubts.append(f"whether {' or '.join(map(str, pair))} is better in {listed(names)}")
+    doubts = [f"{'; '.join(doubts)}, which {runs} do not tell"] if doubts else []
     told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
     return Opening(tried, told, found, [*also, *notes], chart)
 

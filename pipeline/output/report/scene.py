@@ -96,8 +96,8 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
             path("truth outside", each.truth[of[is_out[of]]], "outside"),
         ]
         title = (
-            f"{label}: outside at {int(is_out[of].sum())} of {len(of)}, "
-            f"{100 * float(np.mean(is_out)):.0f} % of this run"
+            f"{label}: outside {int(is_out[of].sum())} of {len(of)} here, "
+            f"{100 * float(np.mean(is_out)):.0f} % in all"
         )
         drawn = [each for each in series if each.x]
         panels.append(Panel(x=x, y=y, series=drawn, title=title, plane=True))

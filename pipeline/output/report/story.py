@@ -351,18 +351,19 @@ def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
         one_s = seconds / messages
         beside = ""
         if each.estimator != take and best.get("seconds", 0.0) > 0.0:
-            beside = _beside(seconds / best["seconds"], take)
+            beside = _beside(seconds / best["seconds"], messages / best["messages"], take)
         foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} a message{beside}")
     if each.failed is not None:
         foot.append(f"{each.failed:,} of {count(each.runs, 'run')} failed")
     return foot
 
 
-def _beside(factor: float, take: str) -> str:
-    """How much time an estimator needs, beside the one to take."""
-    if CHEAPER <= factor <= 1.0 / CHEAPER:
-        return f"; in all as much time as {take}"
-    return f"; in all {number(factor, 2)} times the time of {take}"
+def _beside(factor: float, messages: float, take: str) -> str:
+    """How much time an estimator needs, beside the one to take, and of how many messages."""
+    is_alike = CHEAPER <= factor <= 1.0 / CHEAPER
+    told = f"as much time as {take}" if is_alike else f"{number(factor, 2)} times the time of {take}"
+    of = "" if abs(messages - 1.0) < 0.01 else f", with {number(messages, 2)} times its messages"
+    return f"; in all {told}{of}"
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:

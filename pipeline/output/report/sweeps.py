@@ -202,10 +202,12 @@ def _with_points(
             cards.append(_at_its_best(sweep, card, own, point, alike))
             doubts += _doubts(sweep, card.estimator, own, point, alike)
         else:
-            cards.append(replace(card, notes=["It is the same at all points.", *card.notes]))
-    first, *others = told.verdict or [""]
-    verdict = [*filter(None, [first]), *sentences, *others]
-    return replace(told, verdict=verdict, cards=cards, doubts=[*doubts, *told.doubts])
+            cards.append(replace(card, notes=["Its errors are the same at all points.", *card.notes]))
+    first, *further = told.verdict or [""]
+    verdict = [*filter(None, [first]), *sentences, *further]
+    at_best = ", where it errs least"
+    others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in told.doubts]
+    return replace(told, verdict=verdict, cards=cards, doubts=[*doubts, *others])
 
 
 def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
