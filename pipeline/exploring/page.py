@@ -206,6 +206,7 @@ class Page:
             self._show()
 
     def _reset(self) -> None:
+        self._tell()
         self._set({})
 
     def _tune(self) -> None:
@@ -304,6 +305,7 @@ class Page:
     def _replay(self) -> None:
         """Replay with the values as they are; what is newer by then is replayed instead."""
         values, session, active = dict(self.values), self.session, self._active
+        self._saved.text = ""  # it was of other values
 
         def work(is_newer: Callable[[], bool]) -> None:
             played: dict[int | str, Played] = {}

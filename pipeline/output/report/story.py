@@ -23,7 +23,7 @@ from pipeline.output.report.evidence import (
     relation,
 )
 from pipeline.output.report.gauge import Gauge, gauge, numbers_of
-from pipeline.output.words import MISSING, Scale, count, interval, listed, number, quantity, scale
+from pipeline.output.words import MISSING, Scale, alike, count, interval, listed, number, quantity, scale
 from replay.judging.diagnostics import LEAST_SHARE
 from replay.judging.errors.differences import FEWEST_RUNS
 
@@ -258,10 +258,11 @@ def _card(
     notes, stress = _notes(found, each, take, equal), found.stress.get(each.estimator)
     card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
-        about = quantity(found.main).name
+        about, value = quantity(found.main).name, own.text(each.error.value)
         if each.error.is_told:
-            about += f"; 95 % {interval(each.error.low, each.error.high, own)}"
-        card = replace(card, value=own.text(each.error.value), unit=own.sign, about=about)
+            value, low, high = alike(each.error, own)
+            about += f"; 95 % {low} to {high}"
+        card = replace(card, value=value, unit=own.sign, about=about)
     if each.decisive is not None:
         card = replace(
             card,
