@@ -11,7 +11,7 @@ from bokeh.layouts import column, row
 from bokeh.models import Div, Range1d, Select, Span
 from bokeh.models import Slider as SliderWidget
 
-from pipeline.exploring.curves import true_path
+from pipeline.exploring.curves import LINES, true_path
 from pipeline.exploring.markup import SIDE, label_of, numbers_html, verdict_html
 from pipeline.exploring.newest import NewestFirst
 from pipeline.exploring.plots import (
@@ -258,9 +258,8 @@ class Page:
 
     def _offer(self, text: Callable[[], str]) -> None:
         try:
-            self._saved.text = (
-                f'<pre style="white-space:pre-wrap;width:{SIDE - 20}px">{escape(text())}</pre>'
-            )
+            style = f"white-space:pre-wrap;width:{SIDE - 20}px"
+            self._saved.text = f'<pre style="{style}">{escape(text())}</pre>'
         except BadInput as error:
             self._tell(str(error))
 
@@ -379,6 +378,10 @@ class Page:
                 parts.append(numbers_html(played, self.played.get(PINNED), case))
             if played.seconds > SLOW_S:
                 parts.append(f"<p>One replay takes {played.seconds:.1f} s.</p>")
+        if case in self.played[0].cases and len(self.played[0].cases[case].time_s) > LINES:
+            parts.append(
+                "<p>So long a log is drawn by the least and the greatest value of each span.</p>"
+            )
         self._head.text = "".join(parts)
 
     def _chosen_case(self) -> str:

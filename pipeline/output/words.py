@@ -237,7 +237,7 @@ def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
 
 
 def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
-    """Numbers that stand together, with the decimals of the largest; each its own where sizes differ much.
+    """Numbers that stand together, with the decimals of the largest; of very unlike sizes each its own.
 
     >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
     (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])

@@ -233,7 +233,7 @@ def test_trackers_with_claims_are_told_whom_to_take_over_cases_that_are_cases() 
         "pmbm",
         "jpda",
         "GOSPA",
-        f"{MINUS}1 ({MINUS}1.50 to {MINUS}0.500) m",
+        f"{MINUS}1 ({MINUS}1.50 to {MINUS}0.50) m",
     ]
     assert len(table) == 2
 
