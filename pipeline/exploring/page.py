@@ -77,7 +77,7 @@ class Page:
         self._said = Div(name="said", sizing_mode="stretch_width")
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
-        time = Range1d(0.0, 1.0)  # of the estimates, once there are some
+        self._time = time = Range1d(0.0, 1.0)  # of the estimates, once there are some
         self.truths = [
             name
             for name, each in log.topics.items()
@@ -92,7 +92,6 @@ class Page:
             "nees": ratio_plot("nees", "NEES", time, self._cursor),
             "nis": ratio_plot("nis", "NIS per component, by second", time, self._cursor),
         }
-        self._time = time
         for name in ("error", "nees", "nis"):
             self.plots[name].figure.on_event(MouseMove, self._move_cursor)
         self._case_choice = Select(title="Of", name="case", width=SIDE // 2 - 10)
@@ -104,8 +103,7 @@ class Page:
         plane = row(figures["scene"], figures["lens"], sizing_mode="stretch_width", styles=WRAP)
         left = column(plane, figures["whiteness"], figures["likelihood"], sizing_mode="stretch_width")
         right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
-        for each in (left, right):
-            each.styles = {"flex": "1 1 330px"}
+        left.styles = right.styles = {"flex": "1 1 330px"}
         both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
         main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
         self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))

@@ -88,7 +88,7 @@ def test_a_card_says_what_a_message_cost() -> None:
         },
     )
     feet = {card.estimator: card.foot for card in told.cards}
-    beside = "5.2 µs a message; in all 1.3 times the time of a"
+    beside = "5.2 µs a message; a run takes 1.3 times as long as with a"
     assert feet == {"a": ["4 µs a message"], "b": [beside], "c": []}
 
 

@@ -14,7 +14,14 @@ import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, Series, curve
 from pipeline.output.claims import NO_VERDICT
-from pipeline.output.report.evidence import MARGIN, Findings, Timings, findings, runs_of
+from pipeline.output.report.evidence import (
+    Findings,
+    MARGIN,
+    MATERIAL,
+    Timings,
+    findings,
+    runs_of,
+)
 from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
 from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
@@ -131,7 +138,8 @@ def _with_claims(told: Story, result: Result) -> Story:
     elif counts["confirmed"] < len(result.claims):
         look = ("careful", "○", "Not all confirmed")
     of_all = f"of {count(len(result.claims), 'claim')} confirmed"
-    rest = [f"{counts[each]} {each}" for each in ("not shown", "not reproducible") if counts[each]]
+    why = {"not shown": " (may be chance)", "not reproducible": ""}
+    rest = [f"{counts[each]} {each}{words}" for each, words in why.items() if counts[each]]
     card = Card("claims", *look, str(counts["confirmed"]), of_all, notes=notes, foot=rest)
     cards = told.cards[: MOST_CARDS - 1]
     left_out = [each.estimator for each in told.cards[MOST_CARDS - 1 :]] + told.left_out
@@ -205,8 +213,13 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
-    names = listed([name.removesuffix(", RMS") for name in unclear])
-    doubts = [f"who is better in {names}, which {runs} do not tell"] if unclear else []
+    doubts = []
+    for (first, second), of in rows[rows["verdict"] == "unclear"].groupby(
+        ["first", "second"], sort=False
+    ):
+        keys = dict.fromkeys(map(str, of["quantity"]))
+        names = listed([quantity(key).name.removesuffix(", RMS") for key in keys])
+        doubts.append(f"who of {first} and {second} is better in {names}, which {runs} do not tell")
     told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
     return Opening(tried, told, found, [*also, *notes], chart)
 
@@ -221,6 +234,8 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
         aim = pd.to_numeric(row["aim"], errors="coerce")
         if row["quantity"] in ("nees", "position_nees") and math.isfinite(aim):
             bounds = chi_square_interval(int(aim), int(row["runs"]))
+        if row["quantity"] == "nis_per_component":  # of how many innovations is not kept
+            bounds = (1.0 - MATERIAL, 1.0 + MATERIAL)
         of = quantities.setdefault(str(row["case"]), {}).setdefault(str(row["quantity"]), {})
         for side in ("first", "second"):
             of.setdefault(str(row[side]), Measured(float(row[f"{side}_mean"]), bounds))

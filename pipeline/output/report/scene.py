@@ -97,8 +97,8 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
             path("truth outside", each.truth[of[is_out[of]]], "outside"),
         ]
         title = (
-            f"{label}: outside at {int(is_out[of].sum())} of {len(of)}, "
-            f"{100 * float(np.mean(is_out)):.0f} % of this run"
+            f"{label}: outside at {int(is_out[of].sum())} of {len(of)} dots, "
+            f"{100 * float(np.mean(is_out)):.0f} % over the run"
         )
         drawn = [each for each in series if each.x]
         panels.append(Panel(x=x, y=y, series=drawn, title=title, plane=True))
@@ -266,7 +266,7 @@ def tracked(
         if panels:
             of = f" of {case}" if case else ""
             which = f", the case of the median {of_what}," if len(errors) > 1 and case in errors else ""
-            dots = "; dots: detections" if len(shared) > 1 else ""
+            dots = f"; dots: detections, {MOST_FIXES} of them at most" if len(shared) > 1 else ""
             title = f"First run{of}{which} from above: tracks over the true ways, which are grey{dots}"
             return Chart(title=title, panels=panels, columns=len(panels), legend=False)
     return None

@@ -362,8 +362,8 @@ def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
 def _beside(factor: float, take: str) -> str:
     """How much time an estimator needs, beside the one to take."""
     if CHEAPER <= factor <= 1.0 / CHEAPER:
-        return f"; in all as much time as {take}"
-    return f"; in all {number(factor, 2)} times the time of {take}"
+        return f"; a run takes as long as with {take}"
+    return f"; a run takes {number(factor, 2)} times as long as with {take}"
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:
