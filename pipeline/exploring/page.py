@@ -11,7 +11,7 @@ from bokeh.layouts import column, row
 from bokeh.models import Div, Range1d, Select, Span
 from bokeh.models import Slider as SliderWidget
 
-from pipeline.exploring.curves import true_path
+from pipeline.exploring.curves import LINES, true_path
 from pipeline.exploring.markup import SIDE, label_of, numbers_html, verdict_html
 from pipeline.exploring.newest import NewestFirst
 from pipeline.exploring.plots import (
@@ -77,7 +77,7 @@ class Page:
         self._said = Div(name="said", sizing_mode="stretch_width")
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
-        time = Range1d(0.0, 1.0)  # of the estimates, once there are some
+        self._time = time = Range1d(0.0, 1.0)  # of the estimates, once there are some
         self.truths = [
             name
             for name, each in log.topics.items()
@@ -92,7 +92,6 @@ class Page:
             "nees": ratio_plot("nees", "NEES", time, self._cursor),
             "nis": ratio_plot("nis", "NIS per component, by second", time, self._cursor),
         }
-        self._time = time
         for name in ("error", "nees", "nis"):
             self.plots[name].figure.on_event(MouseMove, self._move_cursor)
         self._case_choice = Select(title="Of", name="case", width=SIDE // 2 - 10)
@@ -104,8 +103,7 @@ class Page:
         plane = row(figures["scene"], figures["lens"], sizing_mode="stretch_width", styles=WRAP)
         left = column(plane, figures["whiteness"], figures["likelihood"], sizing_mode="stretch_width")
         right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
-        for each in (left, right):
-            each.styles = {"flex": "1 1 330px"}
+        left.styles = right.styles = {"flex": "1 1 330px"}
         both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
         main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
         self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
@@ -206,6 +204,7 @@ class Page:
             self._show()
 
     def _reset(self) -> None:
+        self._tell()
         self._set({})
 
     def _tune(self) -> None:
@@ -257,9 +256,8 @@ class Page:
 
     def _offer(self, text: Callable[[], str]) -> None:
         try:
-            self._saved.text = (
-                f'<pre style="white-space:pre-wrap;width:{SIDE - 20}px">{escape(text())}</pre>'
-            )
+            style = f"white-space:pre-wrap;width:{SIDE - 20}px"
+            self._saved.text = f'<pre style="{style}">{escape(text())}</pre>'
         except BadInput as error:
             self._tell(str(error))
 
@@ -304,6 +302,7 @@ class Page:
     def _replay(self) -> None:
         """Replay with the values as they are; what is newer by then is replayed instead."""
         values, session, active = dict(self.values), self.session, self._active
+        self._saved.text = ""  # it was of other values
 
         def work(is_newer: Callable[[], bool]) -> None:
             played: dict[int | str, Played] = {}
@@ -377,6 +376,10 @@ class Page:
                 parts.append(numbers_html(played, self.played.get(PINNED), case))
             if played.seconds > SLOW_S:
                 parts.append(f"<p>One replay takes {played.seconds:.1f} s.</p>")
+        if case in self.played[0].cases and len(self.played[0].cases[case].time_s) > LINES:
+            parts.append(
+                "<p>So long a log is drawn by the least and the greatest value of each span.</p>"
+            )
         self._head.text = "".join(parts)
 
     def _chosen_case(self) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.exploring.curves import Case
 from pipeline.output.alarms import Alarm
+from pipeline.output.words import quantity
 
 Level = Literal["good", "doubtful", "failed"]
 
@@ -86,7 +87,7 @@ def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:
     if case.errors is not None and len(case.errors.nees):
         main = case.errors.main
         squared = case.errors.error[:, main.columns] ** 2
-        unit = {"position_rmse_m": "m", "orientation_rmse_deg": "deg"}.get(main.rmse, "")
+        unit = quantity(main.rmse).unit
         found["error, RMS"] = main.scale * math.sqrt(float(np.mean(squared.sum(axis=1)))), unit
         found[f"NEES, aim {len(case.errors.components)}"] = float(np.nanmean(case.errors.nees)), ""
     if not math.isnan(nis := mean_nis(case)):

@@ -2,10 +2,12 @@
 
 import math
 import re
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from typing import NamedTuple
 
 DIGITS = 3
+MOST_APART = 30.0  # numbers of which one is more times another have decimals of their own
 # As people write them, not as keyboards do.
 MISSING, MINUS, TIMES = "\u2013", "\u2212", "\u00d7"
 
@@ -123,15 +125,16 @@ def quantity(key: str) -> Quantity:
     return Quantity(stem.replace("_", " "), "", OTHER, unit)
 
 
-def label_of(key: str) -> str:
-    """A quantity as an axis has it, with the unit in which a result keeps it.
+def label_of(key: str, meaning: str = "") -> str:
+    """A quantity or a parameter as an axis has it, with the unit in which a result keeps it.
 
-    >>> label_of("position_rmse_m"), label_of("nees")
-    ('position error, RMS (m)', 'NEES')
+    >>> label_of("position_rmse_m"), label_of("sigma_range_m", "standard deviation of a range")
+    ('position error, RMS (m)', 'standard deviation of a range (m)')
     """
     words = quantity(key)
     sign = _UNITS.get(words.unit, words.unit)
-    return f"{words.name} ({sign})" if sign else words.name
+    name = meaning or words.name
+    return f"{name} ({sign})" if sign else name
 
 
 def is_error(key: str) -> bool:
@@ -205,7 +208,7 @@ def number(value: float | None, digits: int = DIGITS) -> str:
         return MISSING
     if value == 0.0:
         return "0"
-    exponent = math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    exponent = _exponent(value, digits)
     if not -4 <= exponent < 9:
         mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
         raised = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
@@ -218,6 +221,11 @@ def stated(value: float) -> str:
     return f"{value:.4g}".replace("-", MINUS) if 1e-4 <= abs(value) < 1e6 else number(value)
 
 
+def _exponent(value: float, digits: int) -> int:
+    """The power of ten of a number that is rounded to so many digits."""
+    return math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+
+
 def _bare(text: str) -> str:
     """Without zeros at the end that say nothing of a whole number."""
     return re.sub(r"\.0+$", "", text)
@@ -225,7 +233,26 @@ def _bare(text: str) -> str:
 
 def interval(low: float, high: float, own: Scale, digits: int = DIGITS) -> str:
     """Two ends in one unit, without the unit."""
-    return f"{own.text(low, digits)} to {own.text(high, digits)}"
+    return " to ".join(alike([low, high], own, digits))
+
+
+def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str]:
+    """Numbers that stand together, with the decimals of the largest; of very unlike sizes each its own.
+
+    >>> alike([24.0, 23.81, 24.14], Scale()), alike([0.004, 0.73], Scale())
+    (['24.0', '23.8', '24.1'], ['0.00400', '0.730'])
+    """
+    scaled = [value * own.factor for value in values]
+    sizes = [abs(each) for each in scaled if each]
+    if not all(map(math.isfinite, scaled)) or not sizes or max(sizes) > MOST_APART * min(sizes):
+        return [number(each, digits) for each in scaled]
+    exponent = _exponent(max(sizes), digits)
+    if not -4 <= exponent < 9:
+        return [number(each, digits) for each in scaled]
+    decimals = max(digits - 1 - exponent, 0)
+    texts = [f"{each:,.{decimals}f}".replace("-", MINUS) if each else "0" for each in scaled]
+    bare = [_bare(text) for text in texts]
+    return texts if any("." in text for text in bare) else bare
 
 
 def count(number_of: int, one: str, many: str = "") -> str:

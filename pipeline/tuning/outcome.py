@@ -20,6 +20,7 @@ from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.outputs import check_folder
 from pipeline.output.results import Outcome, result_folder, split_metric, write_outcome
 from pipeline.output.summary import summarise, summary_table
+from pipeline.output.words import label_of
 from pipeline.tuning.confidence import QUANTILE, Profile, SearchOutcome, doubts, profiles
 from pipeline.tuning.objective import Objective, innovations_in
 from replay.engine.streams.sources import LogSource, MemorySource
@@ -343,7 +344,6 @@ class Tuning:
         }
         if self._profiles:
             outcome.figures["profiles"] = self.profile_chart
-        meanings = next(iter(self.replay.done.meanings.values()), {})
         tuned = {str(name) for name in self.parameters.get("parameter", ())}
         settings = {
             "title": f"{self.label} tuned by {self.objective.by} over {_named(self.logs)}",
@@ -354,7 +354,7 @@ class Tuning:
             **setting_of(self.logs[0]),
             "notes": list(self.notes),
             "gap_limit_s": self.objective.gap_limit_s,
-            "meanings": {name: words for name, words in meanings.items() if name in tuned},
+            "meanings": {name: words for name, words in self._meanings.items() if name in tuned},
         }
         with result_folder(place) as part:
             for name, text in {SETTINGS: self.toml, **self.files}.items():
@@ -363,12 +363,19 @@ class Tuning:
             return ResultFolder(place, write_outcome(part, "tune", settings, outcome))
 
     @property
+    def _meanings(self) -> Mapping[str, str]:
+        """What the estimator's parameters are, in a few words."""
+        return next(iter(self.replay.done.meanings.values()), {})
+
+    @property
     def profile_chart(self) -> Chart:
         """Return the log-likelihood along each parameter, and where 95 % of it ends."""
         positive = {each.name: each.is_positive for each in self.found.coordinates.free}
         panels = [
             Panel(
-                x=Axis(label=each.name, log=positive[each.name]),
+                x=Axis(
+                    label=label_of(each.name, self._meanings.get(each.name, "")), log=positive[each.name]
+                ),
                 y=Axis(label="log-likelihood less its greatest"),
                 series=[
                     level("95 %", each.along, -0.5 * QUANTILE**2),

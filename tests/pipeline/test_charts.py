@@ -244,11 +244,14 @@ def test_a_profile_falls_from_the_maximum_along_its_parameter() -> None:
         for at, each in zip((1.0, -1.0), free, strict=True)
     ]
     tuned = SimpleNamespace(
-        found=SimpleNamespace(coordinates=SimpleNamespace(free=free)), _profiles=profiles
+        found=SimpleNamespace(coordinates=SimpleNamespace(free=free)),
+        _profiles=profiles,
+        _meanings={"sigma": "standard deviation"},
     )
     chart = Tuning.profile_chart.fget(tuned)
+    labels = {"sigma": "standard deviation", "bias": "bias"}
     wanted = {
-        f"log-likelihood less its greatest over {each.name}": {
+        f"log-likelihood less its greatest over {labels[each.name]}": {
             "log-likelihood": [each.along, -each.rise],
             "by curvature": [each.along, -each.parabola],
             "95 %": [each.along[[0, -1]], [-1.92073, -1.92073]],
@@ -338,7 +341,10 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
 
 
 def test_trackers_are_seen_from_above_over_the_true_ways(tmp_path) -> None:
-    """A panel for each in the order that is asked for, at one scale; a gap between any two tracks."""
+    """A panel for each in the order that is asked for, at one scale; a gap between any two tracks.
+
+    Of three cases it is the one of the median error; what a sensor detects is placed by its last fix.
+    """
     stamps, steps = np.arange(4) * 10**9, np.arange(4.0)
     state = np.stack([10.0 * steps, -steps], axis=1)
     truths = [
@@ -363,21 +369,49 @@ def test_trackers_are_seen_from_above_over_the_true_ways(tmp_path) -> None:
         )
         for name, off in (("near", 0.5), ("far", 2.5))
     ]
-    case, run = tmp_path / "clutter-10", RunMetadata("own", epoch_ns=0)
-    for folder, streams in (("logs", truths), ("estimates", made)):
-        (case / folder).mkdir(parents=True)
-        write_log(case / folder / "run-0000.mcap", streams, run)
-    chart = tracked(tmp_path, ["far", "absent", "near"])
+    scanned = [
+        make_stream(
+            "/radar/scan",
+            schemas.SCAN,
+            stamps[1:3],
+            metadata={"origin": "/ship/fix"},
+            scan_id=np.array([5, 4]),
+            detections=np.array([1, 1]),
+        ),
+        make_stream(
+            "/radar/detection",
+            schemas.DETECTION,
+            stamps[1:3],
+            scan_id=np.array([4, 5]),
+            position_m=np.array([[1.0, 2.0], [3.0, 4.0]]),
+        ),
+        make_stream(
+            "/ship/fix",
+            schemas.POSITION_FIX,
+            stamps[[0, 2]],
+            position_m=np.array([[10.0, 0.0], [20.0, 0.0]]),
+            covariance_m2=np.ones((2, 2)),
+        ),
+    ]
+    run = RunMetadata("own", epoch_ns=0)
+    for name in ("clutter-10", "clutter-50", "clutter-90"):
+        for folder, streams in (("logs", [*truths, *scanned]), ("estimates", made)):
+            (tmp_path / name / folder).mkdir(parents=True)
+            write_log(tmp_path / name / folder / "run-0000.mcap", streams, run)
+    errors = {"clutter-10": 3.0, "clutter-50": 2.0, "clutter-90": 1.0, "not-kept": 2.5}
+    chart = tracked(tmp_path, ["far", "absent", "near"], errors, "GOSPA of far")
     assert chart is not None
-    assert chart.title.startswith("First run of clutter-10 from above")
+    assert chart.title.startswith("First run of clutter-50, the case of the median GOSPA of far,")
     assert [panel.title for panel in chart.panels] == ["far", "near"]
     assert len({str(panel.x.limits) for panel in chart.panels}) == 1
-    truth, far = chart.panels[0].series
+    detections, truth, far = chart.panels[0].series
+    assert detections.x == [21.0, 13.0]  # of the later scan first, when the ship was at 20 m
+    assert detections.y == [2.0, 4.0]
     assert truth.reference
     assert truth.x == [0.0, 10.0, 20.0, 30.0, None, 5.0, 15.0, 25.0, 35.0, None]
     assert far.x == [12.5, 32.5, None, 2.5, 22.5, None]  # track 3, then track 7
     assert far.y == [1.5, -0.5, None, 2.5, 0.5, None]
-    assert tracked(tmp_path, ["absent"]) is None
+    assert tracked(tmp_path, ["absent"], {}, "") is None
 
 
 def test_a_figure_has_what_its_chart_says() -> None:

@@ -366,6 +366,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
         page.get_by_text("Reset", exact=True).click()
         page.wait_for_selector("text=Nothing speaks against it.")
         page.wait_for_selector("text=pinned")
+        assert page.get_by_text("--set sigma_range_m").count() == 0  # a command of other values is gone
         page.get_by_text("Timeline", exact=True).click()
         assert is_viewed.wait(30.0)
         title = "() => Bokeh.documents[0].get_model_by_name('lens').title.text"

@@ -130,8 +130,7 @@ def _masked(text: str) -> str:
         text,
     )
     text = re.sub(r"\d[\d.,]* [mµ]?s a message", "TIME a message", text)
-    more = r"; in all (\d[\d.,]* times the|as much) time"
-    text = re.sub(rf"{more} (as|of)", "; in all RATIO times the time of", text)
+    text = re.sub(r"a run takes (\d[\d.,]* times )?as long", "a run takes RATIO times as long", text)
     text = re.sub(r"(fuselog \S+, input )[0-9a-f]+", r"\1SHA-256", text)
     return text.replace(str(ROOT), "ROOT").replace(f"fuselog {version('fuselog')}", "fuselog VERSION")
 

@@ -24,7 +24,7 @@ from markupsafe import Markup, escape
 from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
 from pipeline.output.report.colours import text_colours
-from pipeline.output.report.evidence import Timings
+from pipeline.output.report.evidence import Findings, Timings
 from pipeline.output.report.first_run import first_run, picture_of_timeline
 from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
@@ -194,7 +194,7 @@ def _section(folder: Path, result: Result, name: str, *, viewer: bool) -> Sectio
     labels = list(dict.fromkeys(map(str, labels)))
     looks = [_chart("", begun.chart)] if begun.chart else []
     order = [card.estimator for card in begun.story.cards] or labels
-    looks += _first_run(folder, order, viewer=viewer)
+    looks += _first_run(folder, order, begun.found, viewer=viewer)
     looks += [each for name in SCENES for each in figures if each.name == name]
     figures = [each for each in figures if each.name not in SCENES]
     if "sweep" in result.settings or not looks or looks[-1].name == "tracks":
@@ -278,17 +278,29 @@ def _chart(name: str, chart: Chart) -> Shown:
     return Shown(name, chart.title or re.sub("[-_]", " ", name), what, chart)
 
 
-def _first_run(folder: Path, order: Sequence[str], *, viewer: bool) -> list[Shown]:
+def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: bool) -> list[Shown]:
     """The first run in space: as the viewer shows it, or from above where it has paths, and a lens."""
     if viewer:
         address = _address("webp", picture_of_timeline(folder / "timeline.rrd"))
         return [Shown("", "first run, in the viewer", "The first run in the viewer", picture=address)]
     run = first_run(folder)
     if run is None:
-        tracks = tracked(folder, order)
+        first = next((label for label in order if label in found.compared), "")
+        of_what = f"{quantity(found.main).name} of {first}"
+        tracks = tracked(folder, order, _errors_by_case(found, first), of_what)
         return [_chart("tracks", tracks)] if tracks else []
     near = lens(run, order)
     return [_chart("scene", plan(run)), *([_chart("lens", near)] if near else [])]
+
+
+def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
+    """What an estimator errs in each case."""
+    told = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
+    return {
+        case: float(each.value)
+        for case, each in told.items()
+        if each and isinstance(each.value, int | float)
+    }
 
 
 def _address(kind: str, image: bytes) -> str:

@@ -17,7 +17,6 @@ from pipeline.output.alarms import Stressing
 from pipeline.output.results import Measured, MetricTable, Result, metric_tables, split_metric
 from pipeline.output.words import is_error
 from replay.judging.errors.differences import (
-    FEWEST_RUNS,
     Difference,
     Target,
     mean_interval,
@@ -31,7 +30,6 @@ Timings = Mapping[str, Mapping[str, float]]  # by estimator: its seconds, and th
 PREFERRED = ("position_rmse_m", "orientation_rmse_deg", "gospa_m")
 # A mean of squares may be off by this share: nobody would act on less, however many runs show it.
 MATERIAL = 0.1
-_LITTLE = (1.0 - MATERIAL, 1.0 + MATERIAL)
 FAR = 1.25  # times larger than claimed: errors of that are no matter of a few percent
 MARGIN = 0.02  # as `fuselog compare` has it
 
@@ -272,12 +270,12 @@ class Findings:
         return self._consistency(label, "nis_per_component", "NIS")
 
     def _consistency(self, label: str, key: str, name: str) -> Consistency | None:
-        """The mean over the cases, judged by the interval of one of them, NIS by its runs alone too."""
-        each_run = self.by_run(label, key).to_numpy(dtype=float)
-        of_runs = _LITTLE if name == "NIS" and len(each_run) >= FEWEST_RUNS else None
-        of_cases = filter(None, (table.quantities.get(key, {}).get(label) for table in self.tables))
-        bounded = (each._replace(bounds=each.bounds or of_runs) for each in of_cases)
-        measured = [each for each in bounded if each.place]
+        """The mean over the cases, judged by the interval of one of them; None without any."""
+        measured = [
+            each
+            for table in self.tables
+            if (each := table.quantities.get(key, {}).get(label)) and each.bounds and each.place
+        ]
         if not measured:
             return None
         values = [float(each.value) for each in measured if isinstance(each.value, int | float)]
@@ -285,6 +283,7 @@ class Findings:
             (each.bounds for each in measured if each.bounds), key=lambda ends: ends[1] - ends[0]
         )
         aim = 1.0 if name == "NIS" else self._size(honest)
+        each_run = self.by_run(label, key).to_numpy(dtype=float)
         return Consistency(name, Spread(float(np.mean(values)), *mean_interval(each_run)), aim, honest)
 
     def _size(self, honest: tuple[float, float]) -> float:

@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from pipeline.output.report.evidence import MATERIAL, Consistency
-from pipeline.output.words import Scale, interval, number
+from pipeline.output.words import Scale, alike, interval, number
 
 # It goes from a third of the aim to ten times the aim, evenly in the logarithm.
 GAUGE_ENDS = (1 / 3, 10.0)
@@ -32,8 +32,10 @@ class Gauge(NamedTuple):
 def numbers_of(by: Consistency) -> str:
     """The mean of squares with its interval, and what is right."""
     name = "NIS per component" if by.name == "NIS" else by.name
-    told = f", 95 % {interval(by.found.low, by.found.high, Scale())}" if by.found.is_told else ""
-    return f"{name} {number(by.found.value)}{told}; {number(by.aim)} is right"
+    if not by.found.is_told:
+        return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
+    found, low, high = alike(by.found, Scale())
+    return f"{name} {found}, 95 % {low} to {high}; {number(by.aim)} is right"
 
 
 def gauge(by: Consistency) -> Gauge:

@@ -14,7 +14,14 @@ import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, Series, curve
 from pipeline.output.claims import NO_VERDICT
-from pipeline.output.report.evidence import MARGIN, Findings, Timings, findings, runs_of
+from pipeline.output.report.evidence import (
+    MARGIN,
+    MATERIAL,
+    Findings,
+    Timings,
+    findings,
+    runs_of,
+)
 from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
 from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
@@ -131,8 +138,8 @@ def _with_claims(told: Story, result: Result) -> Story:
     elif counts["confirmed"] < len(result.claims):
         look = ("careful", "○", "Not all confirmed")
     of_all = f"of {count(len(result.claims), 'claim')} confirmed"
-    rest = [f"{counts[each]} {each}" for each in ("not shown", "not reproducible") if counts[each]]
-    rest = [each.replace("not shown", "not shown beyond chance") for each in rest]
+    rest = [f"{counts['not shown']} not shown (may be chance)"] if counts["not shown"] else []
+    rest += [f"{counts['not reproducible']} not reproducible"] if counts["not reproducible"] else []
     card = Card("claims", *look, str(counts["confirmed"]), of_all, notes=notes, foot=rest)
     cards = told.cards[: MOST_CARDS - 1]
     left_out = [each.estimator for each in told.cards[MOST_CARDS - 1 :]] + told.left_out
@@ -190,15 +197,14 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
     told = story(found)
     differ = rows[rows["verdict"].isin(["better", "worse", "higher", "lower"])]
-    open_rows = rows[rows["verdict"] == "unclear"]
-    unclear = [quantity(key).name for key in open_rows["quantity"].unique()]
+    unclear = rows[rows["verdict"] == "unclear"]
     margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
     runs = count(found.runs, "run")
     if found.runs and rows["low"].isna().all():
         summary = f"{runs} give no interval: whether the differences are chance is open."
     elif differ.empty:
         summary = f"Over {runs} none of {len(rows)} metrics differs by more than chance and {margin}"
-        summary += f"; in {len(unclear)} they do not decide." if unclear else "."
+        summary += f"; in {unclear['quantity'].nunique()} they do not decide." if len(unclear) else "."
     else:
         summary = (
             f"Over {runs} {len(differ)} of {len(rows)} metrics differ by more than chance and {margin}."
@@ -208,10 +214,10 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     notes = [str(each) for each in result.settings.get("notes", [])]
     chart = _forest(rows, float(result.settings.get("margin", MARGIN)))
     doubts = []
-    for pair, of_pair in open_rows.groupby(["first", "second"], sort=False):
-        names = [quantity(key).name.removesuffix(", RMS") for key in of_pair["quantity"].unique()]
-        doubts.append(f"whether {' or '.join(map(str, pair))} is better in {listed(names)}")
-    doubts = [f"{'; '.join(doubts)}, which {runs} do not tell"] if doubts else []
+    for (first, second), of in unclear.groupby(["first", "second"], sort=False):
+        keys = dict.fromkeys(map(str, of["quantity"]))
+        names = listed([quantity(key).name.removesuffix(", RMS") for key in keys])
+        doubts.append(f"whether {first} or {second} is better in {names}, which {runs} do not tell")
     told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
     return Opening(tried, told, found, [*also, *notes], chart)
 
@@ -226,6 +232,8 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
         aim = pd.to_numeric(row["aim"], errors="coerce")
         if row["quantity"] in ("nees", "position_nees") and math.isfinite(aim):
             bounds = chi_square_interval(int(aim), int(row["runs"]))
+        if row["quantity"] == "nis_per_component":  # of how many innovations is not kept
+            bounds = (1.0 - MATERIAL, 1.0 + MATERIAL)
         of = quantities.setdefault(str(row["case"]), {}).setdefault(str(row["quantity"]), {})
         for side in ("first", "second"):
             of.setdefault(str(row[side]), Measured(float(row[f"{side}_mean"]), bounds))

@@ -120,16 +120,17 @@ function layoutOf(place) {
   const titles = chart.panels.map((panel) => fitted(panel.title, panelWidth));
   const second = titles.some((title) => title.includes("\n")) ? 16 : 0; // line of a title
   const foot = (chart.legend ? 90 : 66) + second;
-  const height = rows * (row + second) + foot;
-  const inner = height - 67 - second;
+  const deep = chart.panels.some((panel) => fitted(panel.x.label, panelWidth - namesWidth(panel)).includes("\n")) ? 16 : 0; // of a label
+  const height = rows * (row + second + deep) + foot;
+  const inner = height - 67 - second - deep;
   const layout = {
     height, autosize: true, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { color: text, size: 12, family: style.fontFamily },
-    margin: { l: 60, r: 10, t: 22 + second, b: 45 }, hovermode: "closest", showlegend: chart.legend, dragmode: "zoom",
-    hoverlabel: { font: { family: style.fontFamily } }, legend: { orientation: "h", y: -45 / inner, yanchor: "top", x: 0 },
+    margin: { l: 60, r: 10, t: 22 + second, b: 45 + deep }, hovermode: "closest", showlegend: chart.legend, dragmode: "zoom",
+    hoverlabel: { font: { family: style.fontFamily } }, legend: { orientation: "h", y: -(45 + deep) / inner, yanchor: "top", x: 0 },
     annotations: [],
   };
-  const gap = { x: 0, y: (62 + second) / inner };
+  const gap = { x: 0, y: (62 + second + deep) / inner };
   const panelHeight = inner * (1 - gap.y * (rows - 1)) / rows;
   // between columns ticks and an axis label have room, of two lines where it is longer than its axis
   const isLong = chart.panels.some((panel) => fitted(panel.y.label, panelHeight).includes("\n"));

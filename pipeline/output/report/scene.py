@@ -1,6 +1,6 @@
 """Draws the first run from above, a lens on a second that is typical of it, and NIS over time."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from pipeline.output.words import count
 from recorders.log import open_log, read_streams, schemas
 from replay.distributions import chi2
 from replay.engine.streams.sources import LogSource
+from replay.estimators.tracking.scans import ORIGIN, detected_places
 from replay.judging.errors.evaluation import chi_square_interval, split_topic
 
 Floats = NDArray[np.float64]
@@ -96,8 +97,8 @@ def lens(run: FirstRun, labels: Sequence[str]) -> Chart | None:
             path("truth outside", each.truth[of[is_out[of]]], "outside"),
         ]
         title = (
-            f"{label}: outside {int(is_out[of].sum())} of {len(of)} here, "
-            f"{100 * float(np.mean(is_out)):.0f} % in all"
+            f"{label}: outside at {int(is_out[of].sum())} of {len(of)} dots, "
+            f"{100 * float(np.mean(is_out)):.0f} % over the run"
         )
         drawn = [each for each in series if each.x]
         panels.append(Panel(x=x, y=y, series=drawn, title=title, plane=True))
@@ -230,16 +231,23 @@ def _cloud_of(run: FirstRun, topic: str) -> list[Series]:
     return [path(f"{estimator}, particles", np.concatenate(points), "dots")] if points else []
 
 
-def tracked(folder: Path, labels: Sequence[str]) -> Chart | None:
+def tracked(
+    folder: Path, labels: Sequence[str], errors: Mapping[str, float], of_what: str
+) -> Chart | None:
     """The first run of trackers from above: tracks over the true ways, a panel for each of the first.
 
-    None where no run has both. Raises BadInput where a log is damaged.
+    Of several cases it is that of the median error. None where no run has both ways and tracks. Raises
+    BadInput where a log is damaged.
+
+    Args:
+        folder: the result's.
+        labels: of the trackers, in their order.
+        errors: of one of them by case.
+        of_what: what these are errors in, and of which tracker.
     """
-    for log in sorted(folder.rglob("logs/run-0000.mcap")):
-        estimates = log.parent.parent / "estimates" / log.name
-        if not estimates.is_file():
-            continue
-        source, output = LogSource(open_log(log)), LogSource(open_log(estimates))
+    for case, log in _median_first(folder, errors).items():
+        source = LogSource(open_log(log))
+        output = LogSource(open_log(log.parent.parent / "estimates" / log.name))
         ways = _ways(source)
         if not ways:
             continue
@@ -248,20 +256,49 @@ def tracked(folder: Path, labels: Sequence[str]) -> Chart | None:
             Axis(label=label, limits=(low - SMALL * (high - low), high + SMALL * (high - low)))
             for label, (low, high) in zip(("x (m)", "y (m)"), ends, strict=True)
         )
-        truth = path("truth", _parted(ways), reference=True)
-        panels = []
-        for label in labels:
-            found = _tracks(output, label)
-            if found:
-                series = [truth, path(label, _parted(found))]
-                panels.append(Panel(x=x, y=y, series=series, title=label, plane=True))
+        shared = [*_detections(source), path("truth", _parted(ways), reference=True)]
+        found = {label: _tracks(output, label) for label in labels}
+        panels = [
+            Panel(x=x, y=y, series=[*shared, path(label, _parted(tracks))], title=label, plane=True)
+            for label, tracks in found.items()
+            if tracks
+        ][:MOST_LENSES]
         if panels:
-            case = log.parent.parent.relative_to(folder)
-            of = f" of {case}" if case.parts else ""
-            title = f"First run{of} from above: tracks over the true ways, which are grey"
-            shown = panels[:MOST_LENSES]
-            return Chart(title=title, panels=shown, columns=len(shown), legend=False)
+            of = f" of {case}" if case else ""
+            which = f", the case of the median {of_what}," if len(errors) > 1 and case in errors else ""
+            dots = f"; dots: detections, {MOST_FIXES} of them at most" if len(shared) > 1 else ""
+            title = f"First run{of}{which} from above: tracks over the true ways, which are grey{dots}"
+            return Chart(title=title, panels=panels, columns=len(panels), legend=False)
     return None
+
+
+def _median_first(folder: Path, errors: Mapping[str, float]) -> dict[str, Path]:
+    """The first log of each case that has estimates: first that of the median error, then by name."""
+    logs = {
+        "/".join(log.parent.parent.relative_to(folder).parts): log
+        for log in sorted(folder.rglob("logs/run-0000.mcap"))
+        if (log.parent.parent / "estimates" / log.name).is_file()
+    }
+    by_error = sorted((case for case in logs if case in errors), key=errors.__getitem__)
+    middle = (len(by_error) - 1) // 2  # of two the one with less
+    return {case: logs[case] for case in dict.fromkeys([*by_error[middle : middle + 1], *logs])}
+
+
+def _detections(source: LogSource) -> list[Series]:
+    """What the sensors of a log detected, as a series of dots; bearings have no place."""
+    found = []
+    for topic, each in source.topics.items():
+        name = f"{topic.rpartition('/')[0]}/detection"
+        if each.schema_name != schemas.SCAN.full_name or name not in source.topics:
+            continue
+        scan, detected = (source.read([one])[one] for one in (topic, name))
+        origin = scan.metadata.get(ORIGIN, "")
+        fix = source.read([origin])[origin] if origin in source.topics else None
+        found.append(detected_places(scan, detected, fix))
+    if not found:
+        return []
+    points = np.concatenate(found)
+    return [path("detections", points[:: max(1, -(-len(points) // MOST_FIXES))], "dots", reference=True)]
 
 
 def _ways(source: LogSource) -> list[Floats]:

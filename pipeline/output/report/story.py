@@ -23,7 +23,7 @@ from pipeline.output.report.evidence import (
     relation,
 )
 from pipeline.output.report.gauge import Gauge, gauge, numbers_of
-from pipeline.output.words import MISSING, Scale, count, interval, listed, number, quantity, scale
+from pipeline.output.words import MISSING, Scale, alike, count, interval, listed, number, quantity, scale
 from replay.judging.diagnostics import LEAST_SHARE
 from replay.judging.errors.differences import FEWEST_RUNS
 
@@ -258,10 +258,11 @@ def _card(
     notes, stress = _notes(found, each, take, equal), found.stress.get(each.estimator)
     card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
-        about = quantity(found.main).name
+        about, value = quantity(found.main).name, own.text(each.error.value)
         if each.error.is_told:
-            about += f"; 95 % {interval(each.error.low, each.error.high, own)}"
-        card = replace(card, value=own.text(each.error.value), unit=own.sign, about=about)
+            value, low, high = alike(each.error, own)
+            about += f"; 95 % {low} to {high}"
+        card = replace(card, value=value, unit=own.sign, about=about)
     if each.decisive is not None:
         card = replace(
             card,
@@ -351,19 +352,18 @@ def _foot(each: Evidence, take: str, timings: Timings) -> list[str]:
         one_s = seconds / messages
         beside = ""
         if each.estimator != take and best.get("seconds", 0.0) > 0.0:
-            beside = _beside(seconds / best["seconds"], messages / best["messages"], take)
+            beside = _beside(seconds / best["seconds"], take)
         foot.append(f"{scale('s', one_s).with_unit(one_s, 2)} a message{beside}")
     if each.failed is not None:
         foot.append(f"{each.failed:,} of {count(each.runs, 'run')} failed")
     return foot
 
 
-def _beside(factor: float, messages: float, take: str) -> str:
-    """How much time an estimator needs, beside the one to take, and of how many messages."""
-    is_alike = CHEAPER <= factor <= 1.0 / CHEAPER
-    told = f"as much time as {take}" if is_alike else f"{number(factor, 2)} times the time of {take}"
-    of = "" if abs(messages - 1.0) < 0.01 else f", with {number(messages, 2)} times its messages"
-    return f"; in all {told}{of}"
+def _beside(factor: float, take: str) -> str:
+    """How much time an estimator needs, beside the one to take."""
+    if CHEAPER <= factor <= 1.0 / CHEAPER:
+        return f"; a run takes as long as with {take}"
+    return f"; a run takes {number(factor, 2)} times as long as with {take}"
 
 
 def _pairs(found: Findings, take: str, labels: list[str], own: Scale) -> tuple[list[str], list[str]]:

@@ -145,3 +145,23 @@ def latest_fixes(fixes: Ragged, known: Sequence[Fix | None]) -> list[Fix | None]
             if before is None or time_ns >= before.time_ns:
                 latest[run] = Fix(time_ns, places[row])
     return latest
+
+
+def rows_of(scan: Stream, detected: Stream) -> Integers:
+    """The row of each detection's scan."""
+    order = np.argsort(scan["scan_id"], kind="stable")
+    return order[np.searchsorted(scan["scan_id"][order], detected["scan_id"])]
+
+
+def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
+    """Where a sensor is at its scans, (n, 2): at its last fix, or at zero where it has none."""
+    if fix is None:
+        return np.zeros((len(scan), 2))
+    last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
+    return read_vectors(fix, "position_m", PLANE)[np.maximum(last, 0)]
+
+
+def detected_places(scan: Stream, detected: Stream, fix: Stream | None) -> Floats:
+    """Where the detections are in the plane, (n, 2)."""
+    own = places_of_sensor(scan, fix)[rows_of(scan, detected)]
+    return own + read_vectors(detected, "position_m", PLANE)

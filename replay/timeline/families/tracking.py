@@ -22,7 +22,7 @@ from recorders.errors import BadInput
 from recorders.log import Stream, schemas
 from replay.engine.arrays import Integers
 from replay.engine.streams.measurements import PLANE, covariances_of, read_vectors
-from replay.estimators.tracking.scans import ORIGIN
+from replay.estimators.tracking.scans import ORIGIN, places_of_sensor, rows_of
 from replay.judging.errors.evaluation import Floats
 from replay.judging.tracks.errors import NONE, TrackErrors, instants_of, track_errors, tracks_at
 from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Canvas, Colour, Scene, Timeline
@@ -109,14 +109,14 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
         colours[prefix.removeprefix("/").replace("_", " ")] = colour
         if f"{prefix}/detection" in scene.source.topics:
             seen = scene.read(f"{prefix}/detection")
-            place = own[_scan_of(scan, seen)] + read_vectors(seen, "position_m", PLANE)
-            order = np.argsort(_scan_of(scan, seen), kind="stable")
+            place = own[rows_of(scan, seen)] + read_vectors(seen, "position_m", PLANE)
+            order = np.argsort(rows_of(scan, seen), kind="stable")
             columns = rr.Points2D.columns(positions=place[order]).partition(scan["detections"])
             canvas.send(entity, scan.publish_time_ns, columns)
             canvas.fix(entity, rr.Points2D.from_fields(**Stroke(colour, 1.5).fields(widen=2.0)))
         elif f"{prefix}/bearing" in scene.source.topics:
             seen = scene.read(f"{prefix}/bearing")
-            begin, bearing = own[_scan_of(scan, seen)], seen["bearing_rad"]
+            begin, bearing = own[rows_of(scan, seen)], seen["bearing_rad"]
             away = RAY_M * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
             faint = np.tile(np.array([*colour, 90], np.uint8), (len(seen), 1))
             lines = np.stack([begin, begin + away], axis=1)
@@ -124,20 +124,10 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
     return colours
 
 
-def _scan_of(scan: Stream, seen: Stream) -> np.ndarray:
-    """The row of each detection's scan."""
-    order = np.argsort(scan["scan_id"], kind="stable")
-    return order[np.searchsorted(scan["scan_id"][order], seen["scan_id"])]
-
-
 def _own_places(scene: Scene, scan: Stream) -> Floats:
     """Where the sensor is at its scans, (n, 2)."""
     topic = scan.metadata.get(ORIGIN, "")
-    if topic not in scene.source.topics:
-        return np.zeros((len(scan), 2))
-    fix = scene.read(topic)
-    last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
-    return read_vectors(fix, "position_m", PLANE)[np.maximum(last, 0)]
+    return places_of_sensor(scan, scene.read(topic) if topic in scene.source.topics else None)
 
 
 def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
@@ -169,7 +159,7 @@ def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) 
             scan = scene.read(f"/{sensor}/scan")
             seen = _joined(scan, scene.read(f"/{sensor}/detection"))
             first = np.searchsorted(seen.scan, np.arange(len(scan)))
-            row = _scan_of(scan, own)
+            row = rows_of(scan, own)
             end = _own_places(scene, scan)[row] + seen.place[first[row] + own["detection"]]
             begin, is_there = _places_of(tracks, own)
             colours = np.empty((len(own), 4), np.uint8)
@@ -193,7 +183,7 @@ def _joined(scan: Stream, seen: Stream) -> Joined:
     How near is stated on the channel of the scans; see
     `replay.inference.association.scanning.join_near`.
     """
-    row, place = _scan_of(scan, seen), read_vectors(seen, "position_m", PLANE)
+    row, place = rows_of(scan, seen), read_vectors(seen, "position_m", PLANE)
     order = np.argsort(row, kind="stable")
     row, place = row[order], place[order]
     within = float(scan.metadata.get("joined_within_m", 0.0))
