@@ -82,11 +82,11 @@ def run_named(
 
         result = keep(done.folder, result, causes=likeliest_causes(done.folder, result))
     if stress:
-        from pipeline.stressing.experiments import stress_result
+        from pipeline.stressing.experiments import claims_under_stress, stress_result
 
-        result = keep(
-            done.folder, result, stress=stress_result(result, workers=workers, progress=progress)
-        )
+        found = stress_result(result, workers=workers, scheduler=scheduler, progress=progress)
+        claims = claims_under_stress(stated.with_settings(values, {}), result, found)
+        result = keep(done.folder, result, stress=found, claims=claims)
     if as_json:
         print_json(result.model_dump(mode="json"))
         return

@@ -2,22 +2,25 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.altering.sources import alter
 from pipeline.output.alarms import Stressing
+from pipeline.output.claims import Claim, decide
 from pipeline.output.results import Result
 from pipeline.runs.ensemble import Progress, no_progress
 from pipeline.runs.executors import WorkerPool, pool_for
-from pipeline.runs.experiment import Experiment, Setting
+from pipeline.runs.experiment import Experiment, Setting, Study, numbers_of
 from pipeline.runs.initial_states import order_of
 from pipeline.runs.runner import Runner
 from pipeline.stressing.stressing import TOGETHER, How, stress_runs
 from pipeline.stressing.sums import StressSums
 from recorders.errors import BadInput
 from recorders.parameters import build
+from recorders.registry import load
 from replay.foreign.naming import allowed
 
 
@@ -50,13 +53,18 @@ class _Part(NamedTuple):
 
 
 def stress_result(
-    result: Result, *, workers: int | None = 1, progress: Progress = no_progress
+    result: Result,
+    *,
+    workers: int | None = 1,
+    scheduler: str | None = None,
+    progress: Progress = no_progress,
 ) -> list[Stressing]:
     """Stress the estimators of an experiment over all of its runs, as it was run in this process.
 
     Args:
         result: what the run left.
         workers: processes that share the runs; None stands for all cores where that pays.
+        scheduler: of Dask, whose workers share them.
         progress: is told how it goes.
 
     Raises BadInput where the experiment has no estimators or no runs of its own.
@@ -73,7 +81,42 @@ def stress_result(
         _Part(experiment, Path(data) if data else None, first, min(first + TOGETHER, runs))
         for first in range(0, runs, TOGETHER)
     ]
-    return [each.told for each in _merged(parts, workers, progress).values()]
+    pool_of_parts = pool_for(workers, scheduler, parts[-1].end)
+    with pool_of_parts() as pool:
+        if pool.sees is not None and not pool.sees([*experiment.files, *filter(None, [parts[0].data])]):
+            raise BadInput(
+                f"--stress --scheduler {scheduler}: its workers do not see the files that are replayed; "
+                "put them where all see them, or leave out --scheduler"
+            )
+        return [each.told for each in _merged(parts, pool, progress).values()]
+
+
+def claims_under_stress(
+    experiment: Experiment, result: Result, stress: Sequence[Stressing]
+) -> list[Claim]:
+    """The claims of a result: those that stress may carry across their limit are not shown.
+
+    They are decided again with each metric's interval, or its value, wider on both sides by the largest
+    change that stress makes to it. Verdicts on metrics that are not of single estimators stay.
+    """
+    moved = {f"{each.estimator}.{key}": by for each in stress for key, by in each.moved.items()}
+    intervals = dict[str, Sequence[float | None]](result.intervals)
+    for key in moved.keys() & result.metrics.keys():
+        value = result.metrics[key]
+        low, high = intervals.get(key, (value, value))
+        if isinstance(low, float) and isinstance(high, float):
+            intervals[key] = low - moved[key], high + moved[key]
+    study: Study = load("studies", experiment.study, Study)
+    options = build(study.options, experiment.options, f"options of study {experiment.study}")
+    again = decide(experiment.claims, result.metrics, intervals, numbers_of(experiment, options))
+    first = len(result.claims) - len(again)  # those that the study decides itself come before
+    claims = list(result.claims)
+    for place, found in enumerate(again, first):
+        own = claims[place]
+        if own.verdict in ("confirmed", "refuted") and found.verdict != own.verdict:
+            why = "; ".join(filter(None, [own.why, "changes that should not matter may reverse it"]))
+            claims[place] = replace(own, verdict="not shown", why=why)
+    return claims
 
 
 def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[str, StressSums]]:
@@ -87,17 +130,15 @@ def _worked_off(parts: Sequence[_Part], pool: WorkerPool) -> Iterator[Mapping[st
         yield working.popleft().result()
 
 
-def _merged(parts: Sequence[_Part], workers: int | None, progress: Progress) -> Mapping[str, StressSums]:
+def _merged(parts: Sequence[_Part], pool: WorkerPool, progress: Progress) -> Mapping[str, StressSums]:
     """What stress did, part by part, in their order."""
     whole: dict[str, StressSums] = {}
-    with pool_for(workers, None, parts[-1].end)() as pool:
-        try:
-            told = progress(_worked_off(parts, pool), "stressing: parts of the runs", len(parts))
-            for found in told:
-                for label, sums in found.items():
-                    whole.setdefault(label, StressSums(label)).merge(sums)
-        except BrokenExecutor as error:
-            raise BadInput(
-                f"--stress: a process that replayed copies died ({error}); try fewer workers"
-            ) from error
+    try:
+        for found in progress(_worked_off(parts, pool), "stressing: parts of the runs", len(parts)):
+            for label, sums in found.items():
+                whole.setdefault(label, StressSums(label)).merge(sums)
+    except pool.lost as error:
+        raise BadInput(
+            f"--stress: a process that replayed copies died ({error}); try fewer workers"
+        ) from error
     return whole

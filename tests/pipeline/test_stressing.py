@@ -17,6 +17,7 @@ from pipeline.stressing import stressing
 from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of, parameters_changed
 from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
+from recorders.errors import BadInput
 from recorders.log import RunMetadata, Stream
 from replay.engine.streams.sources import memory_source
 from tests.replay.timeline.reading import picture_of
@@ -417,7 +418,11 @@ def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, mo
     experiment = tmp_path / "near.toml"
     experiment.write_text(
         'title = "near"\nruns = 5\n[record]\nscenario = "landmarks"\nparameters = {duration_s = 2.0}\n'
-        '[estimators.one]\nkind = "ekf"\n[estimators.other]\nlike = "one"\nsigma_bearing_rad = 0.0204\n',
+        '[estimators.one]\nkind = "ekf"\n[estimators.other]\nlike = "one"\nsigma_bearing_rad = 0.0204\n'
+        '[[claims]]\nsentence = "near"\npaper = "p"\n'
+        'holds = "position_rmse_m[one, robot1] < position_rmse_m[other, robot1]"\nours = ""\n'
+        '[[claims]]\nsentence = "far"\npaper = "p"\n'
+        'holds = "position_rmse_m[one, robot1] < 9"\nours = ""\n',
         encoding="utf-8",
     )
     out = tmp_path / "out"
@@ -425,11 +430,15 @@ def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, mo
     assert NOT_TESTED not in told
     kept = read_result(out)
     assert [each.estimator for each in kept.stress] == ["one", "other"]
+    assert [each.verdict for each in kept.claims] == ["not shown", "confirmed"]
+    assert "may reverse it" in kept.claims[0].why
     assert all(words in told for each in kept.stress for words in each.words)
     assert "over 5 runs: " in kept.stress[0].words[0]
     found = opening(kept, {"runs": read_table(out / RUNS)})
     assert found.story.cards[0].stress in kept.stress
     monkeypatch.setattr("pipeline.stressing.experiments.TOGETHER", 2)
+    with pytest.raises(BadInput, match="a scheduler has its own workers"):
+        stress_result(kept, workers=2, scheduler="local:2")
     parts = stress_result(kept)
     assert [each.words for each in parts] == [each.words for each in kept.stress]
     assert parts[0].moved == pytest.approx(kept.stress[0].moved)
