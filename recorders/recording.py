@@ -23,6 +23,9 @@ SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
 def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
     """Stamps in ns of times in s since the epoch of simulations, of the same shape.
 
+    Args:
+        elapsed_s: of any shape, in s.
+
     Raises BadInput where a stamp would be beyond what a log can hold.
     """
     with np.errstate(over="ignore"):
@@ -59,7 +62,10 @@ def named_generator(
 class Recording:
     """Streams in memory, before they are a log: one for every topic.
 
-    `epoch_ns` is the run's time zero; `notes` are facts the recorder met, one short text each.
+    Attributes:
+        streams: one for every topic.
+        epoch_ns: the run's time zero.
+        notes: facts that the recorder met, one short text each.
     """
 
     streams: list[Stream]
@@ -78,8 +84,9 @@ class Recording:
 class Blocks:
     """Streams that come block by block, so that they may be more than memory holds.
 
-    A topic may come again in every block. `epoch_ns` and `notes`, as those of a `Recording`, are whole
-    when the last block has been drawn.
+    Attributes:
+        blocks: the streams of each; a topic may come again in every block.
+        epoch_ns, notes: as those of a `Recording`; whole when the last block has been drawn.
     """
 
     blocks: Iterator[list[Stream]]
@@ -97,7 +104,12 @@ class Blocks:
 
 @dataclass(frozen=True)
 class Recorder(Generic[ParametersType]):
-    """Holds what recorders have in common: what they are in one line, and their parameters."""
+    """Holds what recorders have in common: what they are in one line, and their parameters.
+
+    Attributes:
+        summary: what it is, in a line.
+        parameters: their type.
+    """
 
     summary: str
     parameters: type[ParametersType]
@@ -105,14 +117,22 @@ class Recorder(Generic[ParametersType]):
 
 @dataclass(frozen=True)
 class Simulator(Recorder[ParametersType]):
-    """Describes a scenario that can be recorded often, each run from its own random stream."""
+    """Describes a scenario that can be recorded often, each run from its own random stream.
+
+    Attributes:
+        simulate: (parameters, generator) -> a run.
+    """
 
     simulate: Callable[[ParametersType, np.random.Generator], Recording]
 
 
 @dataclass(frozen=True)
 class Importer(Recorder[ParametersType]):
-    """Reads real data: a file or folder as its publishers lay it out, at once or block by block."""
+    """Reads real data: a file or folder as its publishers lay it out, at once or block by block.
+
+    Attributes:
+        read: (path, parameters) -> what is there.
+    """
 
     read: Callable[[Path, ParametersType], Recording | Blocks]
 

@@ -60,7 +60,7 @@ def foreign_code(what: str) -> Iterator[None]:
     except (BadInput, MemoryError, OSError):
         raise
     except Exception as error:
-        said = shorten(str(error), 200)
+        reason = shorten(str(error), 200)
         raise BadInput(
-            f"{what} raised {type(error).__name__}: {said}; FUSELOG_TRACEBACK=1 shows where"
+            f"{what} raised {type(error).__name__}: {reason}; FUSELOG_TRACEBACK=1 shows where"
         ) from error

@@ -1,4 +1,4 @@
-"""What `--set /TOPIC.WHAT=VALUE` does to a topic: which alteration, of which field, by how much."""
+"""Parses `--set /TOPIC.WHAT=VALUE`: which alteration, of which field, by how much."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -79,7 +79,7 @@ class _Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class Change:
-    """What is done to a topic.
+    """Describes what is done to a topic.
 
     Attributes:
         topic: its name.

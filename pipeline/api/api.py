@@ -59,6 +59,14 @@ def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters
 def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySource:
     """Import real data, as their publishers lay them out, into memory.
 
+    Args:
+        importer: a registered name, such as "mrclam"; `fuselog import --help` lists them.
+        path: the file or folder that it reads.
+        parameters: of the importer.
+
+    Returns:
+        The recording, which reads and replays like a log.
+
     Raises BadInput for an unknown importer or parameter, or data that it cannot read.
     """
     return memory_source(*import_run(importer, Path(path), parameters))
@@ -66,6 +74,10 @@ def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySour
 
 def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
     """Write a recording, or streams of your own, as a log; it appears whole or not at all.
+
+    Args:
+        path: the MCAP file; a log of ours that is there is replaced.
+        streams: a recording, or streams, one for every topic.
 
     Raises BadInput where a stream breaks its schema, or what is in the place is no log of ours.
     """
@@ -83,7 +95,12 @@ def write(path: str | Path, streams: MemorySource | Iterable[Stream]) -> None:
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """Represents a result folder, and what its result.json says."""
+    """Represents a result folder, and what its result.json says.
+
+    Attributes:
+        folder: where it is.
+        result: what its result.json says: metrics, tables, claims.
+    """
 
     folder: Path
     result: Result

@@ -80,7 +80,7 @@ def _rows(
         stream, zero_ns = ragged.of_run(run), source.zero_ns("publish_time")
         for row, end_ns in enumerate(stream.publish_time_ns):
             values, direction = stream["eigenvalues"][row], stream["direction"][row]
-            told = Spectrum(values, int(stream["rank"][row]), direction)
+            spectrum = Spectrum(values, int(stream["rank"][row]), direction)
             measured = int(stream["measurements"][row])
             yield {
                 "run": run,
@@ -88,10 +88,10 @@ def _rows(
                 "begin_s": (int(stream["begin_time_ns"][row]) - zero_ns) * 1e-9,
                 "end_s": (int(end_ns) - zero_ns) * 1e-9,
                 "measurements": measured,
-                "rank": told.rank,
+                "rank": spectrum.rank,
                 "eigenvalues": values.tolist(),
                 "direction": dict(zip(components, direction.tolist(), strict=True)),
-                "weakest": in_words(told, components) if measured else "nothing was measured",
+                "weakest": in_words(spectrum, components) if measured else "nothing was measured",
             }
 
 

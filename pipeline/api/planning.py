@@ -1,4 +1,4 @@
-"""What is to be replayed: logs, estimators, spans, starts, order. Python and the commands plan alike.
+"""Plans replays: logs, estimators, spans, starts, order. Python and the commands plan alike.
 
 Nothing that takes long to import is needed for it: `fuselog replay` begins at once.
 """

@@ -28,7 +28,14 @@ Pair = tuple[str, str]
 
 
 class Precompiled(NamedTuple):
-    """Describes one model by one method: the replayed scenario, how long that took, or why not."""
+    """Describes one model by one method: the replayed scenario, how long that took, or why not.
+
+    Attributes:
+        model, method: their registered names.
+        scenario: the one that was recorded and replayed.
+        took_s: how long the replay took with all that it compiled, in s.
+        why_not: the reason where the model was not replayed by this method; else empty.
+    """
 
     model: str
     method: str

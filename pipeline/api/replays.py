@@ -137,11 +137,11 @@ class Replay:
 
     def __repr__(self) -> str:
         runs = self.logs[0].name if len(self.logs) == 1 else f"{len(self.logs)} runs"
-        said = [f"Replay of {runs} by {', '.join(self.settings)}"]
-        said += [each.words for each in self.alarms[:1]]
-        said += self.judge.components_without_truth
+        lines = [f"Replay of {runs} by {', '.join(self.settings)}"]
+        lines += [each.words for each in self.alarms[:1]]
+        lines += self.judge.components_without_truth
         return "\n".join(
-            [*said, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
+            [*lines, *self.failures, *self.losses, self.metrics.to_string(index=False, na_rep="")]
         )
 
     @cached_property

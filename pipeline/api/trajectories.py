@@ -79,8 +79,8 @@ class Evaluation:
         """Return a sentence for what was mended in a trajectory, and where no time offset helps."""
         sought = self.comparison.time_offset_s == "estimate"
         in_vain = "no time offset makes the error smaller; none was added"
-        told = [in_vain] if sought and not self.compared.time_offset_s else []
-        return [*self.estimate.notes, *self.truth.notes, *told]
+        notes = [in_vain] if sought and not self.compared.time_offset_s else []
+        return [*self.estimate.notes, *self.truth.notes, *notes]
 
     @property
     def poses(self) -> pd.DataFrame:
@@ -243,8 +243,8 @@ def compare_logs(
     aligned: list[Source] = []
     for of_run, source in zip(estimates, sources, strict=True):
         alignments = {}
-        told = [each for each in of_run.topics if each.endswith("/origin")]
-        origins = first_fixes({each: gather([of_run[each]]) for each in told})
+        origin_topics = [each for each in of_run.topics if each.endswith("/origin")]
+        origins = first_fixes({each: gather([of_run[each]]) for each in origin_topics})
         for topic, stated in of_run.topics.items():
             truth_topic = stated.metadata.get("truth", "")
             if stated.schema_name != schemas.GAUSSIAN_ESTIMATE.full_name:

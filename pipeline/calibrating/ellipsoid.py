@@ -108,34 +108,34 @@ class Ellipsoid:
         """Sentences: what is not determined, how well it fits, how it is applied."""
         unit, fitted = unit_of(self.field), self.fitted
         before, after = (float(np.sqrt(np.mean((each - self.length) ** 2))) for each in self.lengths)
-        said = []
+        sentences = []
         if self.left_open:
             axis = fitted.turned_about
             turned = f"about one axis only, near {axis}" if axis else "to too few sides"
             others = f"about {' or '.join(AXES.replace(axis, ''))} as well" if axis else "to all sides"
-            said.append(
+            sentences.append(
                 f"the unit was turned {turned}; that does not determine {', '.join(self.left_open)}: "
                 f"they have no value; turn it {others}"
             )
         else:
-            said.append(
+            sentences.append(
                 f"{len(self.readings)} readings: their lengths differ from {self.length:.5g} {unit} by "
                 f"{before:.3g} {unit} as they are, by {after:.3g} {unit} corrected (root mean square)"
             )
         if self.is_assumed:
-            said.append(
+            sentences.append(
                 f"no --length was given: with {self.length:.5g} {unit} the mean of the scales is one; "
                 "only their ratios count"
             )
         if fitted.correlation:
-            said.append(
+            sentences.append(
                 f"errors of one reading and the next correlate by {fitted.correlation:.2g}; that widens "
                 "the intervals"
             )
         if self.settings:
             words = " ".join(f"--set {name}={value}" for name, value in self.settings.items())
-            said.append(f"corrected = matrix (reading - offset): fuselog replay {words}")
-        return said
+            sentences.append(f"corrected = matrix (reading - offset): fuselog replay {words}")
+        return sentences
 
     @property
     def chart(self) -> Chart:

@@ -55,16 +55,16 @@ class Discrepancy(NamedTuple):
     def sentence(self) -> str:
         """All of it in words."""
         where = " ".join(filter(None, (self.run, self.topic, self.part)))
-        told = ""
+        detail = ""
         if self.row is not None:
             what = f"{self.component} is " if self.component else ""
             at = f"in row {self.row}" if self.stamp_ns is None else f"at {self.stamp_ns} ns"
-            told = f"{what}{self.after!r} {at}, the golden has {self.before!r}; "
+            detail = f"{what}{self.after!r} {at}, the golden has {self.before!r}; "
         elif math.isinf(self.apart):
             return f"{where}: is not as in the golden"
         else:
-            told = "rows between those that the golden keeps differ; "
-        return f"{where}: {told}{self.apart:.2g} of its size apart, {self.allowed:g} is allowed"
+            detail = "rows between those that the golden keeps differ; "
+        return f"{where}: {detail}{self.apart:.2g} of its size apart, {self.allowed:g} is allowed"
 
 
 def discrepancies(golden: Golden, replayed: Replayed) -> Iterator[Discrepancy]:
@@ -209,17 +209,17 @@ def first_of(found: Sequence[Discrepancy], replayed: Replayed, golden: Golden) -
     """Say of the first discrepancy in time: itself, where it begins, the innovation there."""
     timed = [each for each in found if each.stamp_ns is not None]
     first = min(timed, key=lambda each: each.stamp_ns or 0) if timed else found[0]
-    said = [first.sentence]
+    sentences = [first.sentence]
     if not first.run or first.topic not in replayed.outputs[first.run]:
-        return said
+        return sentences
     outputs = replayed.outputs[first.run]
     begin_ns = _first_changed(first, replayed, golden)
     if begin_ns is not None:
-        said.append(f"bits of {first.topic} differ from {begin_ns} ns on, which may be rounding")
+        sentences.append(f"bits of {first.topic} differ from {begin_ns} ns on, which may be rounding")
     stamp_ns = first.stamp_ns if begin_ns is None else begin_ns
     if stamp_ns is not None:
-        said += _innovation_at(outputs, split_topic(first.topic), stamp_ns)
-    return said
+        sentences += _innovation_at(outputs, split_topic(first.topic), stamp_ns)
+    return sentences
 
 
 def _first_changed(first: Discrepancy, replayed: Replayed, golden: Golden) -> int | None:

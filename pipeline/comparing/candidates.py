@@ -88,7 +88,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Given:
-    """Something to compare.
+    """Describes one side of a comparison.
 
     Attributes:
         name: what to call it.

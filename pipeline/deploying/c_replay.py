@@ -1,4 +1,4 @@
-"""What lets fuselog replay a filter in C: `fuselog_filter.h`, over the filter's own functions."""
+"""Lets fuselog replay a filter in C: writes `fuselog_filter.h`, over the filter's own functions."""
 
 import json
 from typing import Any

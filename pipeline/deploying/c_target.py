@@ -1,4 +1,4 @@
-"""What runs a filter's test on a Cortex-M4F: QEMU emulates one on Arm's board MPS2, image AN386."""
+"""Runs a filter's test on a Cortex-M4F: QEMU emulates one on Arm's board MPS2, image AN386."""
 
 MACHINE = "mps2-an386"
 TARGET_OPTIONS = (

@@ -1,4 +1,4 @@
-"""What a step of a filter in C costs: operations, counted in its graphs, and memory, by the compiler."""
+"""Counts what a step of a filter in C costs: operations in its graphs, and memory, by the compiler."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What stands beside a filter in C: how to build it, and what it is."""
+"""Writes what stands beside a filter in C: how to build it, and what it is."""
 
 from collections.abc import Mapping
 from textwrap import fill
@@ -79,12 +79,12 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
         return ""
     single = certificate.single
     if single is None:
-        told = f"No GCC was there to run the test; `test_{made.name}` says what it costs."
+        sentence = f"No GCC was there to run the test; `test_{made.name}` says what it costs."
     elif single.lost_event is not None:
         lost = lost_sentence(single._asdict(), is_root=made.is_root)
-        told = f"{lost[0].upper()}{lost[1:]}."
+        sentence = f"{lost[0].upper()}{lost[1:]}."
     else:
-        told = (
+        sentence = (
             f"Over the first {single.estimates} estimates of {log} means and covariances are within "
             f"{single.furthest:.1g} of those in double precision, in units of the state or, of larger "
             "numbers, as a share of them."
@@ -93,7 +93,7 @@ def _single(made: CFilter, certificate: Certificate, log: str) -> str:
         "What the libraries of both precisions differ in over whole logs, with intervals, "
         "`fuselog compare LOG ... -e lib:A.so -e lib:B.so` tells."
     )
-    text = fill(f"{told} {more}", 100, break_on_hyphens=False, break_long_words=False)
+    text = fill(f"{sentence} {more}", 100, break_on_hyphens=False, break_long_words=False)
     return f"\n## What single precision costs\n\n{text}\n"
 
 

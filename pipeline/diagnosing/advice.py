@@ -1,4 +1,4 @@
-"""What a diagnosis says to try: a setting that undoes a fault, for the command line or for Python."""
+"""Describes what to try after a diagnosis: a setting that undoes a fault."""
 
 import json
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 
 class Advice(NamedTuple):
-    """What undoes a fault.
+    """Describes what undoes a fault.
 
     Attributes:
         key: of the setting, a parameter or `/TOPIC.WHAT`.
@@ -45,7 +45,7 @@ class Advice(NamedTuple):
 
 @dataclass(frozen=True)
 class Trying:
-    """How advice is followed.
+    """Describes how advice is followed.
 
     Attributes:
         label: the estimator's.

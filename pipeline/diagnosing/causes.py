@@ -358,7 +358,7 @@ def _over_halves(likelihood: Likelihood, base: Trial, causes: Sequence[Cause]) -
 
 
 class Sought(NamedTuple):
-    """What was found.
+    """Holds what the search for causes found.
 
     Attributes:
         causes: the likeliest first.

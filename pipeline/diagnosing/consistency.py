@@ -1,4 +1,4 @@
-"""Whether NIS and NEES are those of a consistent filter, whatever the cause."""
+"""Tests whether NIS and NEES are those of a consistent filter, whatever the cause."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 
@@ -111,18 +111,18 @@ def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
     for topic, stream in innovations.items():
         case, stated = split_topic(topic)[1], stream.metadata.get("noise", "")
         for name, column in zip(stream.components, whitened(stream).T, strict=True):
-            told = whiteness([column])
-            if not np.isfinite(told.mean_square):
+            tested = whiteness([column])
+            if not np.isfinite(tested.mean_square):
                 continue
-            low, high = (each / told.size for each in chi_square_interval(told.size, 1, CONSISTENT))
-            if low <= told.mean_square <= high:
+            low, high = (each / tested.size for each in chi_square_interval(tested.size, 1, CONSISTENT))
+            if low <= tested.mean_square <= high:
                 continue
-            deviation, what = np.sqrt(told.mean_square), f"{case}: the innovations of {name}"
+            deviation, what = np.sqrt(tested.mean_square), f"{case}: the innovations of {name}"
             noise = f"its noise ({stated})" if stated else "its noise"
-            evidence = f"NIS is {told.mean_square:.3g}, if consistent {low:.3g} to {high:.3g}"
-            if told.mean_square < low:
+            evidence = f"NIS is {tested.mean_square:.3g}, if consistent {low:.3g} to {high:.3g}"
+            if tested.mean_square < low:
                 size, mend = f"{1.0 / deviation:.3g} times smaller", f"{noise} is stated too large"
-            elif told.correlation[0] > told.bound:
+            elif tested.correlation[0] > tested.bound:
                 size = f"{deviation:.3g} times larger"
                 mend = "they hang together, so that it is late, or the process noise too small"
             else:

@@ -1,4 +1,4 @@
-"""Why an estimator is inconsistent: its innovations, its errors where there is truth, their causes.
+"""Diagnoses why an estimator is inconsistent: innovations, errors where there is truth, causes.
 
 A fault is named by what the log-likelihood gains without it, not by how large it looks: a bearing whose
 noise is stated too small makes the range's innovations too large as well.
@@ -64,7 +64,7 @@ OPEN = {"gate_probability": 1.0}
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis:
-    """What was found.
+    """Holds what a diagnosis found.
 
     Attributes:
         label: the estimator's.

@@ -1,4 +1,4 @@
-"""What is unusual in innovations and messages, and needs no replay to be seen.
+"""Finds what is unusual in innovations and messages, and needs no replay to be seen.
 
 Thresholds are far from what chance does to a log that is as its model says; each is beside its name.
 """
@@ -128,7 +128,7 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
             known = column[np.isfinite(column)]
             if len(known) < 2:
                 continue
-            told = whiteness([column])
+            tested = whiteness([column])
             mean, error = float(known.mean()), float(known.std() / np.sqrt(len(known)))
             rows.append(
                 {
@@ -138,11 +138,11 @@ def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
                     "mean": mean,
                     "mean_low": mean - 1.96 * error,
                     "mean_high": mean + 1.96 * error,
-                    "mean_square": told.mean_square if told.size else np.nan,
+                    "mean_square": tested.mean_square if tested.size else np.nan,
                     "beyond_3_sigma": float(np.mean(np.abs(known) > TAIL)),
                     "kurtosis": float(kurtosis(known)) if known.std() > 0.0 else np.nan,
-                    "next_correlation": told.correlation[0],
-                    "probability_white": told.probability,
+                    "next_correlation": tested.correlation[0],
+                    "probability_white": tested.probability,
                 }
             )
     return pd.DataFrame(rows)

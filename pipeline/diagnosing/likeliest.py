@@ -66,13 +66,13 @@ def _mended(logs: list[Path], label: str, own: dict[str, Any], sentence: Sentenc
         return ""
     mend = merge(own, parse_settings([sentence.setting]))
     table = compare(*logs, estimators=[{label: own}, {MENDED: mend}]).table
-    told = []
+    effects = []
     for key in (main, "nees", "nis_per_component"):
         rows = table[table["quantity"] == key].to_dict("records")[:1]
-        told += [_change(key, row) for row in rows if math.isfinite(row["second_mean"])]
-    if not told:
+        effects += [_change(key, row) for row in rows if math.isfinite(row["second_mean"])]
+    if not effects:
         return ""
-    return f"With that, over {count(len(logs), 'run')}: {'; '.join(told)}."
+    return f"With that, over {count(len(logs), 'run')}: {'; '.join(effects)}."
 
 
 def _change(key: str, row: Mapping[Any, Any]) -> str:

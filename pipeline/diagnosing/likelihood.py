@@ -1,4 +1,4 @@
-"""What other settings, or a log without a fault, would gain: the log-likelihood of replays.
+"""Computes what other settings, or a log without a fault, gain: the log-likelihood of replays.
 
 All trials have the same measurements, and begin by the same rule. What a trial does not score, such
 as a fix that a delay moves out of the odometry's span, has the likelihood of a broad model: the next

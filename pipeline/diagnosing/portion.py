@@ -1,4 +1,4 @@
-"""What is diagnosed: of a long log its first part, of an autopilot what it recorded itself."""
+"""Chooses what is diagnosed: of a long log its first part, of an autopilot what it recorded itself."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""What a diagnosis says: causes and what stands in the log by itself, as sentences in their order."""
+"""Writes the sentences of a diagnosis in their order: causes, and what stands in the log by itself."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""What is drawn of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
+"""Computes the curves of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""Which parameters of filters have sliders, between which values, and how a person reads these."""
+"""Chooses which parameters have sliders, between which values, and how a person reads these."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

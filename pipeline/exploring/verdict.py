@@ -1,4 +1,4 @@
-"""What a person is told of a filter on a log: one sentence, and what it rests on."""
+"""Writes the verdict on a filter on a log: one sentence, and what it rests on."""
 
 import math
 from collections.abc import Mapping, Sequence, Set
@@ -72,13 +72,17 @@ def mean_nis(case: Case) -> float:
 
 
 def _evidence(case: Case) -> str:
-    said = []
+    consistent = []
     if not math.isnan(nis := mean_nis(case)):
-        said.append(f"NIS is {nis:.2f} per component")
+        consistent.append(f"NIS is {nis:.2f} per component")
     if case.errors is not None and np.isfinite(case.errors.nees).any():
         nees = float(np.nanmean(case.errors.nees))
-        said.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
-    return " and ".join(said) + " within their intervals." if said else "There is nothing to judge by."
+        consistent.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
+    return (
+        " and ".join(consistent) + " within their intervals."
+        if consistent
+        else "There is nothing to judge by."
+    )
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:

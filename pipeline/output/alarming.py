@@ -51,26 +51,26 @@ def _of_innovations(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -
         sums = innovations.total
         estimator, case = split_topic(topic)
         gate = float(parameters.get(estimator, {}).get("gate_probability", USUAL_GATE))
-        said, excess = [], 1.0
+        facts, excess = [], 1.0
         gated = sums.messages - sums.accepted
         expected = (1.0 - gate) * sums.messages
         # a count of rare things has Poisson's distribution, whose tail is chi-square's
         if gated and chi2.sf(2.0 * expected, 2 * gated) > CONSISTENT:
             share = gated / sums.messages
             excess = max(1.0, gated / max(expected, RARE * sums.messages))
-            said.append(
+            facts.append(
                 f"the gate keeps out {_percent(share)} of {sums.messages} measurements, where "
                 f"{_percent(1.0 - gate)} {'is' if gate < 1.0 else 'are'} expected"
             )
         if not sums.accepted and sums.messages:
-            said.append("its log-likelihood is that of no measurement")
+            facts.append("its log-likelihood is that of no measurement")
         low, high = chi_square_interval(max(sums.degrees, 1), 1, CONSISTENT)
         if sums.degrees and (sums.squared < low or sums.squared > high):
             nis, low, high = (each / sums.degrees for each in (sums.squared, low, high))
             excess = max(excess, _beyond(nis, low, high))
-            said.append(f"NIS is {nis:.3g} per component, {_expected(nis, low, high)}")
-        if said:
-            words = f"{_name(estimator, case)}: {'; '.join(said)}; "
+            facts.append(f"NIS is {nis:.3g} per component, {_expected(nis, low, high)}")
+        if facts:
+            words = f"{_name(estimator, case)}: {'; '.join(facts)}; "
             words += f"fuselog diagnose LOG -e {estimator} says why"
             yield Alarm("innovations", estimator, case, excess, words)
 

@@ -12,7 +12,7 @@ Kind = Literal["innovations", "errors", "origin", "lever arm", "minimum", "digit
 
 @dataclass(frozen=True)
 class Alarm:
-    """One of them.
+    """Represents one reason to doubt the numbers of a replay.
 
     Attributes:
         kind: what it is about.

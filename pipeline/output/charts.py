@@ -38,7 +38,14 @@ Style = Literal["line", "dashed", "markers", "dots", "line+markers", "triangles"
 
 
 class Axis(Parameters):
-    """Describes an axis, with its unit; `ticks` are texts by place, where it has its own."""
+    """Describes an axis.
+
+    Attributes:
+        label: what it shows, with its unit.
+        log: whether it is logarithmic.
+        limits: its ends; by default those of the data.
+        ticks: texts by place, where it has its own.
+    """
 
     label: str = ""
     log: bool = False
@@ -88,7 +95,15 @@ def _check_lengths(*columns: Sequence[Any]) -> None:
 
 
 class Panel(Parameters):
-    """Series and bands over two axes; a `plane` has one scale on both."""
+    """Series and bands over two axes; a `plane` has one scale on both.
+
+    Attributes:
+        x, y: the axes.
+        series: curves over them.
+        bands: ranges over x.
+        title: above it.
+        plane: whether both axes have one scale.
+    """
 
     x: Axis = Axis()
     y: Axis = Axis()
@@ -99,7 +114,14 @@ class Panel(Parameters):
 
 
 class Chart(Parameters):
-    """Panels in rows of so many columns, with one legend unless their titles say what is drawn."""
+    """Panels in rows of so many columns, with one legend unless their titles say what is drawn.
+
+    Attributes:
+        panels: row by row.
+        title: above all of them.
+        columns: how many panels stand in a row.
+        legend: whether there is one.
+    """
 
     panels: list[Panel]
     title: str = ""
@@ -132,7 +154,15 @@ def thinned(count: int) -> slice:
 def curve(
     label: str, x: ArrayLike, y: ArrayLike, style: Style = "line", *, reference: bool = False
 ) -> Series:
-    """Return a series of numbers y over x, numbers or names."""
+    """Return a series of numbers y over x, numbers or names.
+
+    Args:
+        label: its name in the legend.
+        x: (n,), numbers or names.
+        y: (n,), its values at x.
+        style: how it is drawn.
+        reference: whether it is what others are compared with.
+    """
     return Series(label=label, x=_places(x), y=_numbers(y), style=style, reference=reference)
 
 
@@ -144,7 +174,15 @@ def path(
 
 
 def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference: bool = False) -> Band:
-    """Return a range over x, numbers or names."""
+    """Return a range over x, numbers or names.
+
+    Args:
+        label: its name in the legend.
+        x: (n,), numbers or names.
+        low: (n,), its lower end at x.
+        high: (n,), its upper end at x.
+        reference: whether it is what others are compared with.
+    """
     return Band(label=label, x=_places(x), low=_numbers(low), high=_numbers(high), reference=reference)
 
 

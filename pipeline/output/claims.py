@@ -40,6 +40,13 @@ class Claim:
     """Represents a statement of a paper: what it prints, what we measured, our verdict and its reason.
 
     There is no verdict on a claim that is made of another recording.
+
+    Attributes:
+        claim: the statement.
+        paper: what the paper prints, or where.
+        ours: what we measured.
+        verdict: see `Verdict`.
+        why: the reason of the verdict, where the numbers do not say it.
     """
 
     claim: str
@@ -51,6 +58,13 @@ class Claim:
 
 def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str = "") -> Claim:
     """Return a claim that a measured condition confirms or refutes.
+
+    Args:
+        claim: as in `Claim`.
+        paper: likewise.
+        ours: likewise.
+        holds: whether what was measured confirms the claim.
+        why: as in `Claim`.
 
     >>> judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict
     'confirmed'

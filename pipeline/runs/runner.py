@@ -28,7 +28,12 @@ from replay.judging.judge import Judge
 
 @dataclass(frozen=True)
 class Runner:
-    """Holds the runs of an experiment, in its setting."""
+    """Holds the runs of an experiment, in its setting.
+
+    Attributes:
+        experiment: what is run.
+        setting: where and how.
+    """
 
     experiment: Experiment
     setting: Setting

@@ -244,9 +244,9 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
         said = {"estimator": estimator, "quantity": quantity, "case": case}
         bound_low, bound_high = bounds.get(key, (math.nan, math.nan))
         aim = sizes.get(key, 1.0) if key in bounds else math.nan
-        told = {"value": value, "low": low, "high": high}
+        estimate = {"value": value, "low": low, "high": high}
         consistent = {"aim": aim, "bound_low": bound_low, "bound_high": bound_high}
-        rows.append({"point": number, **point, **said, **told, **consistent})
+        rows.append({"point": number, **point, **said, **estimate, **consistent})
     return pd.DataFrame(rows)
 
 

@@ -1,4 +1,4 @@
-"""What is found of the noise of sensors: tables, curves, sentences, a result folder."""
+"""Holds what is found of the noise of sensors: tables, curves, sentences, a result folder."""
 
 import math
 from collections.abc import Mapping, Sequence

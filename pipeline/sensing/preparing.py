@@ -154,10 +154,10 @@ def find_drift(values: Floats, step_s: float) -> Drift | None:
         drifting = fit(samples, ("walk",))
         gain = drifting.log_likelihood - best.log_likelihood - (found.gain if found else 0.0)
         if gain > (_DRIFT_GAIN if found is None or not found.offset else 0.0):
-            said = likelihood(samples, drifting.terms)
-            offset = float(said.coefficients[1]) if share < math.inf else 0.0
+            fitted = likelihood(samples, drifting.terms)
+            offset = float(fitted.coefficients[1]) if share < math.inf else 0.0
             gain += found.gain if found else 0.0
-            rate, sigma = float(said.coefficients[0]), float(said.sigmas[0])
+            rate, sigma = float(fitted.coefficients[0]), float(fitted.sigmas[0])
             found = Drift(rate, sigma, offset, share * span_s, gain)
     return found
 

@@ -1,4 +1,4 @@
-"""How far two replays are apart: in sigmas of the first, in metres and degrees, and since when.
+"""Measures how far two replays are apart: in sigmas of the first, in metres and degrees, and since when.
 
 A(t) = sqrt(d' P^-1 d / n), with the difference d of n components and the covariance P of the unchanged
 replay. A moved start never grows in A where the filter is linear: d' P^-1 d does not rise (Deyst and

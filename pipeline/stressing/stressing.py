@@ -43,7 +43,7 @@ TOGETHER = max(1, RUNS_AT_ONCE // (1 + len(CHANGES)))
 
 
 class How(NamedTuple):
-    """How runs are replayed and stressed.
+    """Says how runs are replayed and stressed.
 
     Attributes:
         seed: of signs, coins, and what is dropped.

@@ -14,7 +14,7 @@ RARE_RUNS = 100
 
 @dataclass
 class StressSums:
-    """What stress did to one estimator, run by run.
+    """Counts what stress did to one estimator, run by run.
 
     Attributes:
         estimator: whose.

@@ -206,25 +206,25 @@ class Stressed:
     @property
     def sentences(self) -> list[str]:
         """The verdict first, then what explains it."""
-        said = [self.sentence]
+        sentences = [self.sentence]
         if self.is_per_prediction:
-            said.append(
+            sentences.append(
                 "noise per prediction, not per second: a microsecond makes one prediction two, and "
                 "that changes the covariance; scale the noise with the duration"
             )
         elif self._jumps:
-            said.append(
+            sentences.append(
                 "a microsecond decides what is taken together: what has one stamp is one step, and what "
                 "comes later waits for the next"
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined
             since_s = (least.since_ns - self.source.epoch_ns) * 1e-9
-            said.append(
+            sentences.append(
                 f"from {since_s:.1f} s on {least.words} is not determined: its sigma is "
                 f"{least.sigma:.3g}, across it {least.next_sigma:.3g}"
             )
-        return said
+        return sentences
 
 
 def _largest(values: Any) -> float:
@@ -236,7 +236,9 @@ def _largest(values: Any) -> float:
 class Stress:
     """Estimators over runs, stressed: one of `Stressed` for each run and estimator.
 
-    `gap_limit_s` is over which gaps the truth was not interpolated.
+    Attributes:
+        stressed: one for each run and estimator.
+        gap_limit_s: over longer gaps the truth was not interpolated.
     """
 
     stressed: Sequence[Stressed]

@@ -142,17 +142,17 @@ class Tuning:
                     for name, column in columns:
                         series.setdefault((split_topic(topic)[1], name), []).append(column)
             for (case, name), found in series.items():
-                told = whiteness(found)
+                tested = whiteness(found)
                 rows.append(
                     {
                         "estimator": label,
                         "case": case,
                         "component": name,
-                        "innovations": told.size,
-                        "mean_square": told.mean_square,
-                        "next_correlation": told.correlation[0],
-                        "ljung_box": told.ljung_box,
-                        "probability": told.probability,
+                        "innovations": tested.size,
+                        "mean_square": tested.mean_square,
+                        "next_correlation": tested.correlation[0],
+                        "ljung_box": tested.ljung_box,
+                        "probability": tested.probability,
                     }
                 )
         return pd.DataFrame(rows)

@@ -147,8 +147,8 @@ def _table(path: Path) -> pd.DataFrame:
     except pd.errors.EmptyDataError:
         raise BadInput(f"{path}: is empty; give an AIS table with a header line") from None
     except (OSError, EOFError, ValueError, lzma.LZMAError, zlib.error) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadInput(f"{path}: cannot be read as a CSV table ({said})") from None
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadInput(f"{path}: cannot be read as a CSV table ({reason})") from None
     missing = [name for name in ("Time", *NUMBERS) if name not in table.columns]
     if missing:
         raise BadInput(

@@ -15,7 +15,15 @@ from recorders.log.run import RECORD_NAME, RunMetadata
 
 @dataclass(frozen=True)
 class Topic:
-    """Describes one topic, which several channels may share; `metadata` is what they agree on."""
+    """Describes one topic, which several channels may share; `metadata` is what they agree on.
+
+    Attributes:
+        name, schema_name: of the topic and of its messages.
+        encoding: of the messages.
+        channel_ids: of its channels.
+        metadata: what the channels agree on.
+        messages: how many there are.
+    """
 
     name: str
     schema_name: str

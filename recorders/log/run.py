@@ -16,10 +16,15 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class RunMetadata:
-    """Scenario, parameters, seed and epoch of one run; `seed` is None for imported data.
+    """Says how one run was recorded.
 
-    `epoch_ns` is the log's time zero: simulated time plus the epoch gives the stamps.
-    `notes` are facts that the recorder met (unknown barcodes, say), one short text each.
+    Attributes:
+        scenario: the name of the scenario or importer.
+        parameters: of the scenario or importer.
+        seed: of the random numbers; None for imported data.
+        run: its number among those of the seed.
+        epoch_ns: the log's time zero: simulated time plus the epoch gives the stamps.
+        notes: facts that the recorder met (unknown barcodes, say), one short text each.
     """
 
     scenario: str

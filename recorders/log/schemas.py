@@ -1,4 +1,4 @@
-"""Every message of a log, declared once.
+"""Declares every message of a log, once.
 
 A schema is a flat protobuf message whose fields are fixed-width and `optional`; a vector is packed
 doubles of one length per stream. So all messages of a stream share one byte layout (see `layout`) and
@@ -35,10 +35,13 @@ NUMPY_TYPES: dict[Kind, np.dtype] = {
 class Field:
     """Describes one field of a message.
 
-    `may_be_nan` says that NaN stands for a value that is missing, `may_be_absent` that logs written
-    before there was such a field lack it: who reads them asks whether the column is there. Of a
-    measurement that has several components `may_be_partial` says that NaN stands for one that was not
-    measured.
+    Attributes:
+        name: with its unit.
+        kind: the type of its values.
+        may_be_nan: whether NaN stands for a value that is missing.
+        may_be_absent: whether logs written before there was such a field lack it: who reads them asks
+            whether the column is there.
+        may_be_partial: whether NaN stands for a component of a measurement that was not measured.
     """
 
     name: str
@@ -55,7 +58,14 @@ class Field:
 
 @dataclass(frozen=True)
 class Schema:
-    """A message type: its protobuf name without the package, what it says, and its fields."""
+    """A message type: its protobuf name without the package, what it says, and its fields.
+
+    Attributes:
+        name: the name of its protobuf message, without the package.
+        purpose: what a message says.
+        fields: in their order.
+        package: of its protobuf message.
+    """
 
     name: str
     purpose: str

@@ -20,11 +20,16 @@ Clock = Literal["publish_time", "log_time"]
 
 @dataclass(frozen=True, repr=False)
 class Stream:
-    """The messages of one topic: first axis = message.
+    """Holds the n messages of one topic: first axis = message.
 
-    `publish_time_ns` says when the quantity was measured, `log_time_ns` when it reached the recorder,
-    both (n,) int64 and never negative. `columns` has one array per schema field, (n,), or (n, width)
-    for a vector. `position` is the place in the file, for a stable order among equal stamps.
+    Attributes:
+        topic: its name.
+        schema: of its messages.
+        publish_time_ns, log_time_ns: (n,), when the quantity was measured and when it reached the
+            recorder, never negative.
+        columns: one array per field of the schema, (n,), or (n, width) for a vector.
+        position: (n,), the place in the file, for a stable order among equal stamps.
+        metadata: what the channel states, as text.
 
     >>> from recorders.log import make_stream, schemas
     >>> seen = make_stream("/range", schemas.RANGE, [0, 10, 20], target_id=[1, 2, 1], range_m=[5, 3, 4])
@@ -131,6 +136,15 @@ def make_stream(
     A vector that may be absent need not be given. Raises BadInput where another column is missing, or
     one is unknown, has another length, has the wrong number of axes, holds NaN that its field does not
     allow or a number that its type cannot keep (a fraction of a nanosecond, say), or a time is negative.
+
+    Args:
+        topic: its name.
+        schema: of its messages.
+        publish_time_ns: (n,), when the quantity was measured.
+        log_time_ns: (n,), when it reached the recorder.
+        sensor_time_ns: (n,), the stamp by the clock of the sensor.
+        metadata: what the channel states, as text.
+        columns: by field, (n,), or (n, width) for a vector.
 
     >>> from recorders.log import schemas
     >>> make_stream("/gyro", schemas.RANGE, [0, 10], target_id=[1, 1], range_m=[5.0])

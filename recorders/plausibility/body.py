@@ -65,7 +65,7 @@ class Fixes(Series):
 
 @dataclass
 class Body:
-    """What is said of one body.
+    """Holds what topics say of one body.
 
     Attributes:
         fixes: its places.

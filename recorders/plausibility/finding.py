@@ -1,4 +1,4 @@
-"""What a check finds: a sentence with its evidence, and what mends it."""
+"""Defines what a check finds: a sentence with its evidence, and what mends it."""
 
 from typing import Literal, NamedTuple
 

@@ -16,7 +16,7 @@ NEAR_S = 1.0  # a lag within it is as likely as all that are longer
 
 
 class Timing(NamedTuple):
-    """How a source fits windows in time.
+    """Says how a source fits windows in time.
 
     Attributes:
         lag_s: the windows are later than the source by so much.

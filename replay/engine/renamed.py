@@ -31,8 +31,8 @@ def renamed(**names: str) -> Callable[[Target], Target]:
         @wraps(function)
         def call(*arguments: Any, **given: Any) -> Any:
             for old in names.keys() & given.keys():
-                said = f"'{old}' is called '{names[old]}' now; the old name goes in the next release"
-                warnings.warn(f"{owner}: {said}", FutureWarning, stacklevel=2)
+                notice = f"'{old}' is called '{names[old]}' now; the old name goes in the next release"
+                warnings.warn(f"{owner}: {notice}", FutureWarning, stacklevel=2)
                 given[names[old]] = given.pop(old)
             return function(*arguments, **given)
 

@@ -1,4 +1,4 @@
-"""What a foreign filter says of itself: its topics, its state, its parameters; in JSON."""
+"""Reads what a foreign filter says of itself: its topics, its state, its parameters; in JSON."""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -32,6 +32,10 @@ METHODS: Mapping[str, Method] = {
 def modelled(model: Model, method: str) -> Estimator[Any]:
     """Make the estimator of the state of one model by one method, named as on the command line.
 
+    Args:
+        model: how the state moves and what sensors measure of it.
+        method: as `fuselog methods` lists them, such as "ukf", "lrkf:s2kf-50" or "imm:ekf".
+
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 
     >>> from replay.estimators.models.landmarks import ROBOT

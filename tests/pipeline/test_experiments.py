@@ -19,7 +19,7 @@ from pipeline.output.charts import Chart
 from pipeline.output.claims import Claim
 from pipeline.output.results import TIMINGS, Outcome, result_folder, write_outcome
 from pipeline.output.summary import summarise
-from pipeline.output.words import number
+from pipeline.output.words import Scale, alike
 from pipeline.runs.estimates import hash_files, hash_streams
 from pipeline.runs.experiment import (
     Experiment,
@@ -511,7 +511,8 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
         expected = f"{mean:.3g} (95 % {low:.3g} to {high:.3g}), aim 3"
         assert expected in printed
     fuselog("report", out, "-o", tmp_path / "five.html")
-    expected = f"NEES {number(mean)}, 95 % {number(low)} to {number(high)}; 3 is right"
+    of_page = alike([mean, low, high], Scale())
+    expected = f"NEES {of_page[0]}, 95 % {of_page[1]} to {of_page[2]}; 3 is right"
     assert expected in (tmp_path / "five.html").read_text(encoding="utf-8")
     assert printed.splitlines()[-1] == f"{out}: figures, tables, timeline.rrd, {TIMINGS}, result.json"
     names = {"figures", "tables", "timeline.rrd", TIMINGS, "result.json"}

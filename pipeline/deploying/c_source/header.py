@@ -135,9 +135,9 @@ def _predict_comment(made: CFilter) -> str:
 def _between_comment(made: CFilter) -> str:
     control = made.filtering.stage.model.control
     assert control is not None
-    told = "Predicts to a time, driven by the mean of the last control and that at this time."
+    note = "Predicts to a time, driven by the mean of the last control and that at this time."
     if not made.has_gaps:
-        return f"/* {told} */"
+        return f"/* {note} */"
     after = (
         "the next prediction with a control passes over all of it"
         if made.steps.gap is not None
@@ -145,7 +145,7 @@ def _between_comment(made: CFilter) -> str:
     )
     silent = made.filtering.gap_ns * 1e-9
     return (
-        f"/* {told}\n * Hand over NAN where {control.topic} is silent for longer than {control.gap},\n"
+        f"/* {note}\n * Hand over NAN where {control.topic} is silent for longer than {control.gap},\n"
         f" * {silent:g} s, up to its first message then: {made.name.upper()}_NOT_DRIVEN says that the\n"
         f" * estimate is unknown, messages are not to be used, and {after}. */"
     )

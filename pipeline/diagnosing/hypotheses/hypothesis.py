@@ -1,4 +1,4 @@
-"""One thing that may be wrong, and how it is undone."""
+"""Defines a hypothesis: one thing that may be wrong, and how it is undone."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""What is doubtful of a result, in a few words each, the worst first: it stands on the first screen."""
+"""Lists what is doubtful of a result, in a few words each, the worst first, for the first screen."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""What a result knows of each estimator: its error, whether it is consistent, failures; run by run.
+"""Collects what a result knows of each estimator, run by run: error, consistency, failures.
 
 It is computed of the metrics and of the table of runs, which all kinds of results have in one form.
 """
@@ -89,7 +89,7 @@ class Consistency:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of one estimator.
+    """Holds what is known of one estimator.
 
     Attributes:
         estimator: its label.

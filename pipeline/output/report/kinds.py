@@ -39,7 +39,7 @@ TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
 @dataclass(frozen=True)
 class Opening:
-    """How a page begins.
+    """Holds what a page begins with.
 
     Attributes:
         tried: what was tried, in a sentence.
@@ -65,17 +65,17 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     if "sweep" in result.settings:
         return Opening(*story_of_sweep(result, tables), numbers_of="Each estimator where it errs least.")
     found = findings(result, tables)
-    told = story(found, result.causes, timings, result.alarms)
+    base = story(found, result.causes, timings, result.alarms)
     notes = [str(each) for each in result.settings.get("notes", [])]
     tried = what_was_tried(result, found, tables)
     if result.experiment == "diagnose":
-        return Opening(tried, _of_diagnosis(told, notes), found, notes[1:])
+        return Opening(tried, _of_diagnosis(base, notes), found, notes[1:])
     if result.experiment == "tune":
         meanings = result.settings.get("meanings", {})
-        return Opening(tried, _of_tuning(told, tables, meanings), found, notes)
+        return Opening(tried, _of_tuning(base, tables, meanings), found, notes)
     if result.claims:
-        told = _with_claims(_of_a_study(result, found, timings), result)
-    return Opening(tried, told, found, notes)
+        base = _with_claims(_of_a_study(result, found, timings), result)
+    return Opening(tried, base, found, notes)
 
 
 def said(result: Result, folder: Path) -> tuple[str, str]:
@@ -118,12 +118,12 @@ def _of_a_study(result: Result, found: Findings, timings: Timings | None) -> Sto
     """
     stated = result.settings.get("estimators") or {}
     own = replace(found, labels=[label for label in found.labels if label in stated] or found.labels)
-    told = story(own, result.causes, timings, result.alarms)
+    base = story(own, result.causes, timings, result.alarms)
     is_compared = len(own.compared) > 1 or len(own.labels) == len(own.compared)
-    return told if is_compared else Story([], doubts=told.doubts)
+    return base if is_compared else Story([], doubts=base.doubts)
 
 
-def _with_claims(told: Story, result: Result) -> Story:
+def _with_claims(base: Story, result: Result) -> Story:
     """A story, then how many claims hold, with a card of those that do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     refuted = [claim.claim for claim in result.claims if claim.verdict == "refuted"]
@@ -141,10 +141,10 @@ def _with_claims(told: Story, result: Result) -> Story:
     rest = [f"{counts['not shown']} not shown (may be chance)"] if counts["not shown"] else []
     rest += [f"{counts['not reproducible']} not reproducible"] if counts["not reproducible"] else []
     card = Card("claims", *look, str(counts["confirmed"]), of_all, notes=notes, foot=rest)
-    cards = told.cards[: MOST_CARDS - 1]
-    left_out = [each.estimator for each in told.cards[MOST_CARDS - 1 :]] + told.left_out
-    verdict = [*told.verdict, *claims_sentences(result)]
-    return replace(told, verdict=verdict, cards=[*cards, card], left_out=left_out)
+    cards = base.cards[: MOST_CARDS - 1]
+    left_out = [each.estimator for each in base.cards[MOST_CARDS - 1 :]] + base.left_out
+    verdict = [*base.verdict, *claims_sentences(result)]
+    return replace(base, verdict=verdict, cards=[*cards, card], left_out=left_out)
 
 
 def claims_sentences(result: Result) -> list[str]:
@@ -153,24 +153,24 @@ def claims_sentences(result: Result) -> list[str]:
     of_all = count(len(result.claims), "claim")
     if counts["confirmed"] == len(result.claims):
         return [f"{'The only claim is' if len(result.claims) == 1 else f'All {of_all} are'} confirmed."]
-    told = [
+    counted = [
         f"{counts[each]} {each}" for each in ("refuted", "not shown", "not reproducible") if counts[each]
     ]
     if counts[NO_VERDICT]:
-        told.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
-    return [f"{counts['confirmed']} of {of_all} confirmed; {listed(told)}."]
+        counted.append(f"{counts[NO_VERDICT]} of another recording, without a verdict")
+    return [f"{counts['confirmed']} of {of_all} confirmed; {listed(counted)}."]
 
 
-def _of_diagnosis(told: Story, notes: Sequence[str]) -> Story:
+def _of_diagnosis(base: Story, notes: Sequence[str]) -> Story:
     """What is wrong comes first; that an estimator is inconsistent is on its card."""
     first = notes[0].removeprefix("1. ") if notes else ""
     what, _, advice = meaning_alone(first).partition("; try ")
     is_name = "_" in what.split(" ")[0]
     verdict = [f"{what if is_name else what[:1].upper() + what[1:]}."] if what else []
-    return replace(told, verdict=[*verdict, *([f"Try {advice}."] if advice else [])] or told.verdict)
+    return replace(base, verdict=[*verdict, *([f"Try {advice}."] if advice else [])] or base.verdict)
 
 
-def _of_tuning(told: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
+def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Story:
     """The values that were found, then whether they change what the estimator is worth."""
     sentences = []
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
@@ -184,7 +184,7 @@ def _of_tuning(told: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
         unit = f" {sign}" if (sign := unit_of(row["parameter"])) else ""
         sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{told_by}{begun}.")
-    return replace(told, verdict=[*sentences, *told.verdict])
+    return replace(base, verdict=[*sentences, *base.verdict])
 
 
 # A comparison.
@@ -195,7 +195,7 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     rows = rows[rows["case"] != "all"]
     sides = [label for group in result.settings["sides"] for label in group]
     found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
-    told = story(found)
+    base = story(found)
     differ = rows[rows["verdict"].isin(["better", "worse", "higher", "lower"])]
     unclear = rows[rows["verdict"] == "unclear"]
     margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
@@ -218,8 +218,8 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
         keys = dict.fromkeys(map(str, of["quantity"]))
         names = listed([quantity(key).name.removesuffix(", RMS") for key in keys])
         doubts.append(f"whether {first} or {second} is better in {names}, which {runs} do not tell")
-    told = replace(told, verdict=[*told.verdict[:2], summary], doubts=[*told.doubts, *doubts])
-    return Opening(tried, told, found, [*also, *notes], chart)
+    base = replace(base, verdict=[*base.verdict[:2], summary], doubts=[*base.doubts, *doubts])
+    return Opening(tried, base, found, [*also, *notes], chart)
 
 
 def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -> Findings:

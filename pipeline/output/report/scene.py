@@ -317,13 +317,13 @@ def _ways(source: LogSource) -> list[Floats]:
 
 
 def _tracks(output: LogSource, label: str) -> list[Floats]:
-    """The tracks that an estimator told of, each (n, 2)."""
+    """The tracks that an estimator tracks of, each (n, 2)."""
     topic = f"/estimates/{label}/track"
     if topic not in output.topics or not set(PLANE) <= {*output.empty(topic).components}:
         return []
-    told = output.read([topic])[topic]
-    places = told["mean"][:, [told.components.index(name) for name in PLANE]]
-    return [places[told["track_id"] == number] for number in np.unique(told["track_id"])]
+    tracks = output.read([topic])[topic]
+    places = tracks["mean"][:, [tracks.components.index(name) for name in PLANE]]
+    return [places[tracks["track_id"] == number] for number in np.unique(tracks["track_id"])]
 
 
 def _parted(ways: Sequence[Floats]) -> Floats:

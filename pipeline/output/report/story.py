@@ -315,11 +315,11 @@ def _notes(found: Findings, each: Evidence, take: str, equal: list[str]) -> list
 
 def _of_tracks(found: Findings, label: str) -> list[str]:
     """What a tracker misses, invents and mixes up, on average."""
-    told = []
+    counts = []
     for key, words in (("missed_targets", "missed"), ("false_targets", "false")):
         values = found.values(label, key)
-        told += [f"{number(sum(values) / len(values), 2)} {words}"] if values else []
-    sentences = [f"Targets at a time: {listed(told)}."] if told else []
+        counts += [f"{number(sum(values) / len(values), 2)} {words}"] if values else []
+    sentences = [f"Targets at a time: {listed(counts)}."] if counts else []
     switches = found.values(label, "switches")
     if switches:
         a_run = number(sum(switches) / len(switches), 2)

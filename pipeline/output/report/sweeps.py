@@ -116,11 +116,11 @@ class Sweep:
 
     def where(self, point: int, *, brief: bool = False) -> str:
         """The values at a point in words: with what they are of, or `brief`."""
-        told = []
+        parts = []
         for key, value in self.points[point].items():
             text = f"{_value(value)} {unit_of(key) if _is_number(value) else ''}".rstrip()
-            told.append(text if brief else f"{self.name(key)} = {text}")
-        return f"({', '.join(told)})" if brief and len(told) > 1 else ", ".join(told)
+            parts.append(text if brief else f"{self.name(key)} = {text}")
+        return f"({', '.join(parts)})" if brief and len(parts) > 1 else ", ".join(parts)
 
     def name(self, key: str, *, with_key: bool = False) -> str:
         """What a parameter is: what it means, where that is known."""
@@ -148,11 +148,11 @@ def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings
     best = {label: _best(sweep, label, own) for label, own in errors.items()}
     still = [label for label, own in errors.items() if _is_still(own)]
     found = sweep.at({label: (label, point) for label, point in best.items()})
-    told = story(found)
+    base = story(found)
     if len(still) < len(errors):
-        return tried, _with_points(sweep, told, errors, best, still), found
+        return tried, _with_points(sweep, base, errors, best, still), found
     keys = listed([sweep.name(key) for key in sweep.points[0]])
-    return tried, replace(told, verdict=[f"No error depends on {keys}.", *told.verdict]), found
+    return tried, replace(base, verdict=[f"No error depends on {keys}.", *base.verdict]), found
 
 
 def _tried(sweep: Sweep, labels: list[str]) -> str:
@@ -182,7 +182,7 @@ def _is_still(own: "pd.Series[float]") -> bool:
 
 def _with_points(
     sweep: Sweep,
-    told: Story,
+    base: Story,
     errors: Mapping[str, "pd.Series[float]"],
     best: Mapping[str, int],
     still: list[str],
@@ -195,7 +195,7 @@ def _with_points(
         sentences.append(f"{listed(still)} {are} on it.")
     doubts: list[str] = []
     cards = []
-    for card in told.cards:
+    for card in base.cards:
         if card.estimator in moved:
             own, point = errors[card.estimator], best[card.estimator]
             alike = _as_good(sweep, card.estimator, own, point)
@@ -203,11 +203,11 @@ def _with_points(
             doubts += _doubts(sweep, card.estimator, own, point, alike)
         else:
             cards.append(replace(card, notes=["Its errors are the same at all points.", *card.notes]))
-    first, *further = told.verdict or [""]
+    first, *further = base.verdict or [""]
     verdict = [*filter(None, [first]), *sentences, *further]
     at_best = ", where it errs least"
-    others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in told.doubts]
-    return replace(told, verdict=verdict, cards=cards, doubts=[*doubts, *others])
+    others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in base.doubts]
+    return replace(base, verdict=verdict, cards=cards, doubts=[*doubts, *others])
 
 
 def _as_good(sweep: Sweep, label: str, own: "pd.Series[float]", best: int) -> list[int]:
@@ -232,18 +232,18 @@ def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, a
 
 def _doubts(sweep: Sweep, label: str, own: "pd.Series[float]", best: int, alike: list[int]) -> list[str]:
     """What is doubtful of a best point."""
-    told = []
+    parts = []
     sure = [int(point) for point in own.index if sweep.is_too_sure(label, int(point))]
     if sure and best not in sure:
-        told.append(f"{label} at {_named(sweep, sure)}, where it is overconfident")
+        parts.append(f"{label} at {_named(sweep, sure)}, where it is overconfident")
     if alike:
-        told.append(f"which point is best for {label}, as {_named(sweep, alike)} may be as good")
+        parts.append(f"which point is best for {label}, as {_named(sweep, alike)} may be as good")
     key, *others = sweep.points[0]
     values = [each for point in sweep.points if _is_number(each := point[key])]
     if not others and len(values) == len(sweep.points) and sweep.points[best][key] in _ends_of(values):
         where = sweep.where(best, brief=True)
-        told.append(f"whether {label} errs less beyond {where}, where the range ends")
-    return told
+        parts.append(f"whether {label} errs less beyond {where}, where the range ends")
+    return parts
 
 
 def _named(sweep: Sweep, points: list[int]) -> str:

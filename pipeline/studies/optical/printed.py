@@ -1,4 +1,4 @@
-"""What is measured of lines of sight beside what Belfadel et al. 2014 print."""
+"""Compares what is measured of lines of sight with what Belfadel et al. 2014 print."""
 
 from typing import Any
 

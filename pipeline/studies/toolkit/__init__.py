@@ -1,1 +1,1 @@
-"""What studies of any family share; begin with `localization`."""
+"""Holds what studies of any family share; begin with `localization`."""

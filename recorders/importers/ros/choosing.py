@@ -66,8 +66,8 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
     if parameters.truth is not None:
         _check_truth(bag, parameters.truth, found.readers)
     if not found.readers:
-        told = some_of([f"{topic} ({why})" for topic, why in sorted(found.not_taken.items())])
-        raise BadInput(f"{bag.path}: has no topic that can be imported: {told or 'no topics'}")
+        left_out = some_of([f"{topic} ({why})" for topic, why in sorted(found.not_taken.items())])
+        raise BadInput(f"{bag.path}: has no topic that can be imported: {left_out or 'no topics'}")
     return found
 
 

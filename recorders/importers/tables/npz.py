@@ -61,9 +61,9 @@ def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
         arrays = {name.removesuffix(".npy"): _described(archive, name) for name in archive.namelist()}
     lengths = {each.shape[:1] for each in arrays.values()}
     if len(lengths) != 1 or any(len(each.shape) not in (1, 2) for each in arrays.values()):
-        told = some_of([f"{name} {each.shape}" for name, each in arrays.items()]) or "none"
+        found = some_of([f"{name} {each.shape}" for name, each in arrays.items()]) or "none"
         raise BadInput(
-            f"{path}: its arrays are not columns of one length ({told}); save arrays of the same length"
+            f"{path}: its arrays are not columns of one length ({found}); save arrays of the same length"
         )
     width = sum(each.width for each in arrays.values())
     if width > most_columns:

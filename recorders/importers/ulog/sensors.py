@@ -1,4 +1,4 @@
-"""What becomes of the topics of sensors: one function for each, which makes parts of their rows."""
+"""Reads the topics of sensors: one function for each, which makes parts of their rows."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field

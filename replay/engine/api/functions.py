@@ -294,6 +294,9 @@ def each_run(
 
     They know more of the run: `OneRun.prior`, `stated` and a `generator`. Where `solve` raises, that
     run has failed; where all do, it is the input that is bad.
+
+    Args:
+        solve: (streams, parameters) -> the estimates of a run.
     """
 
     def solve_all(given: Given[ParametersType]) -> Solved:

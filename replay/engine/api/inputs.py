@@ -41,7 +41,7 @@ class Binding(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Given(Mapping[str, Ragged], Generic[ParametersType]):
-    """What is given of all runs; topics go by the names under which an estimator asked for them.
+    """Holds what is given of all runs; topics go by the names under which an estimator asked for them.
 
     It maps the static topics to their streams: of a recursion what it starts from, of a batch
     all. A topic that is optional and that the log lacks is not in it.
@@ -92,7 +92,12 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
 
 @dataclass(frozen=True, eq=False)
 class OneRun(Mapping[str, Stream]):
-    """Holds what is given of one run, stream by stream; see `Given` and `each_run`."""
+    """Holds what is given of one run, stream by stream; see `Given` and `each_run`.
+
+    Attributes:
+        given: what is given of all runs.
+        run: its number among them.
+    """
 
     given: Given[Any]
     run: int

@@ -51,7 +51,14 @@ class Results(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Describes how the solutions ended, (n,) each; the cost is what was minimised."""
+    """Describes how the solutions ended, (n,) each; the cost is what was minimised.
+
+    Attributes:
+        iterations: how many there were.
+        converged: 1 where the solver converged, else 0.
+        rank: of the Jacobian at the solution.
+        cost: what was minimised.
+    """
 
     iterations: Integers
     converged: Integers
@@ -60,7 +67,12 @@ class Solution(NamedTuple):
 
 
 class Diagnostics(NamedTuple):
-    """Holds numbers that a batch gives beside its estimates: stamps (n,), and columns of a schema."""
+    """Holds numbers that a batch gives beside its estimates: stamps (n,), and columns of a schema.
+
+    Attributes:
+        time_ns: (n,), the stamps.
+        columns: by field of the schema, (n, ...).
+    """
 
     time_ns: Integers
     columns: Mapping[str, NDArray]
@@ -97,7 +109,12 @@ class Estimates(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Holds the estimates by run, and the failures; a run that failed has no estimates."""
+    """Holds the estimates by run, and the failures; a run that failed has no estimates.
+
+    Attributes:
+        estimates: by the number of the run.
+        failures: when and why a run failed, likewise.
+    """
 
     estimates: Mapping[int, Estimates]
     failures: Mapping[int, Failure]

@@ -141,6 +141,15 @@ class Batch:
     """Describes an estimator that needs everything at once: `solve` turns its topics into outputs.
 
     `streams` are the measurements, within the span that is replayed; all else as for `Recursive`.
+
+    Attributes:
+        name: the label, and what is estimated.
+        streams: topics of measurements.
+        static: topics that are read whole.
+        solve: streams by topic, of all runs -> outputs.
+        priors: topics of priors, with their components.
+        given: streams that the replay hands it beside those of the log.
+        parameters: as it was bound with.
     """
 
     name: str
@@ -160,10 +169,14 @@ Bound = Recursive | Batch
 class Estimator(Generic[ParametersType]):
     """Describes an estimator: what it is, its parameters, and how it binds to the topics of a log.
 
-    `bind` gets the name to use, the log's topics and the parameters, and returns one bound estimator
-    for everything it can estimate there (each robot, say); none where the log does not fit. `variant`
-    names the parameter that the rest of a name such as `lrkf:s2kf-50` sets. `label` is what it is called
-    where it is given without one.
+    Attributes:
+        summary: what it is, in a line.
+        requirements: what it needs of a log, in a line.
+        parameters: the type of its parameters.
+        bind: (name, topics, parameters) -> one bound estimator for everything that it can estimate in a
+            log of these topics (each robot, say); none where the log does not fit.
+        variant: the parameter that the rest of a name such as `lrkf:s2kf-50` sets.
+        label: what it is called where it is given without one.
     """
 
     summary: str

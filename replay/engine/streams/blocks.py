@@ -39,7 +39,12 @@ class Findings(dict[Hashable, Any]):
 
 @dataclass(frozen=True)
 class Ragged:
-    """Holds one topic of several runs: run r owns the rows offsets[r]:offsets[r + 1] of the stream."""
+    """Holds one topic of several runs: run r owns the rows offsets[r]:offsets[r + 1] of the stream.
+
+    Attributes:
+        stream: the rows of all runs, end to end.
+        offsets: (runs + 1,), where the runs begin, and the end of the last.
+    """
 
     stream: Stream
     offsets: NDArray[np.int64]
@@ -86,9 +91,12 @@ CarriedType = TypeVar("CarriedType", bound=tuple[Any, ...])
 class Block(NamedTuple):
     """Holds what an estimator gets at once: a span of its topics, in all runs.
 
-    `arrival` (n, 2) says of every event when it was taken and its place in the file, where that is not
-    its stamp's order alone; see `replay.engine.replaying.late`. `findings` are of a block that is
-    replayed again, None of any other.
+    Attributes:
+        streams: by topic.
+        events: the messages of all topics in the order in which they are taken.
+        arrival: (n, 2), of every event when it was taken and its place in the file, where that is not
+            its stamp's order alone; see `replay.engine.replaying.late`.
+        findings: of a block that is replayed again; None of any other.
     """
 
     streams: dict[str, Ragged]

@@ -22,7 +22,7 @@ UNSTATED = "no reason given"
 
 
 class Failure(NamedTuple):
-    """When and why a run failed."""
+    """Says when and why a run failed."""
 
     time_ns: int
     reason: str

@@ -111,7 +111,7 @@ class _Readable(Mapping[str, Stream]):
 
 @dataclass(frozen=True, repr=False)
 class LogSource(_Readable):
-    """Represents a log file, read lazily; it maps its topics to their streams."""
+    """Represents a log file, or a span of it, read lazily; it maps its topics to their streams."""
 
     log: Log
     start_ns: int | None = None

@@ -1,4 +1,4 @@
-"""What programs that read a log are given, and what they write.
+"""Writes what programs that read a log are given, and reads what they write.
 
 Begin with `estimates`.
 """

@@ -129,9 +129,17 @@ def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
 
 
 class Innovations(NamedTuple):
-    """Holds one innovation stream of an ensemble; `degrees` is the number of measured components.
+    """Holds the n innovations of one stream of an ensemble.
 
-    `log_likelihood` is NaN where the estimator states none, and None of a log from before it was stated.
+    Attributes:
+        estimator: the estimator's label, such as `ekf`.
+        case: what it estimates, such as `robot1`; may be empty.
+        run, time_ns: (n,), the number of the run and the stamp.
+        accepted: (n,), whether the gate let the measurement in.
+        squared: (n,), normalised innovation squared (NIS).
+        degrees: (n,), how many components were measured.
+        log_likelihood: (n,), of the measurements; NaN where the estimator states none, and None of a log
+            from before it was stated.
     """
 
     estimator: str
@@ -310,16 +318,16 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
     true = stated_components(sources[0].topics[truth].metadata, {}, truth)
     position = [name for name in own if name in POSITION and name not in names]
     rest = [name for name in true if name in POSITION and name not in position]
-    said = []
+    facts = []
     if names:
         verb, them = ("is", "it") if len(names) == 1 else ("are", "them")
-        said.append(f"{', '.join(names)} {verb} not judged: {truth} lacks {them}")
+        facts.append(f"{', '.join(names)} {verb} not judged: {truth} lacks {them}")
     if len(names) == len(own):
-        said.append(f"it has {', '.join(true)}")
+        facts.append(f"it has {', '.join(true)}")
     elif position and rest:
         alone, others = ", ".join(position), ", ".join(rest)
-        said.append(f"position_rmse_m is of {alone} alone, and not of {others}, which {truth} has")
-    return f"{what}: {'; '.join(said)}" if said else ""
+        facts.append(f"position_rmse_m is of {alone} alone, and not of {others}, which {truth} has")
+    return f"{what}: {'; '.join(facts)}" if facts else ""
 
 
 def _components(stream: Stream) -> dict[str, Any]:

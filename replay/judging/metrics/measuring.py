@@ -18,6 +18,14 @@ class Output(NamedTuple):
     """Holds messages of one output topic of an estimator, of any schema.
 
     Row r of a run belongs to `sources[run]`, whose number in the whole ensemble is `first_run` + run.
+
+    Attributes:
+        estimator: the label of the estimator.
+        case: what it estimates, such as `robot1`; may be empty.
+        leaf: the last part of the name of the topic.
+        rows: the messages, run by run.
+        sources: the sensor streams and truth of each run.
+        first_run: the number in the whole ensemble of the first run.
     """
 
     estimator: str

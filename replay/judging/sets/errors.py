@@ -27,8 +27,13 @@ ORDER = 2.0
 class SetErrors(NamedTuple):
     """Holds a set estimate of an ensemble, judged: one row (n,) per run and step.
 
-    Distances are in m; localisation, missed and false are GOSPA's parts in m^2. `estimated` and `true`
-    are the numbers of targets.
+    Attributes:
+        estimator: the estimator's label.
+        case: what it estimates; may be empty.
+        run, time_ns, elapsed_s: the number of the run, the stamp, and the time since the run's epoch.
+        ospa, gospa: the distances, in m.
+        localisation, missed, false: GOSPA's parts, in m^2.
+        estimated, true: how many targets.
     """
 
     estimator: str

@@ -210,7 +210,11 @@ class Canvas:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Draws a scenario family: `draw` sends everything and returns the layout of its views."""
+    """Draws a scenario family: `draw` sends everything and returns the layout of its views.
+
+    Attributes:
+        draw: (canvas, scene) -> the layout.
+    """
 
     draw: Callable[[Canvas, Scene], rrb.Container | rrb.View]
 

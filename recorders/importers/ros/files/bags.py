@@ -135,8 +135,8 @@ def _metadata(folder: Path) -> dict[str, Any]:
     try:
         about = YAML(typ="safe").load(place.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
     except (OSError, ValueError, KeyError, TypeError, YAMLError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadInput(f"{place}: cannot be read ({said}); give the bag's files one by one") from None
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise BadInput(f"{place}: cannot be read ({reason}); give the bag's files one by one") from None
     if not isinstance(about, dict):
         raise BadInput(f"{place}: does not describe a bag; give the bag's files one by one")
     return about
