@@ -21,8 +21,8 @@ STATED = "covariance_rad2"  # by a channel of orientations: their variances
 ALL_TOPICS = "/*"
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
 WHATS = {
-    "delay_s": "The stamps are so late, and are taken back by it; messages that would be before 1970 are "
-    "left out.",
+    "delay_s": "The stamps are so late, and are taken back by it; messages that would be before 1970 "
+    "are left out.",
     "clock_gain": "The clock of the stamps gains so many s a second from the run's begin on.",
     "FIELD_scale": "The field is multiplied by it; covariance_scale is a factor of variances.",
     "FIELD_bias": "The field is too large by it, and is reduced by it.",
@@ -121,7 +121,7 @@ class Change:
     def altered(self, stream: Stream) -> Stream:
         """The topic's messages altered, from those of the one that is stored.
 
-        What would be before 1970, where a log's stamps begin near 0, is left out: no log has such stamps.
+        Messages that would be before 1970 are left out: no log has such stamps.
         """
         metadata = {**stream.metadata, **self.metadata}
         stream = replace(stream, topic=self.topic, metadata=metadata)
