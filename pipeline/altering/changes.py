@@ -21,7 +21,8 @@ STATED = "covariance_rad2"  # by a channel of orientations: their variances
 ALL_TOPICS = "/*"
 # Of a topic can be set, each with what it means; each undoes a fault, and takes its number.
 WHATS = {
-    "delay_s": "The stamps are so late, and are taken back by it.",
+    "delay_s": "The stamps are so late, and are taken back by it; messages that would be before 1970 "
+    "are left out.",
     "clock_gain": "The clock of the stamps gains so many s a second from the run's begin on.",
     "FIELD_scale": "The field is multiplied by it; covariance_scale is a factor of variances.",
     "FIELD_bias": "The field is too large by it, and is reduced by it.",
@@ -118,15 +119,15 @@ class Change:
         return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
 
     def altered(self, stream: Stream) -> Stream:
-        """The topic's messages altered, from those of the one that is stored."""
-        stamps_ns = self.moved(stream.publish_time_ns) if self.is_moving else stream.publish_time_ns
-        if len(stamps_ns) and stamps_ns.min() < 0:
-            raise BadInput(
-                f"--set {self.topic}: its stamps would be before 1970, the first by "
-                f"{-1e-9 * stamps_ns.min():g} s; give a smaller delay_s or clock_gain"
-            )
+        """The topic's messages altered, from those of the one that is stored.
+
+        Messages that would be before 1970 are left out: no log has such stamps.
+        """
         metadata = {**stream.metadata, **self.metadata}
-        stream = replace(stream, topic=self.topic, publish_time_ns=stamps_ns, metadata=metadata)
+        stream = replace(stream, topic=self.topic, metadata=metadata)
+        if self.is_moving:
+            stamps_ns = self.moved(stream.publish_time_ns)
+            stream = replace(stream, publish_time_ns=stamps_ns).take(stamps_ns >= 0)
         for alteration in self.columns:
             stream = alteration(stream)
         return stream

@@ -145,7 +145,7 @@ class AlteredLog(LogSource):
         """A span in ns that holds all stamps by one of the clocks, before they are altered and after."""
         ends = np.array(super().extent(clock))
         moved = [ends, *(each.moved(ends) for each in self.changes.values() if clock == "publish_time")]
-        return int(np.min(moved)), int(np.max(moved))
+        return max(0, int(np.min(moved))), int(np.max(moved))
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
         """Return whole topics, in publish-time order, whatever the source's span."""

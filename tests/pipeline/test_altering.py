@@ -14,6 +14,7 @@ import pytest
 import fuselog as fl
 from pipeline.altering import alterations as put
 from pipeline.altering.sources import alter
+from pipeline.diagnosing.battery.car import car
 from recorders.log.streams import concatenate
 from recorders.parameters import parse_settings
 from tests.pipeline.test_python import robot
@@ -131,6 +132,19 @@ def test_a_log_is_altered_block_by_block_as_a_recording_is(tmp_path: Path, run: 
             assert np.array_equal(found.publish_time_ns, whole[topic].publish_time_ns)
             for name, column in whole[topic].columns.items():
                 assert np.array_equal(found[name], column, equal_nan=True)
+
+
+def test_advice_works_on_stamps_that_begin_at_zero(tmp_path: Path, fuselog: Fuselog) -> None:
+    """The fix that would be before 1970 is left out, in memory and of a file; all others are moved."""
+    run, log = car(1), tmp_path / "run.mcap"
+    fl.write(log, run)
+    setting = {"/car/fix.delay_s": 0.3}
+    kept_ns = run.streams["/car/fix"].publish_time_ns[1:] - 300_000_000
+    for source in (alter(run, setting), alter(fl.open(log), setting)):
+        assert source.extent("publish_time")[0] == 0
+        assert np.array_equal(source.read(["/car/fix"])["/car/fix"].publish_time_ns, kept_ns)
+    told = fuselog("replay", log, "-e", "ekf", "--set", "/car/fix.delay_s=.3", "--json")
+    assert told.code == 0, told.err
 
 
 @pytest.mark.paper
