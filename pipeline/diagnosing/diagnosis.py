@@ -273,7 +273,7 @@ def diagnose(
             if each.topic not in no_judges
         ),
     ]
-    if not sentences and not findings:
+    if not sentences and all(each.kind == "gate" for each in findings):  # which names no cause
         findings += unnamed(done, innovations, len(sought.tried), no_judges)
     sentences += [Sentence.of(each) for each in findings]
     return Diagnosis(

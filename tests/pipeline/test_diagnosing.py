@@ -14,8 +14,8 @@ from rerun.chunk import RrdReader
 
 import fuselog as fl
 from pipeline.altering import alterations as alter
-from pipeline.diagnosing import study
-from pipeline.diagnosing.causes import find_causes, least_gain
+from pipeline.diagnosing import diagnosis, study
+from pipeline.diagnosing.causes import Sought, find_causes, least_gain
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
@@ -403,3 +403,11 @@ def test_the_study_counts_what_is_named_and_what_a_removal_gains(
     assert told["diagnosis.first.landmarks-bias"] == told["diagnosis.first_two.landmarks-bias"] == 2.0
     assert told["diagnosis.nothing_share"] == 1.0
     assert told["diagnosis.counted"] == 2.0
+
+
+def test_what_the_gate_keeps_out_names_no_cause(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NIS outside what a consistent filter leaves is said beside it."""
+    monkeypatch.setattr(diagnosis, "seek", lambda *_: Sought())
+    log = fl.record("landmarks", seed=2, duration_s=20.0)
+    found = fl.diagnose(log, "ekf", set={"sigma_range_m": 0.03})
+    assert {"gate", "unnamed"} <= {each.kind for each in found.sentences}
