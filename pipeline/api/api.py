@@ -60,7 +60,7 @@ def import_(importer: str, path: str | Path, /, **parameters: Any) -> MemorySour
     """Import real data, as their publishers lay them out, into memory.
 
     Args:
-        importer: a registered name, such as "mrclam"; `fuselog import --help` lists them.
+        importer: a registered name, such as "mrclam"; `fuselog scenarios` lists them.
         path: the file or folder that it reads.
         parameters: of the importer.
 

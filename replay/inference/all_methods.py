@@ -34,7 +34,7 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
 
     Args:
         model: how the state moves and what sensors measure of it.
-        method: as `fuselog methods` lists them, such as "ukf", "lrkf:s2kf-50" or "imm:ekf".
+        method: as `fuselog models NAME` lists them, such as "ukf", "lrkf:s2kf-50" or "imm:ekf".
 
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 
