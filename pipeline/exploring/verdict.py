@@ -72,17 +72,13 @@ def mean_nis(case: Case) -> float:
 
 
 def _evidence(case: Case) -> str:
-    consistent = []
+    facts = []
     if not math.isnan(nis := mean_nis(case)):
-        consistent.append(f"NIS is {nis:.2f} per component")
+        facts.append(f"NIS is {nis:.2f} per component")
     if case.errors is not None and np.isfinite(case.errors.nees).any():
         nees = float(np.nanmean(case.errors.nees))
-        consistent.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
-    return (
-        " and ".join(consistent) + " within their intervals."
-        if consistent
-        else "There is nothing to judge by."
-    )
+        facts.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
+    return f"{' and '.join(facts)} within their intervals." if facts else "There is nothing to judge by."
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:

@@ -146,9 +146,9 @@ def _has_own_colour(drawn: Drawn) -> bool:
     return not drawn.reference and not (isinstance(drawn, Series) and drawn.style == "outside")
 
 
-def thinned(count: int) -> slice:
-    """Every k-th of so many points, so that a line has no more of them than a person sees."""
-    return slice(None, None, max(1, -(-count // MOST_POINTS)))
+def thinned(count: int, most: int = MOST_POINTS) -> slice:
+    """Every k-th of so many points: by default no more of them than a person sees in a line."""
+    return slice(None, None, max(1, -(-count // most)))
 
 
 def curve(

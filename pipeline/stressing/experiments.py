@@ -81,8 +81,7 @@ def stress_result(
         _Part(experiment, Path(data) if data else None, first, min(first + TOGETHER, runs))
         for first in range(0, runs, TOGETHER)
     ]
-    pool_of_parts = pool_for(workers, scheduler, parts[-1].end)
-    with pool_of_parts() as pool:
+    with pool_for(workers, scheduler, parts[-1].end)() as pool:
         if pool.sees is not None and not pool.sees([*experiment.files, *filter(None, [parts[0].data])]):
             raise BadInput(
                 f"--stress --scheduler {scheduler}: its workers do not see the files that are replayed; "

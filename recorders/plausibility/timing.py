@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from recorders.plausibility.body import Floats, Series
-from recorders.plausibility.windows import FEWEST, Windows
+from recorders.plausibility.windows import FEWEST, Windows, thinned
 
 Account = Callable[[Series, Floats, Floats], Floats]  # of windows, from their begin to their end
 LONGEST_S, STEP_S, FINE_S = 30.0, 0.1, 0.01
@@ -39,7 +39,7 @@ def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: f
         return None
     count = _independent(windows)
     lags_s = np.arange(-LONGEST_S, LONGEST_S + 0.5 * STEP_S, STEP_S)
-    few = _thinned(windows, max(FEW, 2 * count))
+    few = windows.take(thinned(len(windows), max(FEW, 2 * count)))
     coarse = _likeness(few, source, account, lags_s)
     if not np.isfinite(coarse).any():
         return None
@@ -95,11 +95,6 @@ def _share_within(windows: Windows, source: Series, lag_s: float) -> float:
         windows.end_s - lag_s <= source.times_s[-1]
     )
     return float(is_within.mean())
-
-
-def _thinned(windows: Windows, most: int) -> Windows:
-    """Every second, third, ... window, so that at most so many are left."""
-    return windows.take(slice(None, None, -(-len(windows) // most)))
 
 
 def _independent(windows: Windows) -> int:

@@ -30,6 +30,11 @@ class Windows:
         return Windows(self.begin_s[rows], self.end_s[rows], self.values[rows])
 
 
+def thinned(count: int, most: int) -> slice:
+    """Every second, third, ... of so many, so that at most so many are left."""
+    return slice(None, None, max(1, -(-count // most)))
+
+
 def noise_of(places: Floats) -> float:
     """The standard deviation of white noise of samples (n, 2), by how they differ from their neighbours.
 
@@ -46,7 +51,7 @@ def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np
     first = np.flatnonzero(later < len(times_s))
     is_near = times_s[later[first]] - times_s[first] < 1.5 * max(span_s, step_s)
     first = first[is_near]
-    first = first[:: -(-len(first) // MOST)] if len(first) > MOST else first
+    first = first[thinned(len(first), MOST)]
     return first, later[first]
 
 

@@ -429,8 +429,10 @@ def test_processes_give_the_same_bytes_also_after_a_kill(place, files):
 
 @pytest.mark.paper
 def test_dask_workers_give_the_same_bytes(place, files):
-    """Of a cluster that is there, whose worker shares no files with it; "local:1" starts such a one."""
+    """Of a cluster of its own, and of one that is there, whose worker shares no files with it."""
     distributed = pytest.importorskip("distributed")
+    assert run(place, pool_for(None, "local:1", RUNS)) == files
+    shutil.rmtree(place)
     loopback = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
     with distributed.LocalCluster(n_workers=1, threads_per_worker=1, **loopback) as cluster:
         assert run(place, pool_for(None, cluster.scheduler_address, RUNS)) == files

@@ -76,6 +76,7 @@ def test_a_german_dump_is_imported_by_one_command(fuselog: Callable[..., Any], t
 @pytest.mark.parametrize(
     ("names", "right"),
     [
+        ("fix variance x 4", {"/fix.covariance_scale": 0.25}),
         (
             "speed x 3.6 + lever (2, .6) m",
             {"/odometry.forward_scale": 1 / 3.6, "lever_x_m": 2.0, "lever_y_m": 0.6},

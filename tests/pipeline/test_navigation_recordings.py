@@ -116,10 +116,15 @@ def test_what_is_planted_into_a_walk_is_named_first(
     walk = replace(whole, streams=streams)
     first = {
         name: fl.diagnose(walk, "ekf", set=PLANTED[name][0]).sentences[0]
-        for name in ("nothing", "degrees", "18 s, fixes")
+        for name in ("nothing", "turn rate's sign", "degrees", "velocity x 3.6", "18 s, fixes")
     }
     assert first["nothing"].kind == "unnamed"
+    assert first["turn rate's sign"].setting == "/inertial.turn_rate_scale=1.0"
+    assert "turn_rate_radps has the wrong sign" in first["turn rate's sign"].words
     assert "turn_rate_radps is 57.3 times" in first["degrees"].words
+    assert re.search(
+        r"/velocity: velocity_mps is 3\.[56]\d* times .* too large", first["velocity x 3.6"].words
+    )
     assert first["18 s, fixes"].words.startswith("/fix: its stamps are 18 s late")
 
 

@@ -64,6 +64,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
     code = "\n\n".join(_blocks("python"))
     (folder / "radio.py").write_text(code)
     in_python = code.replace("follow=follow,\n", "follow=follow,\n    compiled=False,\n")
+    assert in_python != code
     (folder / "plain.py").write_text(in_python.replace('"nearest"', '"plain"'))
     (folder / "radio.toml").write_text("\n".join(experiment))
     (folder / "broken.py").write_text(BROKEN)
@@ -151,11 +152,14 @@ def test_what_the_page_compiles_is_what_it_says(package: Path) -> None:
     said = _run(package, [record, "fuselog replay b.mcap -e nearest -e plain --out both.mcap"])
     assert [each["code"] for each in said] == [0, 0]
     log = open_log(package / "both.mcap")
-    compiled = [topic for topic in log.topics if topic.startswith("/estimates/nearest/")]
-    assert compiled
-    for topic in compiled:
-        plain = topic.replace("/nearest/", "/plain/")
-        one, two = (read_streams(log, [each])[each] for each in (topic, plain))
+    of = {
+        name: [topic for topic in log.topics if topic.startswith(f"/estimates/{name}/")]
+        for name in ("nearest", "plain")
+    }
+    assert of["nearest"]
+    assert of["plain"] == [topic.replace("/nearest/", "/plain/") for topic in of["nearest"]]
+    for topics in zip(of["nearest"], of["plain"], strict=True):
+        one, two = (read_streams(log, [each])[each] for each in topics)
         for name, column in one.columns.items():
             np.testing.assert_allclose(column, two[name], rtol=1e-9, atol=1e-12)
 

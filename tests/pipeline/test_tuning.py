@@ -508,7 +508,7 @@ def test_what_need_not_be_positive_is_found_too() -> None:
             {"duration_s": 30.0, "range_bearing": {"rate_hz": 2.0}},
             "ekf",
             ["forward_noise_density", "turn_noise_density", "sigma_range_m", "sigma_bearing_rad"],
-            [10.0],
+            [0.1, 10.0],
         ),
         (
             "manoeuvres",
@@ -529,7 +529,7 @@ def test_what_need_not_be_positive_is_found_too() -> None:
 def test_a_start_ten_times_off_leads_to_the_same_optimum(
     scenario: str, duration: dict[str, Any], estimator: str, free: list[str], factors: list[float]
 ) -> None:
-    """All parameters together, times ten, or divided by it: within .01 of the likelihood.
+    """All parameters together, of the robot times and divided by ten: within .01 of the likelihood.
 
     What logs tell so little of that this leaves it more than its interval is said in words.
     """

@@ -191,7 +191,7 @@ def _fixes(run: FirstRun) -> list[Series]:
     if not found:
         return []
     points = np.concatenate(found)
-    return [path("fixes", points[:: max(1, -(-len(points) // MOST_FIXES))], "dots", reference=True)]
+    return [_dots("fixes", points)]
 
 
 def _clouds(run: FirstRun) -> list[Series]:
@@ -298,7 +298,12 @@ def _detections(source: LogSource) -> list[Series]:
     if not found:
         return []
     points = np.concatenate(found)
-    return [path("detections", points[:: max(1, -(-len(points) // MOST_FIXES))], "dots", reference=True)]
+    return [_dots("detections", points)]
+
+
+def _dots(label: str, points: Floats) -> Series:
+    """Measured places (n, 2), as many as a picture holds."""
+    return path(label, points[thinned(len(points), MOST_FIXES)], "dots", reference=True)
 
 
 def _ways(source: LogSource) -> list[Floats]:
@@ -317,7 +322,7 @@ def _ways(source: LogSource) -> list[Floats]:
 
 
 def _tracks(output: LogSource, label: str) -> list[Floats]:
-    """The tracks that an estimator tracks of, each (n, 2)."""
+    """The tracks that an estimator gave, each (n, 2)."""
     topic = f"/estimates/{label}/track"
     if topic not in output.topics or not set(PLANE) <= {*output.empty(topic).components}:
         return []

@@ -109,8 +109,9 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
         colours[prefix.removeprefix("/").replace("_", " ")] = colour
         if f"{prefix}/detection" in scene.source.topics:
             seen = scene.read(f"{prefix}/detection")
-            place = own[rows_of(scan, seen)] + read_vectors(seen, "position_m", PLANE)
-            order = np.argsort(rows_of(scan, seen), kind="stable")
+            rows = rows_of(scan, seen)
+            place = own[rows] + read_vectors(seen, "position_m", PLANE)
+            order = np.argsort(rows, kind="stable")
             columns = rr.Points2D.columns(positions=place[order]).partition(scan["detections"])
             canvas.send(entity, scan.publish_time_ns, columns)
             canvas.fix(entity, rr.Points2D.from_fields(**Stroke(colour, 1.5).fields(widen=2.0)))

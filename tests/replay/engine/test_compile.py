@@ -177,11 +177,12 @@ def test_a_new_process_finds_numbas_kernel_and_a_changed_one_is_compiled_anew(tm
     user = BY_NUMBA.replace("GAIN = 3.0", "from extension import gain").replace(
         "GAIN * value", "gain(value)"
     )
-    changed = EXTENSION.replace("3.0", "5.00")
+    changed, less = EXTENSION.replace("3.0", "5.00"), user.replace("value) + 1.0", "value) - 1.0")
     for extension, module, expected in (
         (EXTENSION, user, "1.0 4.0 7.0 compiled"),
         (EXTENSION, user, "1.0 4.0 7.0 cached"),
         (changed, user, "1.0 6.0 11.0 compiled"),
+        (changed, less, "-1.0 4.0 9.0 compiled"),
     ):
         (tmp_path / "extension.py").write_text(textwrap.dedent(extension))
         assert imported(module, tmp_path, cache)[0] == expected
