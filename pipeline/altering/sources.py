@@ -5,6 +5,7 @@ by its new stamps: memory holds a block of each, however far the stamps move.
 """
 
 import json
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -42,15 +43,52 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
     """
     if not settings and not in_one_plane(source.name, source.topics, {}):
         return source
-    if isinstance(source, AlteredLog):
-        made = replace(source, alterations={**source.alterations, **settings})
-        made.changes  # noqa: B018, where a setting is wrong this says so, before anything is read
-        return made
+    made: AlteredLog | AlteredRecording
     if isinstance(source, AlteredRecording):
-        return _altered(source.before, {**source.alterations, **settings})
-    if isinstance(source, MemorySource):
-        return _altered(source, settings)
-    return alter(AlteredLog(source.log, source.start_ns, source.end_ns), settings)
+        made = _altered(source.before, {**source.alterations, **settings})
+    elif isinstance(source, MemorySource):
+        made = _altered(source, settings)
+    else:
+        of_log = source.alterations if isinstance(source, AlteredLog) else {}
+        made = AlteredLog(source.log, source.start_ns, source.end_ns, {**of_log, **settings})
+    for topic, (lost, count) in _before_1970(made).items():
+        if lost == count:
+            raise BadInput(
+                f"{source.name}: all {count} messages of {topic} would be before 1970; set a smaller "
+                f"{topic}.delay_s or clock_gain"
+            )
+    return made
+
+
+def alter_all(
+    sources: Iterable[LogSource | MemorySource], settings: Settings
+) -> list[LogSource | MemorySource]:
+    """Runs with topics altered; what is left out, since it would be before 1970, is counted and logged.
+
+    Raises BadInput as `alter`.
+    """
+    made = [alter(source, settings) for source in sources]
+    for source in made:
+        if settings and isinstance(source, AlteredLog | AlteredRecording):
+            for topic, (lost, count) in _before_1970(source).items():
+                logging.getLogger("fuselog").warning(
+                    f"{source.name}: {lost} of {count} messages of {topic} would be before 1970 and "
+                    "are left out"
+                )
+    return made
+
+
+def _before_1970(source: "AlteredLog | AlteredRecording") -> dict[str, tuple[int, int]]:
+    """How many messages of which topics would be before 1970, and of how many."""
+    found = {}
+    stored = LogSource(source.log) if isinstance(source, AlteredLog) else source.before
+    for topic, change in source.changes.items():
+        if change.is_moving and change.moved(np.array(stored.extent("publish_time")))[0] < 0:
+            stamps_ns = stored.read([change.stored])[change.stored].publish_time_ns
+            lost = int(np.count_nonzero(change.moved(stamps_ns) < 0))
+            if lost:
+                found[topic] = lost, len(stamps_ns)
+    return found
 
 
 def alterations_of(source: Source) -> dict[str, Any]:
@@ -99,6 +137,7 @@ class AlteredRecording(MemorySource):
 
     before: MemorySource = field(kw_only=True)
     alterations: Settings = field(kw_only=True)
+    changes: Mapping[str, Change] = field(kw_only=True)
 
 
 def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
@@ -115,6 +154,7 @@ def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
         source.end_ns,
         before=source,
         alterations=settings,
+        changes=changes,
     )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import alter, split_settings
+from pipeline.altering.sources import alter_all, split_settings
 from pipeline.runs.ensemble import Pass, Progress, Settings, cut_in_parts, no_progress, replay_parts
 from pipeline.runs.initial_states import Origin, order_of, origins_of, span_of
 from pipeline.runs.settings import with_settings
@@ -151,7 +151,7 @@ def sources_of(
     found = [logs] if isinstance(logs, Log) else list(logs)
     if not found:
         raise BadInput("there are no logs to replay; give at least one")
-    return [alter(_source(log), alterations or {}) for log in found]
+    return alter_all(map(_source, found), alterations or {})
 
 
 def _source(log: Log) -> LogSource | MemorySource:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.altering.sources import alter
+from pipeline.altering.sources import alter_all
 from pipeline.runs.ensemble import Part, Pass, Settings, estimates_metadata, replay_parts
 from pipeline.runs.estimates import ErrorTables, hash_files, hash_streams
 from pipeline.runs.experiment import Experiment, Setting
@@ -160,7 +160,7 @@ class Runner:
                 _write_log(source, log)
             sources, estimates = recorded, [(path, log) for log, path in places]
             input_sha256 = hash_streams(recorded)
-        sources = [alter(source, experiment.alterations or {}) for source in sources]
+        sources = alter_all(sources, experiment.alterations or {})
         part = Part(sources, now.start, len(sources) == experiment.runs, estimates)
         with ErrorTables(setting.folder) if setting.errors else nullcontext() as errors:
             done = replay_parts(

@@ -134,7 +134,9 @@ def test_a_log_is_altered_block_by_block_as_a_recording_is(tmp_path: Path, run: 
                 assert np.array_equal(found[name], column, equal_nan=True)
 
 
-def test_advice_works_on_stamps_that_begin_at_zero(tmp_path: Path, fuselog: Fuselog) -> None:
+def test_advice_works_on_stamps_that_begin_at_zero(
+    tmp_path: Path, fuselog: Fuselog, caplog: pytest.LogCaptureFixture
+) -> None:
     """The fix that would be before 1970 is left out, in memory and of a file; all others are moved."""
     run, log = car(1), tmp_path / "run.mcap"
     fl.write(log, run)
@@ -145,6 +147,13 @@ def test_advice_works_on_stamps_that_begin_at_zero(tmp_path: Path, fuselog: Fuse
         assert np.array_equal(source.read(["/car/fix"])["/car/fix"].publish_time_ns, kept_ns)
     told = fuselog("replay", log, "-e", "ekf", "--set", "/car/fix.delay_s=.3", "--json")
     assert told.code == 0, told.err
+    counted = f"{log}: 1 of 201 messages of /car/fix would be before 1970 and are left out"
+    assert caplog.messages == [counted]
+    for source in (run, fl.open(log)):
+        with pytest.raises(
+            fl.BadInput, match="all 201 messages of /car/fix would be before 1970; set a"
+        ):
+            alter(source, {"/car/fix.delay_s": 200.0})
 
 
 @pytest.mark.paper

@@ -17,6 +17,7 @@ from pipeline.diagnosing.battery import battery
 from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
 from pipeline.diagnosing.battery.car import (
     FAULTS,
+    Car,
     Truth,
     arcs,
     drive,
@@ -146,6 +147,23 @@ def test_another_origin_of_positions_is_one_cause_of_two_numbers() -> None:
 
 
 @pytest.mark.paper
+def test_a_start_without_a_prior_knows_of_the_antenna_and_of_the_delay() -> None:
+    """It took the antenna for the car, now and not 1.5 s ago: NIS 2 to 5,000 in place of 1."""
+    clean = drive(2101)
+    cases: list[tuple[Car, dict[str, float]]] = [
+        (clean, {}),
+        (FAULTS["lever (2, .6) m"](clean), {"lever_x_m": 2.0, "lever_y_m": 0.6}),
+        (late(1.5)(clean), {"fix_delay_s": 1.5}),
+    ]
+    nis = [
+        fl.replay(recorded(car, has_compass=False), "ekf", set=settings)
+        .metrics.query("quantity == 'nis_per_component'")["value"]
+        .item()
+        for car, settings in cases
+    ]
+    assert nis == pytest.approx([nis[0]] * 3, abs=0.05)
+
+
 def test_what_a_log_does_not_tell_apart_is_one_cause_with_two_names() -> None:
     """Without a heading a mirrored turn rate and mirrored fixes are the same, in either order."""
     log = recorded(faulty(SEED, "E, N exchanged"), has_compass=False)

@@ -189,20 +189,22 @@ def read_heading_covariance(stream: Stream) -> Floats:
 def align(
     path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Any
 ) -> tuple[Floats, Floats] | None:
-    """The pose at the last of some fixes: the path, turned and shifted to them by least squares.
+    """Find the pose at the last of some fixes: the antenna's path turned and shifted to them.
 
-    To the covariance of the solution is added what the odometry errs by: the mean of a random walk over
-    a span, seen from its end, has a third of the variance that it has grown to. None while the heading
-    is less sure than `COURSE_SIGMA_RAD`. See `start.Start`.
+    By least squares. To its covariance is added what the odometry errs by: the mean of a random walk
+    over a span, seen from its end, has a third of the variance that it has grown to. None while the
+    heading is less sure than `COURSE_SIGMA_RAD`. See `start.Start`.
     """
     weight = 2.0 / np.trace(covariances, axis1=1, axis2=2)
-    middle, centre = (np.average(each, axis=0, weights=weight) for each in (path[:, :2], places))
-    a, b = path[:, :2] - middle, places - centre
+    seen = np.stack(antenna(path.T, None, parameters), axis=1)
+    middle, centre = (np.average(each, axis=0, weights=weight) for each in (seen, places))
+    a, b = seen - middle, places - centre
     across, along = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1)
     turn = np.arctan2(weight @ across, weight @ along)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     turned = a @ rotation.T
-    arms = turned - turned[-1]
+    last = turned[-1] - rotation @ (seen[-1] - path[-1, :2])
+    arms = turned - last
     rows = np.zeros((len(path), 2, 3))
     rows[:, 0, 0] = rows[:, 1, 1] = 1.0
     rows[:, 0, 2], rows[:, 1, 2] = -arms[:, 1], arms[:, 0]
@@ -215,7 +217,7 @@ def align(
     covariance += np.diag([forward, forward, turning])
     if covariance[2, 2] > COURSE_SIGMA_RAD**2:
         return None
-    return np.array([*(centre + turned[-1]), path[-1, 2] + turn]), covariance
+    return np.array([*(centre + last), path[-1, 2] + turn]), covariance
 
 
 def read_turn_rate(stream: Stream) -> Floats:

@@ -38,6 +38,7 @@ from replay.inference.run.first_messages import (
     unknown,
 )
 from replay.inference.run.recursion import CONTROL, FilterEvents
+from replay.inference.run.timing import compensate_delays, delays_of
 
 FOREVER_NS = np.iinfo(np.int64).max
 CERTAIN = 1e-6  # of the standard deviations of a start: a thing alone knows where its frame is
@@ -326,6 +327,7 @@ class Initializer:
         streams = {name: first[name] for name in names}
         block = Block(streams, merge_events(streams, clock))
         events, _ = filter_events(stage, found, block, Context({}, origins), settings)
+        events, _ = compensate_delays(stage, events, delays_of(stage, settings), is_end=True)
         is_aligned = np.zeros(len(begun.time_ns), bool)
         for run in range(len(is_aligned)):
             solved = self._align(events, run, stage, settings)
@@ -348,7 +350,7 @@ class Initializer:
         spreads: list[Floats] = []
         begin, end = events.offsets[run : run + 2]
         _, first = data_columns(stage)
-        before_ns = first_ns = 0
+        before_ns, first_ns = 0, None
         for event in range(begin, end):
             time_ns, source = int(events.time_ns[event]), events.source[event]
             duration_s = (time_ns - before_ns) * 1e-9
@@ -362,7 +364,7 @@ class Initializer:
                 size = len(stage.sensors[source].measured)
                 lower = np.zeros((size, size))
                 lower[np.tril_indices(size)] = data[size : size + size * (size + 1) // 2]
-                first_ns = first_ns or time_ns
+                first_ns = time_ns if first_ns is None else first_ns
                 path.append(state)
                 places.append(data[:size])
                 spreads.append(lower + np.tril(lower, -1).T)

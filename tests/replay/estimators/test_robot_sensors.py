@@ -15,7 +15,7 @@ from recorders.models.planar import drive, wrap_angle
 from recorders.recording import Recording
 from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import MemorySource, memory_source
-from replay.estimators.models.landmarks import RECKONING, ROBOT
+from replay.estimators.models.landmarks import RECKONING, ROBOT, LocalizationParameters, align, antenna
 from tests.replay.inference.replays import bound, outputs
 
 Floats = NDArray[np.float64]
@@ -122,6 +122,25 @@ def test_a_span_begins_at_its_own_first_pose() -> None:
     (filtering,) = bound(ROBOT, "ekf", [later])
     with pytest.raises(BadInput, match=r"no prior in this log .*leave out --start-from"):
         start_from(filtering, [later], [], "publish_time")
+
+
+def test_the_start_is_where_the_robot_is_and_not_its_antenna() -> None:
+    """An antenna 2 m ahead was taken for the robot: NIS 1.2 to 4.4 on a car's log, now .89 to 1.12."""
+    path = np.array([(0.0, 0.0, 0.0)] * 5)
+    for step in range(4):
+        path[step + 1] = drive(path[step], (4.0, 0.3), 0.5)
+    turned, shift = 2.2, np.array([30.0, -7.0])
+    cosine, sine = np.cos(turned), np.sin(turned)
+    truth = np.column_stack(
+        [path[:, :2] @ np.array([[cosine, sine], [-sine, cosine]]) + shift, path[:, 2] + turned]
+    )
+    robot = LocalizationParameters(
+        forward_noise_density=0.01, turn_noise_density=0.01, lever_x_m=2.0, lever_y_m=0.6
+    )
+    places = np.stack(antenna(truth.T, None, robot), axis=1)
+    solved = align(path, places, np.tile(1e-4 * np.eye(2), (5, 1, 1)), 2.0, robot)
+    assert solved is not None
+    assert_allclose(solved[0], truth[-1], atol=1e-12)
 
 
 def test_what_a_log_states_is_not_assumed() -> None:
