@@ -32,6 +32,7 @@ KEPT_OUT = 0.05  # of measurements that a gate keeps out, though they are no out
 LOST = 0.02  # of the steps of a regular topic, which are longer than usual
 REGULAR = 0.8  # of the steps between stamps that are the usual one, or a multiple of it
 LONG_GAP = 20.0  # usual steps
+PAUSES = 0.95  # of the steps, which may be the pauses between bursts, as of ranges to many anchors
 REPEATED = 0.001  # of the messages
 SATURATED = 0.005  # of the values that are the greatest, or the least
 FEWEST = 20
@@ -237,8 +238,8 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
         usual = float(np.median(steps[steps < 1.5 * least]))  # also where half of the messages are lost
         multiples = np.rint(steps / usual)
         is_regular = np.abs(steps / usual - multiples) < 0.2
-        gaps = np.flatnonzero(is_regular & (multiples > 1))
-        if np.mean(is_regular) > REGULAR and len(gaps) > LOST * len(steps):
+        gaps = np.flatnonzero(is_regular & (multiples > 1) & (multiples <= LONG_GAP))
+        if np.mean(is_regular) > REGULAR and len(gaps) > LOST * len(steps) and not _are_bursts(gaps):
             lost = int(np.sum(multiples[gaps] - 1))
             share = lost / (lost + len(stamps_ns))
             yield Finding(
@@ -251,6 +252,7 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
             )
         longest = int(np.argmax(steps))
         sees_targets = "target_id" in stream.columns  # and is silent where there are none
+        usual = max(usual, float(np.quantile(steps, PAUSES)))
         if steps[longest] > LONG_GAP * usual and not sees_targets:
             yield Finding(
                 "lost messages",
@@ -277,6 +279,12 @@ def _of_stamps(stream: Stream, epoch_ns: int) -> Iterator[Finding]:
             f"{behind.max() * 1e-9:.3g} s behind; in the order of arrival replay with --late rewind:"
             f"{np.ceil(behind.max() * 1e-8) / 10:.2g}",
         )
+
+
+def _are_bursts(gaps: NDArray[np.integer]) -> bool:
+    """Whether gaps come after so many messages each time, as between bursts of a sensor."""
+    counts = np.diff(gaps)
+    return len(counts) >= FEWEST and bool(np.mean(counts == np.median(counts)) > REGULAR)
 
 
 def _repeated(stream: Stream) -> int:

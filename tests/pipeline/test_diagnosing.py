@@ -271,6 +271,14 @@ def test_what_is_wrong_with_messages_is_said() -> None:
     )
     silent = np.arange(300) + 60 * (np.arange(300) > 100)
     assert "silent for 61 s from 100 s on" in told(fixes(place, publish_time_ns=silent * 10**9))
+    for step_ns in (200_000_000, 10**6):  # bursts of a sensor, as ranges to four anchors or eight
+        count = 8 if step_ns < 10**8 else 4
+        bursts_ns = np.arange(300) // count * 10**9 + np.arange(300) % count * step_ns
+        assert not list(of_messages([fixes(place, publish_time_ns=bursts_ns)], 0))
+    bursts_ns[160:] += 60 * 10**9
+    assert "silent for 61 s from 19.01 s on, where the usual step is 0.993 s" in told(
+        fixes(place, publish_time_ns=bursts_ns)
+    )
 
 
 def test_a_floor_of_the_covariance_is_told_from_a_steady_state() -> None:
