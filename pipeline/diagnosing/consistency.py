@@ -1,6 +1,7 @@
 """Tests whether NIS and NEES are those of a consistent filter, whatever the cause."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,6 +9,7 @@ from pipeline.api.replays import Replay
 from pipeline.diagnosing.findings import Finding
 from pipeline.output.charts import Axis, Chart, Panel, curve, level
 from pipeline.output.results import MetricValue, split_metric
+from pipeline.output.words import listed
 from recorders.log import Stream, schemas
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.judging.consistency.consistency import CONSISTENT
@@ -102,39 +104,75 @@ def unnamed(
             yield _unnamed(_truth(case), case, evidence, faults)
 
 
+class _Seen(NamedTuple):
+    """A component whose innovations are not as large as their variances say, and what may mend it."""
+
+    name: str
+    nis: float
+    low: float
+    high: float
+    mend: str
+
+    @property
+    def times(self) -> float:
+        """How many times larger, or smaller, they are."""
+        deviation = float(np.sqrt(self.nis))
+        return 1.0 / deviation if self.is_small else deviation
+
+    @property
+    def is_small(self) -> bool:
+        """Whether they are smaller."""
+        return self.nis < self.low
+
+
 def of_each_component(innovations: Mapping[str, Stream]) -> Iterator[Finding]:
     """Find what each sensor's innovations say of an estimator that cannot be replayed.
 
     Those that hang together in time are the motion's, or a delay's; others the sensor's own noise. Where
-    a channel states which of its estimator's parameters is that noise, it is named.
+    a channel states which of its estimator's parameters is that noise, it is named. Components of which
+    the same is true are one sentence.
     """
     for topic, stream in innovations.items():
-        case, stated = split_topic(topic)[1], stream.metadata.get("noise", "")
-        for name, column in zip(stream.components, whitened(stream).T, strict=True):
-            tested = whiteness([column])
-            if not np.isfinite(tested.mean_square):
-                continue
-            low, high = (each / tested.size for each in chi_square_interval(tested.size, 1, CONSISTENT))
-            if low <= tested.mean_square <= high:
-                continue
-            deviation, what = np.sqrt(tested.mean_square), f"{case}: the innovations of {name}"
-            noise = f"its noise ({stated})" if stated else "its noise"
-            evidence = f"NIS is {tested.mean_square:.3g}, if consistent {low:.3g} to {high:.3g}"
-            if tested.mean_square < low:
-                size, mend = f"{1.0 / deviation:.3g} times smaller", f"{noise} is stated too large"
-            elif tested.correlation[0] > tested.bound:
-                size = f"{deviation:.3g} times larger"
-                mend = "they hang together, so that it is late, or the process noise too small"
-            else:
-                size, mend = f"{deviation:.3g} times larger", f"{noise} is stated too small"
-            mean = float(np.nanmean(column))
-            if abs(mean) > BIASED * max(deviation, 1.0):
-                mend = f"on average they are {mean:.3g} standard deviations: it is biased"
+        case, alike = split_topic(topic)[1], dict[tuple[bool, str], list[_Seen]]()
+        for each in _inconsistent(stream):
+            alike.setdefault((each.is_small, each.mend), []).append(each)
+        for (is_small, mend), some in alike.items():
+            less = "smaller" if is_small else "larger"
+            times, nis = (
+                " to ".join(dict.fromkeys(f"{value:.3g}" for value in (min(values), max(values))))
+                for values in ([each.times for each in some], [each.nis for each in some])
+            )
+            low, high = min(each.low for each in some), max(each.high for each in some)
             yield Finding(
                 "measurement noise",
                 topic,
-                f"{what} are {size} than their variances say ({evidence}): {mend}",
+                f"{case}: the innovations of {listed([each.name for each in some])} are {times} times "
+                f"{less} than their variances say (NIS is {nis}, if consistent {low:.3g} to "
+                f"{high:.3g}): {mend}",
             )
+
+
+def _inconsistent(stream: Stream) -> Iterator[_Seen]:
+    """The components whose mean square is none that a consistent filter has."""
+    stated = stream.metadata.get("noise", "")
+    noise = f"its noise ({stated})" if stated else "its noise"
+    for name, column in zip(stream.components, whitened(stream).T, strict=True):
+        tested = whiteness([column])
+        if not np.isfinite(tested.mean_square):
+            continue
+        low, high = (each / tested.size for each in chi_square_interval(tested.size, 1, CONSISTENT))
+        if low <= tested.mean_square <= high:
+            continue
+        mean = float(np.nanmean(column))
+        if abs(mean) > BIASED * max(np.sqrt(tested.mean_square), 1.0):
+            mend = f"on average they are {mean:.3g} standard deviations: it is biased"
+        elif tested.mean_square < low:
+            mend = f"{noise} is stated too large"
+        elif tested.correlation[0] > tested.bound:
+            mend = "they hang together, so that it is late, or the process noise too small"
+        else:
+            mend = f"{noise} is stated too small"
+        yield _Seen(name, tested.mean_square, low, high, mend)
 
 
 def nis_charts(label: str, innovations: Mapping[str, Stream], epoch_ns: int) -> dict[str, Chart]:

@@ -16,6 +16,7 @@ import fuselog as fl
 from pipeline.altering import alterations as alter
 from pipeline.diagnosing import diagnosis, study
 from pipeline.diagnosing.causes import Sought, find_causes, least_gain
+from pipeline.diagnosing.consistency import of_each_component
 from pipeline.diagnosing.findings import of_estimates, of_innovations, of_messages
 from pipeline.diagnosing.hypotheses.hypothesis import Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
@@ -278,6 +279,34 @@ def test_what_is_wrong_with_messages_is_said() -> None:
     bursts_ns[160:] += 60 * 10**9
     assert "silent for 61 s from 19.01 s on, where the usual step is 0.993 s" in told(
         fixes(place, publish_time_ns=bursts_ns)
+    )
+
+
+def test_components_of_which_the_same_is_true_are_one_sentence() -> None:
+    """A recorded filter's fixes: x and y half as large as stated, z biased; each is said once."""
+    rng = np.random.default_rng(2)
+    innovation = 0.5 * rng.normal(size=(400, 3)) + np.array([0.0, 0.0, 3.0])
+    stream = fl.make_stream(
+        "/estimates/ekf2/vehicle/fix/innovation",
+        fl.schemas.INNOVATION,
+        np.arange(400) * 10**9,
+        metadata={"components": "x_m,y_m,z_m", "kinds": "linear,linear,linear", "noise": "EKF2_GPS_P"},
+        target_id=np.zeros(400, int),
+        accepted=np.ones(400, int),
+        innovation=innovation,
+        covariance=np.tile(np.eye(3).ravel(), (400, 1)),
+        normalised_innovation_squared=np.sum(innovation**2, axis=1),
+        log_likelihood=np.zeros(400),
+    )
+    small, biased = of_each_component({stream.topic: stream})
+    assert small.words == (
+        "vehicle/fix: the innovations of x_m and y_m are 1.92 to 1.96 times smaller than their "
+        "variances say (NIS is 0.26 to 0.27, if consistent 0.784 to 1.25): its noise (EKF2_GPS_P) is "
+        "stated too large"
+    )
+    assert biased.words == (
+        "vehicle/fix: the innovations of z_m are 2.98 times larger than their variances say (NIS is "
+        "8.9, if consistent 0.784 to 1.25): on average they are 2.94 standard deviations: it is biased"
     )
 
 
