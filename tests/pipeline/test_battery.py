@@ -36,6 +36,8 @@ from recorders.log.planes import Origin
 from recorders.models.geodesy import out_of_tangent_plane
 from recorders.models.orientation import heading
 from replay.engine.replaying.estimator import bind
+from replay.judging.consistency.consistency import CONSISTENT
+from replay.judging.errors.evaluation import chi_square_interval
 
 OPEN = {"kind": "ekf", "gate_probability": 1.0}
 SEED = 2000
@@ -56,10 +58,23 @@ CELLS = [
 @pytest.mark.parametrize("cell", CELLS, ids=lambda cell: cell.name)
 @pytest.mark.paper
 def test_the_fault_is_named_first(cell: battery.Cell) -> None:
-    """Its number, if it has one, within 4 of the sheet's standard deviations; one seed or another."""
-    found = battery.tried(cell, SEED + 100 * (CELLS.index(cell) % 2))
+    """Its number, if it has one, within 4 of the sheet's standard deviations; one seed or another.
+
+    With what is advised against it NIS is within the interval that it has in 999 of 1,000 logs.
+    """
+    seed = SEED + 100 * (CELLS.index(cell) % 2)
+    found = battery.tried(cell, seed)
     assert found["is_first"], found["first"]
     assert found["is_within"] != 0.0, found["value"]
+    if cell.fault == "half of the odometry lost":  # which nothing brings back
+        return
+    assert bool(found["setting"]) == (cell.fault != "nothing")
+    log = recorded(faulty(seed, cell.fault), has_compass=cell.has_compass, has_prior=cell.has_prior)
+    given = [each.split("=") for each in found["setting"].split()]
+    settings = {key: value if key.startswith("/") else float(value) for key, value in given}
+    innovations = fl.replay(log, {"ekf": OPEN}, set=settings).innovations
+    low, high = chi_square_interval(int(innovations["degrees"].sum()), 1, CONSISTENT)
+    assert low < innovations["nis"].sum() < high, found["setting"]
 
 
 @pytest.mark.parametrize("faults", battery.PAIRS[:1], ids=" + ".join)
