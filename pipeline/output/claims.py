@@ -1,7 +1,7 @@
 """Claims: statements of papers with our verdicts.
 
-A claim is stated as data, beside an experiment's settings: a sentence, what the paper says, and a
-comparison of metrics that decides it; see `pipeline.output.expressions`.
+A claim is stated as data, beside an experiment's settings in data/experiments: a sentence, what the
+paper says, and a comparison of metrics that decides it; see `pipeline.output.expressions`.
 """
 
 import re

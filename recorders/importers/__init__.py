@@ -1,1 +1,1 @@
-"""Importers of real data, one file or room per source; begin with `mrclam`."""
+"""Importers of real data, one file or package per source; begin with `mrclam`."""

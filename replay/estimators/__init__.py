@@ -1,1 +1,4 @@
-"""Estimators, one room per family, and models that any method estimates; begin with `models`."""
+"""Estimators, one package per family, and models that any method estimates; begin with `models`.
+
+The methods themselves, such as `ekf`, are in `replay.inference`.
+"""

@@ -1,6 +1,7 @@
 """The report: result folders as one HTML page that fetches nothing and runs only our scripts.
 
-Begin here; `kinds` has what a section opens with, `story` the cards, `scene` the pictures of a run.
+Begin here; `kinds` has what a section opens with, `story` the first sentences and the cards, `scene` the
+pictures of a run.
 
 Plotly draws the charts: its bundle of basic traces, which is small enough to be in every page, lies here
 as its publisher gives it (npm: plotly.js-basic-dist-min 4.1.1, MIT licence).

@@ -1,6 +1,8 @@
 """Keeps numba's kernels on disk: each is loaded, or compiled once by one process.
 
-Our own compiler's kernels are kept by `kernels.native`.
+The key of a kernel is its source text, the versions of Python, numba and NumPy, the types of its
+arguments and the processor. How numba is used is no part of it, see `inlining`. Our own compiler's
+kernels are kept by `kernels.native`.
 """
 
 import __future__

@@ -9,9 +9,10 @@ arrive and does one of three things about it:
     rewind:SECONDS  the estimator goes back, if not further than that; what is older still is left out
 
 What is left out is said on the estimator's topic `skipped`, as a `schemas.SKIPPED`; what came late and
-was waited for on `waited`, as a `schemas.WAITED`; what was gone back for by the estimator itself
-(`Recursive.out_of_sequence`; for filters of models, `replay.inference.run.out_of_sequence`,
-for those of libraries `replay.foreign.native.out_of_sequence`).
+was waited for on `waited`, as a `schemas.WAITED`. For what is gone back for, the estimator does both
+itself, and says so on `rewound`, as a `schemas.REWOUND` (`Recursive.out_of_sequence`; for filters of
+models, `replay.inference.run.out_of_sequence`, for those of libraries
+`replay.foreign.native.out_of_sequence`).
 """
 
 from collections.abc import Mapping

@@ -2,7 +2,7 @@
 
 A method passes a Gaussian through motion and sensors: by exact derivatives (`linear_motion`,
 `linear_sensor`), by samples (`replay.inference.kalman.regression`), or by moments that the model knows.
-All work in one workspace, and the Kalman update after them is the same (`kalman_update`).
+All work in one workspace, and the Kalman update after them is the same (`update.kalman_update`).
 """
 
 from collections.abc import Callable

@@ -150,8 +150,9 @@ class Sensor:
         noise: (parameters) -> variances of the measured components, or the rows of a lower triangle;
             with `noises`, the variances of these. With `covariance`, for messages that lack theirs: what
             has neither is passed over, and counted.
-        vector: the field that holds what is measured as a vector, by the names of its components; else
-            every component is a field of its own.
+        vector: the field that holds what is measured as a vector. The channel's metadata say in
+            `components` how its entries are called, in any order; those of a position need no names.
+            Unless this is given, every component is a field of its own.
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
         reference: what the message is about: a point of a map, or one of each of several maps.

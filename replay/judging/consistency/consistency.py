@@ -1,6 +1,7 @@
 """Errors against the covariance that was promised: by component, ellipses, dilution of precision.
 
-Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
+NEES itself is `replay.engine.vectors.covariances.normalized_error_squared`. Bar-Shalom, Li and
+Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
 """
 
 import numpy as np
