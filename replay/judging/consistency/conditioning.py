@@ -1,9 +1,9 @@
 """Judges what rounding has left of covariances, from samples of those that a replay gives.
 
-Each is brought to variances of one first, so that units are of no account. The pivots of its Cholesky
-factorisation are then the shares of a variance that the components before do not tell: the largest is
-one, and one below 1e-12 has four of a double's sixteen digits left (Higham, Accuracy and Stability of
-Numerical Algorithms, 2nd edition, theorem 10.7).
+Each pivot of a Cholesky factorisation is taken as a share of its variance, so that units are of no
+account: it is how much of the variance the components before do not tell. The largest is one, and one
+below 1e-12 has four of a double's sixteen digits left (Higham, Accuracy and Stability of Numerical
+Algorithms, 2nd edition, theorem 10.7).
 """
 
 from typing import NamedTuple
@@ -65,11 +65,13 @@ def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int =
     if size < 2 or size * size != flat.shape[1]:
         return Conditioning()
     least = least_pivots(flat.reshape(-1, size, size))
-    worst = int(np.argmin(least))
-    run = int(np.searchsorted(rows.offsets, at[worst], side="right")) - 1
+    worst = int(least.argmin())
+    run = int(rows.offsets.searchsorted(at[worst], side="right")) - 1
     elapsed_s = (int(rows.stream.publish_time_ns[at[worst]]) - int(epochs_ns[run])) * 1e-9
-    lost, failed = (int(np.count_nonzero(least < limit)) for limit in (LOST, -LOST))
-    return Conditioning(most, lost, failed, float(least[worst]), first_run + run, elapsed_s)
+    smallest, lost, failed = float(least[worst]), 0, 0
+    if smallest < LOST:
+        lost, failed = (int(np.count_nonzero(least < limit)) for limit in (LOST, -LOST))
+    return Conditioning(most, lost, failed, smallest, first_run + run, elapsed_s)
 
 
 def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -79,20 +81,19 @@ def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     a pivot is not positive there is no factor, and it is the least one.
     """
     variances = np.einsum("rii->ri", covariances)
-    if np.isfinite(covariances).all() and (variances > 0.0).all():  # as nearly always
-        scale = variances**-0.5
-        shares = covariances * scale[:, :, None] * scale[:, None, :]
-    else:
-        is_in = np.isfinite(variances) & (variances != 0.0)
-        scale = np.where(is_in, 1.0 / np.sqrt(np.where(is_in, np.abs(variances), 1.0)), 0.0)
-        known = np.nan_to_num(covariances, posinf=0.0, neginf=0.0)
-        shares = known * scale[:, :, None] * scale[:, None, :]
-        np.einsum("rii->ri", shares)[~is_in] = 1.0
-    try:
-        factors = np.linalg.cholesky(shares)
-    except np.linalg.LinAlgError:  # which one it is remains to be found
-        return np.array([_least_pivot(each) for each in shares])
-    return np.asarray(np.einsum("rii->ri", factors).min(axis=1, initial=1.0) ** 2, np.float64)
+    try:  # as nearly always all are positive
+        factors = np.einsum("rii->ri", np.linalg.cholesky(covariances))
+        least = np.asarray((factors * factors / variances).min(axis=1, initial=1.0), np.float64)
+    except np.linalg.LinAlgError:  # which one is not remains to be found
+        least = np.full(1, np.nan)
+    if np.isfinite(least).all():
+        return least
+    is_in = np.isfinite(variances) & (variances != 0.0)
+    scale = np.where(is_in, 1.0 / np.sqrt(np.where(is_in, np.abs(variances), 1.0)), 0.0)
+    known = np.nan_to_num(covariances, posinf=0.0, neginf=0.0)
+    shares = known * scale[:, :, None] * scale[:, None, :]
+    np.einsum("rii->ri", shares)[~is_in] = 1.0
+    return np.array([_least_pivot(each) for each in shares])
 
 
 def _least_pivot(left: NDArray[np.float64]) -> float:
