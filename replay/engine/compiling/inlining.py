@@ -1,7 +1,6 @@
 """Compiles functions that end up in another kernel, in a quarter of the time that numba takes.
 
-No kernel's key notices a change of this file: who changes it gives FUSELOG_CACHE a new folder, else
-kernels that were kept before are loaded.
+The text of this file is part of the key of every kernel that is kept: what it changes is compiled anew.
 """
 
 from typing import Any

@@ -1,8 +1,8 @@
 """Keeps numba's kernels on disk: each is loaded, or compiled once by one process.
 
 The key of a kernel is its source text, the versions of Python, numba and NumPy, the types of its
-arguments and the processor. How numba is used is no part of it, see `inlining`. Our own compiler's
-kernels are kept by `kernels.native`.
+arguments and the processor, and how numba is used, the text of `inlining` and `through_numba`. Our own
+compiler's kernels are kept by `kernels.native`.
 """
 
 import __future__
@@ -12,7 +12,7 @@ import pickle
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
@@ -50,8 +50,7 @@ def load(text: str, title: str) -> Callable[..., Any]:
         text: the source, in which `kernel` stands.
         title: see above.
     """
-    versions = f"{sys.implementation.cache_tag} numba {numba.__version__} numpy {version('numpy')}"
-    name = f"kernel_{sha256((versions + text).encode()).hexdigest()[:24]}"
+    name = f"kernel_{sha256((_versions() + text).encode()).hexdigest()[:24]}"
     module = ModuleType(name)
     sys.modules[name] = module  # compiled code that was kept looks for it there
     execute(text, name, module)
@@ -59,6 +58,14 @@ def load(text: str, title: str) -> Callable[..., Any]:
         module.kernel._cache = code = _CompiledCode(name, title)
         module.kernel.compile = partial(code.compile, module.kernel.compile)
     return module.kernel
+
+
+@cache
+def _versions() -> str:
+    """What a kernel is made with: Python, NumPy, numba, and how numba is used."""
+    files = [Path(__file__).with_name(name) for name in ("inlining.py", "through_numba.py")]
+    how = sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+    return f"{sys.implementation.cache_tag} numba {numba.__version__} {how} numpy {version('numpy')}"
 
 
 def execute(source: str, name: str, module: ModuleType) -> None:
