@@ -41,7 +41,7 @@ def of_stamps(
         sense, at, low, high = in_sense(at, low, high, ("late", "early"))
         size, least, most = (f"{number(1e3 * each)} ms" for each in (at, low, high))
         if at >= 1.0:
-            size, least, most = (f"{number(each)} s" for each in (at, low, high))
+            size, least, most = (f"{number(each, 4)} s" for each in (at, low, high))
         if sense == "early":
             return f"{topic}: its stamps are {size} early ({least} to {most}){about}"
         return f"{topic}: comes {size} late ({least} to {most}) by its stamps{about}"
