@@ -1,5 +1,6 @@
 """Runs filters in processes of their own: a crash, a loop or a leak ends one run, with its reason."""
 
+import atexit
 import json
 import queue
 import signal
@@ -261,6 +262,13 @@ def _kept_or_new() -> Worker:
                 return worker
             worker.end()
     return Worker()
+
+
+@atexit.register
+def _end_kept() -> None:
+    with suppress(queue.Empty):
+        while True:
+            _KEPT.get_nowait().end()
 
 
 def follow_runs_apart(

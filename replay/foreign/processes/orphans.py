@@ -4,6 +4,7 @@ A process of ours waits for the end of its standard input, which only we hold: t
 end. Then it kills what it was told of.
 """
 
+import atexit
 import os
 import subprocess
 import sys
@@ -62,10 +63,19 @@ class _Guard:
                         alone = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
                     self._process = start_module(__name__, stdout=subprocess.DEVNULL, **alone)
                     self._of = os.getpid()
+                    atexit.register(self._end)
                 assert self._process.stdin is not None
                 with suppress(OSError):
                     self._process.stdin.write(line.encode())
                     self._process.stdin.flush()
+
+    def _end(self) -> None:
+        """End the guard where we end as usual: what it was told of has ended."""
+        with self._lock:
+            if self._process is not None and self._of == os.getpid():
+                with suppress(OSError):
+                    self._process.communicate()
+                self._process = None
 
 
 GUARD = _Guard()
