@@ -274,13 +274,26 @@ def test_what_is_no_ulog_is_refused_in_a_sentence(tmp_path: Path, content: bytes
 
 
 def test_a_parameter_that_changes_is_no_value_from_the_start(tmp_path: Path):
-    change = message("P", bytes([12]) + b"float SOME_X" + struct.pack("<f", 2.5))
+    """Each has its own column, in the order of the file, and a change is of its own alone."""
+
+    def parameter(name: str, value: float) -> bytes:
+        text = f"float {name}".encode()
+        return message("P", bytes([len(text)]) + text + struct.pack("<f", value))
+
     path = tmp_path / "change.ulg"
-    path.write_bytes(by_hand(last=change))
+    first = parameter("SOME_X", 1.5)
+    more = first + parameter("OTHER_Z", 7.0) + parameter("A_LAST_ONE", -3.0)
+    changes = parameter("OTHER_Z", 8.0) + parameter("SOME_X", 2.5) + parameter("SOME_X", 2.5)
+    content = by_hand()
+    half = content.index(struct.pack("<HQ", 7, 1_000_000 + 4000 * 150)) - 3
+    later = content[half:] + parameter("A_LAST_ONE", -4.0)
+    path.write_bytes(content[:half].replace(first, more) + changes + later)
     stream = streams_of(path)["/vehicle/parameters"]
-    assert stream.components == ["SOME_X"]
-    assert stream["value"].ravel().tolist() == [1.5, 2.5]
-    assert stream.publish_time_ns[1] == 1000 * (1_000_000 + 299 * 4000)
+    assert stream.components == ["SOME_X", "OTHER_Z", "A_LAST_ONE"]
+    values = [[1.5, 7.0, -3.0], [1.5, 8.0, -3.0], [2.5, 8.0, -3.0], [2.5, 8.0, -4.0]]
+    assert stream["value"].tolist() == values
+    elapsed_us = stream.publish_time_ns // 1000 - 1_000_000
+    assert elapsed_us.tolist() == [0, *[149 * 4000] * 2, 299 * 4000]
 
 
 def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(tmp_path: Path):
