@@ -4,6 +4,7 @@ What comes back, of a library in this process or in its own and of a program, is
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ SETTINGS = {"seed": 2**52 - 3, "early_s": 0.25, "late_s": 0.5, "every_s": 1.0}
 SECOND = 10**9
 SPREAD = np.array([[2.0, 0.5], [0.5, 3.0]])
 START_S, END_S = 1.5, 9.75
+LATE_NS = 300_000_000
 
 
 def a_run(run: int, failing: bool) -> MemorySource:
@@ -145,3 +147,32 @@ def test_what_a_filter_is_told_comes_back(compile_filter: Compile, tmp_path: Pat
             assert found["log_likelihood"][row] == pytest.approx(likelihood * used[row])
     assert [each for each in done.failures if "told to fail" in each] == done.failures
     assert len(done.failures) == 1
+
+
+@pytest.mark.parametrize("in_process", [True, False])
+def test_a_filter_goes_back_until_it_fails(compile_filter: Compile, in_process: bool) -> None:
+    """Ranges reach the log after what was measured behind them, which the filter is told again then."""
+    text = json.dumps(DESCRIPTION)
+    path = compile_filter(Path(__file__).with_name("telling.c"), DESCRIPTION=json.dumps(text))
+    mine = {"kind": "lib", "path": str(path), "in_process": in_process, **SETTINGS, "every_s": None}
+    sources = []
+    for source in (a_run(run, failing=run == 0) for run in range(2)):
+        near = source.streams["/a/range"]
+        late = replace(near, log_time_ns=near.publish_time_ns + LATE_NS)
+        sources.append(replace(source, streams={**source.streams, "/a/range": late}))
+    done = fl.replay(sources, {"mine": mine}, arrival_order=True, late="rewind:1")
+    for run, (source, made) in enumerate(zip(sources, done.estimates, strict=True)):
+        estimates, innovations = expected(source, run)
+        wanted = [each for each in estimates if each[7] == 2 for _ in range(2)]
+        state = made["/estimates/mine/a/state"]
+        np.testing.assert_array_equal(state.publish_time_ns, [each[0] for each in wanted])
+        np.testing.assert_allclose(state["mean"], np.array(wanted)[:, 1:], rtol=1e-14)
+        known_ns = state.log_time_ns - state.publish_time_ns
+        np.testing.assert_array_equal(known_ns, [0, LATE_NS - SECOND // 4] * (len(wanted) // 2))
+        failure = made["/estimates/mine/a/failure"]
+        failed_ns = source.streams["/a/both"].publish_time_ns[5]
+        assert failure.publish_time_ns.tolist() == [failed_ns] * (run == 0)
+        found = made["/estimates/mine/a/innovation"]
+        told = sorted(zip(found.publish_time_ns.tolist(), found["innovation"][:, 0], strict=True))
+        before = [(each[0], each[1]) for each in innovations]  # the last range comes after the failure
+        assert told == before[: len(before) - (run == 0)]
