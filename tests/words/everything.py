@@ -1,4 +1,4 @@
-"""All texts: what commands print, and below it made cases of their sentences; claims and timelines."""
+"""All texts: what commands print, with made cases of their sentences; claims, logs and timelines."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -12,6 +12,7 @@ from tests.words.made import (
     deploying,
     diagnosing,
     plausibility,
+    recorded,
     reporting,
     timelines,
     tuning,
@@ -32,12 +33,13 @@ MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
 
 
 def everything(folder: Path) -> dict[str, str]:
-    """The text of every command, of claims and timelines; an empty folder takes what commands write."""
+    """The text of every command, of claims, logs and timelines; an empty folder takes files."""
     found = commands.texts(folder)
     for command, cases in MADE.items():
         for case in cases:
             lines = [f"# {case.__doc__}", *case()]
             found[command] += "\n" + "\n".join(lines) + "\n"
     found["claims"] = "\n".join(limits.in_words()) + "\n"
+    found["recorded"] = "\n".join(recorded.in_words()) + "\n"
     found["timelines"] = "\n".join(timelines.in_words(folder)) + "\n"
     return found

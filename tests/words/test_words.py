@@ -15,7 +15,7 @@ def found(tmp_path_factory: pytest.TempPathFactory, blank_figures: None) -> Mapp
     return everything(tmp_path_factory.mktemp("words"))
 
 
-@pytest.mark.parametrize("command", [*sorted(fuselog.commands), "claims", "timelines"])
+@pytest.mark.parametrize("command", [*sorted(fuselog.commands), "claims", "recorded", "timelines"])
 def test_a_command_says_what_was_reviewed(command: str, found: Mapping[str, str]) -> None:
     """A new command comes with lines in the script of `commands`, and with its text."""
     path = path_of(command)
