@@ -30,6 +30,7 @@ GYRO_SUMS = {
     "sample_log_small": (5.786301962234, 0.40459157813, 1.310431911354),
 }
 TAGGED = "sample_logging_tagged_and_default_params"
+LATER_US = 7_000  # a message is logged after its sample
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +327,7 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     in_use = sum(1 << bit for bit in (2, 3, 4, 5, 9))  # not the height of fixes
 
     def row(number: int, stamp: int, body: bytes) -> bytes:
-        return message("D", struct.pack("<HQQ", number, stamp, stamp) + body)
+        return message("D", struct.pack("<HQQ", number, stamp + LATER_US, stamp) + body)
 
     rows = b""
     for step, flags in enumerate((in_use, 0, in_use)):
@@ -351,6 +352,8 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
         innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]
         np.testing.assert_allclose(innovation, [once, np.multiply(3, once)], rtol=1e-5)
     stream = streams["/estimates/ekf2/vehicle/gnss_position/innovation"]
+    assert stream.publish_time_ns.tolist() == [1_000_000_000, 1_200_000_000]  # as the samples were
+    assert set(stream.log_time_ns - stream.publish_time_ns) == {1000 * LATER_US}
     assert stream["accepted"].tolist() == [1, 0]  # the last is six standard deviations to the east
 
 
@@ -365,11 +368,13 @@ def test_states_are_in_our_axes_with_the_variances_of_old_and_new_firmware(
     turns = [0.005, 0.01, 0.02, 0.03] if count == 24 else turned
     variances = np.concatenate([turns, [0.1, 0.2, 0.3], [1, 2, 3], np.zeros(count - 6 - len(turns))])
     body = np.concatenate([states, variances]).astype("<f4").tobytes() + b"\x18"
-    rows = message("D", struct.pack("<HQQ", 20, 1_000_000, 1_000_000) + body)
+    rows = message("D", struct.pack("<HQQ", 20, 1_000_000 + LATER_US, 1_000_000) + body)
     path = tmp_path / "states.ulg"
     subscribed = message("A", struct.pack("<BH", 0, 20) + b"estimator_states")
     path.write_bytes(by_hand(subscribed, formats=(layout,), last=rows))
     stream = streams_of(path)["/estimates/ekf2/vehicle/state"]
+    assert stream.publish_time_ns.tolist() == [1_000_000_000]
+    assert stream.log_time_ns.tolist() == [1_000_000_000 + 1000 * LATER_US]
     [mean], [covariance] = stream["mean"], stream["covariance"].reshape(-1, 9, 9)
     np.testing.assert_allclose(mean[:6], [20, 10, -30, 2, 1, -3])
     np.testing.assert_allclose(rotate(mean[6:], np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12)
