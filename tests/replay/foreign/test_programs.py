@@ -1,5 +1,6 @@
 """Programs as filters: those that stream, and those that read a log and write estimates."""
 
+import re
 import sys
 from dataclasses import replace
 from itertools import combinations_with_replacement
@@ -171,6 +172,22 @@ def test_what_holds_for_a_whole_run_is_read_whatever_the_span() -> None:
     [bound] = estimator.bind("mine", topics, values)
     assert bound.static == ("/landmarks", "/tags", "/a/prior")
     assert bound.streams == ("/a/fix", "/a/priority")
+
+
+def test_of_two_truths_one_is_named() -> None:
+    kinds = {"/a/truth": schemas.TRUTH_STATE, "/b/truth": schemas.TRUTH_STATE, "/fix": schemas.RANGE}
+    topics = {name: Topic(name, kind.full_name, "protobuf", (), {}, 1) for name, kind in kinds.items()}
+    for named, sentence in (
+        ("", "the log has the truths /a/truth, /b/truth; say which with --set mine.truth=..."),
+        ("/c/truth", "truth = /c/truth: the log has none"),
+        ("/b/truth", ""),
+    ):
+        estimator, values = configure("mine", program("x {log} {out}", truth=named))
+        if sentence:
+            with pytest.raises(BadInput, match=re.escape(sentence)):
+                estimator.bind("mine", topics, values)
+        else:
+            assert len(estimator.bind("mine", topics, values)) == 1
 
 
 def test_a_program_that_writes_mcap(tmp_path: Path) -> None:

@@ -50,36 +50,34 @@ def a_run(run: int, failing: bool) -> MemorySource:
     range_m = np.array([1.0, 20.0, 60.0, 95.0, 30.0, 40.0 if not failing else -1.0, 12.5])
     stamps_ns = begin_ns + (at_s * SECOND).astype(np.int64)
     own: dict[str, Any] = {"range_m": range_m, "bearing_rad": 0.125 * np.arange(7) - 0.5}
-    return memory_source(
-        Recording(
-            [
-                make_stream(
-                    "/marks",
-                    schemas.LANDMARK,
-                    [begin_ns] * 2,
-                    landmark_id=[4, 5],
-                    position_m=[[1.0, 2.0], [3.0, 6.0 + run]],
-                ),
-                make_stream(
-                    "/a/prior",
-                    schemas.GAUSSIAN_ESTIMATE,
-                    [begin_ns + int(START_S * SECOND)],
-                    metadata=kinds,
-                    mean=[np.arange(9.0) + run],
-                    covariance=[(root @ root.T).ravel()],
-                ),
-                make_stream(
-                    "/a/range",
-                    schemas.RANGE,
-                    stamps_ns[1:] - SECOND // 4,
-                    target_id=np.zeros(6),
-                    range_m=np.arange(6.0),
-                ),
-                make_stream("/a/both", schemas.RANGE_BEARING, stamps_ns, target_id=np.arange(7), **own),
-            ]
+    streams = [
+        make_stream(
+            "/marks",
+            schemas.LANDMARK,
+            [begin_ns] * 2,
+            landmark_id=[4, 5],
+            position_m=[[1.0, 2.0], [3.0, 6.0 + run]],
         ),
-        RunMetadata("told", epoch_ns=begin_ns),
-    )
+        make_stream(
+            "/a/prior",
+            schemas.GAUSSIAN_ESTIMATE,
+            [begin_ns + int(START_S * SECOND)],
+            metadata=kinds,
+            mean=[np.arange(9.0) + run],
+            covariance=[(root @ root.T).ravel()],
+        ),
+        make_stream(
+            "/a/range",
+            schemas.RANGE,
+            stamps_ns[1:] - SECOND // 4,
+            target_id=np.zeros(6),
+            range_m=np.arange(6.0),
+        ),
+        make_stream("/a/both", schemas.RANGE_BEARING, stamps_ns, target_id=np.arange(7), **own),
+    ]
+    # what others estimated is no sensor's
+    others = [replace(each, topic=f"/estimates/old{each.topic}") for each in streams[1:]]
+    return memory_source(Recording([*streams, *others]), RunMetadata("told", epoch_ns=begin_ns))
 
 
 def expected(source: MemorySource, run: int) -> tuple[list[list[float]], list[list[float]]]:

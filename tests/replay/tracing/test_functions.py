@@ -308,3 +308,9 @@ def test_what_numpy_answers_with_yes_or_no_is_a_truth_and_nothing_else():
         node = graph.apply(operation, *(graph.input(k) for k in range(count)))
         with np.errstate(all="ignore"):
             assert node.is_truth == (np.asarray(function(*given)).dtype == bool), function
+
+
+@pytest.mark.parametrize("exponent", [-6, -5, -1, 1, 2, 3, 4, 7, 13])
+def test_a_power_of_a_known_number_is_known(exponent: int):
+    graph = Graph()
+    assert graph.power(graph.constant(1.5), exponent).value == pytest.approx(1.5**exponent, rel=1e-15)
