@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from pipeline.diagnosing.battery import battery
-from pipeline.diagnosing.battery.car import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
+from pipeline.diagnosing.battery.car import (
+    FAULTS,
+    UNIT_FAULTS,
+    Unit,
+    faulty,
+    recorded,
+    recorded_unit,
+    ride,
+)
 from recorders.log import Stream, make_stream, schemas
 from recorders.models.orientation import compose
 from recorders.plausibility.body import bodies
@@ -196,3 +204,19 @@ def test_errors_that_are_not_white_say_nothing_of_their_variance() -> None:
     place[rows] = np.cumsum(place[rows] * 0.15, axis=0)
     drifting = replace(slow, columns={**slow.columns, "position_m": place})
     assert findings({**clean.streams, "/car/fix": drifting}) == []
+
+
+def test_the_bias_of_forces_is_what_they_say_at_rest() -> None:
+    """A car that only turns left is always pushed to the left: that is no bias, and fits its course."""
+    sample_s, velocity_s = np.arange(0.0, 60.0, 0.02), np.arange(0.0, 60.0, 0.2)
+    rest_s, speed_mps, turn_radps = 30.0, 6.0, 0.4
+    turns = np.where(sample_s > rest_s, turn_radps, 0.0)
+    pushed = np.array([0.3, -0.2, 9.81]) + np.outer(turns, [0.0, speed_mps, 0.0])
+    angle = turn_radps * np.maximum(velocity_s - rest_s, 0.0)
+    speeds = np.where(velocity_s > rest_s, speed_mps, 0.0)
+    velocity = speeds[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    motion = motion_of(recorded_unit(Unit(sample_s, pushed, turns, velocity_s, velocity)).streams)
+    found = motion.forces(motion.body.forces[0])
+    assert found is not None
+    assert found.fit > 0.99
+    assert abs(found.angle_rad) < 0.1

@@ -30,6 +30,7 @@ GYRO_SUMS = {
     "sample_log_small": (5.786301962234, 0.40459157813, 1.310431911354),
 }
 TAGGED = "sample_logging_tagged_and_default_params"
+LATER_US = 7_000  # a message is logged after its sample
 
 
 @pytest.fixture(scope="module")
@@ -274,13 +275,26 @@ def test_what_is_no_ulog_is_refused_in_a_sentence(tmp_path: Path, content: bytes
 
 
 def test_a_parameter_that_changes_is_no_value_from_the_start(tmp_path: Path):
-    change = message("P", bytes([12]) + b"float SOME_X" + struct.pack("<f", 2.5))
+    """Each has its own column, in the order of the file, and a change is of its own alone."""
+
+    def parameter(name: str, value: float) -> bytes:
+        text = f"float {name}".encode()
+        return message("P", bytes([len(text)]) + text + struct.pack("<f", value))
+
     path = tmp_path / "change.ulg"
-    path.write_bytes(by_hand(last=change))
+    first = parameter("SOME_X", 1.5)
+    more = first + parameter("OTHER_Z", 7.0) + parameter("A_LAST_ONE", -3.0)
+    changes = parameter("OTHER_Z", 8.0) + parameter("SOME_X", 2.5) + parameter("SOME_X", 2.5)
+    content = by_hand()
+    half = content.index(struct.pack("<HQ", 7, 1_000_000 + 4000 * 150)) - 3
+    later = content[half:] + parameter("A_LAST_ONE", -4.0)
+    path.write_bytes(content[:half].replace(first, more) + changes + later)
     stream = streams_of(path)["/vehicle/parameters"]
-    assert stream.components == ["SOME_X"]
-    assert stream["value"].ravel().tolist() == [1.5, 2.5]
-    assert stream.publish_time_ns[1] == 1000 * (1_000_000 + 299 * 4000)
+    assert stream.components == ["SOME_X", "OTHER_Z", "A_LAST_ONE"]
+    values = [[1.5, 7.0, -3.0], [1.5, 8.0, -3.0], [2.5, 8.0, -3.0], [2.5, 8.0, -4.0]]
+    assert stream["value"].tolist() == values
+    elapsed_us = stream.publish_time_ns // 1000 - 1_000_000
+    assert elapsed_us.tolist() == [0, *[149 * 4000] * 2, 299 * 4000]
 
 
 def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(tmp_path: Path):
@@ -313,7 +327,7 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
     in_use = sum(1 << bit for bit in (2, 3, 4, 5, 9))  # not the height of fixes
 
     def row(number: int, stamp: int, body: bytes) -> bytes:
-        return message("D", struct.pack("<HQQ", number, stamp, stamp) + body)
+        return message("D", struct.pack("<HQQ", number, stamp + LATER_US, stamp) + body)
 
     rows = b""
     for step, flags in enumerate((in_use, 0, in_use)):
@@ -338,6 +352,8 @@ def test_innovations_are_what_was_measured_minus_what_was_predicted_in_our_axes(
         innovation = streams[f"/estimates/ekf2/vehicle/{name}/innovation"]["innovation"]
         np.testing.assert_allclose(innovation, [once, np.multiply(3, once)], rtol=1e-5)
     stream = streams["/estimates/ekf2/vehicle/gnss_position/innovation"]
+    assert stream.publish_time_ns.tolist() == [1_000_000_000, 1_200_000_000]  # as the samples were
+    assert set(stream.log_time_ns - stream.publish_time_ns) == {1000 * LATER_US}
     assert stream["accepted"].tolist() == [1, 0]  # the last is six standard deviations to the east
 
 
@@ -352,11 +368,13 @@ def test_states_are_in_our_axes_with_the_variances_of_old_and_new_firmware(
     turns = [0.005, 0.01, 0.02, 0.03] if count == 24 else turned
     variances = np.concatenate([turns, [0.1, 0.2, 0.3], [1, 2, 3], np.zeros(count - 6 - len(turns))])
     body = np.concatenate([states, variances]).astype("<f4").tobytes() + b"\x18"
-    rows = message("D", struct.pack("<HQQ", 20, 1_000_000, 1_000_000) + body)
+    rows = message("D", struct.pack("<HQQ", 20, 1_000_000 + LATER_US, 1_000_000) + body)
     path = tmp_path / "states.ulg"
     subscribed = message("A", struct.pack("<BH", 0, 20) + b"estimator_states")
     path.write_bytes(by_hand(subscribed, formats=(layout,), last=rows))
     stream = streams_of(path)["/estimates/ekf2/vehicle/state"]
+    assert stream.publish_time_ns.tolist() == [1_000_000_000]
+    assert stream.log_time_ns.tolist() == [1_000_000_000 + 1000 * LATER_US]
     [mean], [covariance] = stream["mean"], stream["covariance"].reshape(-1, 9, 9)
     np.testing.assert_allclose(mean[:6], [20, 10, -30, 2, 1, -3])
     np.testing.assert_allclose(rotate(mean[6:], np.array([1.0, 0, 0])), [0, 1, 0], atol=1e-12)

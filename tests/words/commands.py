@@ -73,6 +73,7 @@ scenarios
 scenarios landmarks
 models
 models robot
+models batch-reactor --formulas
 estimators
 estimators ekf
 metrics

@@ -1,4 +1,4 @@
-"""All texts: what commands print, and below it made cases of their sentences."""
+"""All texts: what commands print, with made cases of sentences; claims, models, logs and timelines."""
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -11,8 +11,11 @@ from tests.words.made import (
     comparing,
     deploying,
     diagnosing,
+    modelled,
     plausibility,
+    recorded,
     reporting,
+    timelines,
     tuning,
 )
 
@@ -31,11 +34,14 @@ MADE: Mapping[str, tuple[Callable[[], Iterable[str]], ...]] = {
 
 
 def everything(folder: Path) -> dict[str, str]:
-    """The text of every command, and of claims; an empty folder takes what commands write."""
+    """The text of every command, of claims, models, logs, timelines; an empty folder takes files."""
     found = commands.texts(folder)
     for command, cases in MADE.items():
         for case in cases:
             lines = [f"# {case.__doc__}", *case()]
             found[command] += "\n" + "\n".join(lines) + "\n"
     found["claims"] = "\n".join(limits.in_words()) + "\n"
+    found["modelled"] = "\n".join(modelled.in_words()) + "\n"
+    found["recorded"] = "\n".join(recorded.in_words()) + "\n"
+    found["timelines"] = "\n".join(timelines.in_words(folder)) + "\n"
     return found

@@ -224,7 +224,7 @@ def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> F
         root[:, 0, 0] = np.sqrt(covariances[:, 0, 0])
         root[:, 1, 0] = covariances[:, 1, 0] / root[:, 0, 0]
         root[:, 1, 1] = np.sqrt(covariances[:, 1, 1] - root[:, 1, 0] ** 2)
-    return means[:, None, :] + (root @ circle).transpose(0, 2, 1)
+        return means[:, None, :] + (root @ circle).transpose(0, 2, 1)
 
 
 def draw_lines(

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from recorders.errors import BadInput
 from replay.estimators.networks.covariance_intersection import RULES, fuse
+from replay.estimators.networks.nodes import observe
 from replay.estimators.networks.pairwise import Stake, sighting_weight
 
 PAIR = np.array([np.diag([1.0, 4.0]), [[3.0, 1.0], [1.0, 1.0]]])
@@ -212,3 +213,18 @@ def test_what_cannot_be_inverted_is_refused_by_every_rule(name):
 def test_an_unknown_rule_is_refused_with_those_there_are():
     with pytest.raises(BadInput, match="ci-trace"):
         fuse("best", np.zeros((2, 2)), PAIR)
+
+
+def test_what_is_all_independent_stays_so_in_an_update() -> None:
+    """By Joseph's form, of a measurement that lacks a component; against that in matrices."""
+    root = np.random.default_rng(4).normal(size=(4, 4))
+    covariance, mean = root @ root.T, np.array([1.0, 2.0, 3.0, 4.0])
+    value, variance = np.array([1.5, np.nan, 2.0, np.nan]), np.array([0.5, 1.0, 2.0, 1.0])
+    rows, noise = np.eye(4)[[0, 2]], np.diag([0.5, 2.0])
+    gain = covariance @ rows.T @ np.linalg.inv(rows @ covariance @ rows.T + noise)
+    expected = mean + gain @ (value[[0, 2]] - mean[[0, 2]])
+    after = (np.eye(4) - gain @ rows) @ covariance
+    found = [mean.copy(), covariance.copy(), covariance.copy()]
+    observe(*found, value, variance)
+    for have, want in zip(found, (expected, after, after), strict=True):
+        np.testing.assert_allclose(have, want, rtol=1e-9, atol=1e-12)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -199,6 +200,14 @@ def test_numbers_of_other_units_and_clocks_are_told():
     assert_allclose(turned.mean, right.mean, atol=1e-9)
     with pytest.raises(BadInput, match=r"no message of /body/fix within the span .* clocks agree"):
         align(streams, NavigationParameters(fix_delay_s=3600.0))
+    # what is stated of the start is its covariance, about the body's axes where it leans
+    stated = align(streams, NavigationParameters(**SETTINGS))
+    up = Rotation.from_quat(stated.mean[6:10], scalar_first=True).inv().apply([0.0, 0.0, 1.0])
+    tilt, heading = (SETTINGS[f"{name}_sigma_rad"] ** 2 for name in ("tilt", "heading"))
+    sigmas = [SETTINGS[name] for name in ("start_sigma_m", "start_sigma_mps", "gyro_bias_sigma_radps")]
+    blocks = [sigma**2 * np.eye(3) for sigma in sigmas]
+    blocks.insert(2, tilt * np.eye(3) + (heading - tilt) * np.outer(up, up))
+    assert_allclose(stated.covariance[:12, :12], block_diag(*blocks), atol=1e-12)
 
 
 # --- the walk, section 2 of the sheet; its outages are in the study `gnss-ins` ---------------------

@@ -14,6 +14,7 @@ from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.blocks import Block, gather, merge_events
 from replay.engine.streams.sources import MemorySource, memory_source
+from replay.estimators.tracking.report_association import ReportSettings, is_held
 from replay.judging.metrics.measuring import Output, find_metrics, measure
 from replay.judging.tracks.tracks import kept, live_counts, track_table
 
@@ -242,3 +243,21 @@ def test_other_parts_of_the_solent_do_as_well(real_data: Path):
         found = kept(track_table(things[rows].astype(np.int64), tracks))
         assert found.kept_share >= 0.70, name
         assert found.mean_share >= 0.88, name
+
+
+@pytest.mark.parametrize(
+    ("course_rad", "before_rad", "is_so"),
+    [
+        (1.0, 1.0, True),
+        (1.0, 1.09, True),
+        (1.0, 1.11, False),
+        (0.02, 2 * np.pi - 0.07, True),  # across north
+        (0.02, 2 * np.pi - 0.09, False),
+        (np.nan, np.nan, True),
+        (np.nan, 1.0, False),
+        (1.0, np.nan, False),
+    ],
+)
+def test_a_course_is_held_within_its_width(course_rad: float, before_rad: float, is_so: bool) -> None:
+    settings = ReportSettings(*np.zeros(len(ReportSettings._fields)))._replace(course_width_rad=0.1)
+    assert is_held(course_rad, before_rad, settings) == is_so

@@ -1,7 +1,9 @@
 """Programs as filters: those that stream, and those that read a log and write estimates."""
 
+import re
 import sys
 from dataclasses import replace
+from itertools import combinations_with_replacement
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from recorders.log.opening import Topic
 from recorders.recording import Recording
 from replay.engine.replaying.estimator import configure
 from replay.engine.streams.sources import memory_source
+from replay.engine.vectors.tangent import tangent_components
 from replay.foreign.description import TopicRead
 from replay.foreign.files.estimates import read_estimates
 from replay.foreign.naming import Allowed
@@ -171,6 +174,22 @@ def test_what_holds_for_a_whole_run_is_read_whatever_the_span() -> None:
     assert bound.streams == ("/a/fix", "/a/priority")
 
 
+def test_of_two_truths_one_is_named() -> None:
+    kinds = {"/a/truth": schemas.TRUTH_STATE, "/b/truth": schemas.TRUTH_STATE, "/fix": schemas.RANGE}
+    topics = {name: Topic(name, kind.full_name, "protobuf", (), {}, 1) for name, kind in kinds.items()}
+    for named, sentence in (
+        ("", "the log has the truths /a/truth, /b/truth; say which with --set mine.truth=..."),
+        ("/c/truth", "truth = /c/truth: the log has none"),
+        ("/b/truth", ""),
+    ):
+        estimator, values = configure("mine", program("x {log} {out}", truth=named))
+        if sentence:
+            with pytest.raises(BadInput, match=re.escape(sentence)):
+                estimator.bind("mine", topics, values)
+        else:
+            assert len(estimator.bind("mine", topics, values)) == 1
+
+
 def test_a_program_that_writes_mcap(tmp_path: Path) -> None:
     """Its estimates and innovations, with their topics' ends, are judged like those that it wrote."""
     log, written = fl.record("landmarks", seed=1, duration_s=2.0), tmp_path / "written.mcap"
@@ -252,3 +271,26 @@ def test_seconds_of_a_table_are_the_nearest_nanoseconds(tmp_path: Path) -> None:
     topic = memory_source(Recording([truth]), RunMetadata("own", epoch_ns=0)).topics["/truth"]
     [read] = read_estimates(path, "mine", topic).values()
     np.testing.assert_array_equal(read.publish_time_ns, milliseconds * 10**6)
+
+
+def test_a_tables_covariance_has_every_entry_in_its_place(tmp_path: Path) -> None:
+    """Named in either order, of a state with an orientation, whose tangent space has three."""
+    kinds = {
+        "x_m": "linear",
+        **{f"orientation_{each}": "quaternion" for each in "wxyz"},
+        "v_mps": "linear",
+    }
+    stated = {"components": ",".join(kinds), "kinds": ",".join(kinds.values())}
+    truth = make_stream("/truth", schemas.TRUTH_STATE, [0], metadata=stated, state=[[0, 1, 0, 0, 0, 0]])
+    topic = memory_source(Recording([truth]), RunMetadata("own", epoch_ns=0)).topics["/truth"]
+    names = [name for name, _ in tangent_components(list(kinds), list(kinds.values()))]
+    root = np.random.default_rng(3).normal(size=(2, len(names), len(names)))
+    covariance = root @ root.transpose(0, 2, 1)
+    columns = {"time_ns": [7, 9], **{name: [0.5, 0.5] for name in kinds}}
+    for i, j in combinations_with_replacement(range(len(names)), 2):
+        of = names[i], names[j]
+        columns["cov_" + "_".join(of if (i + j) % 2 else of[::-1])] = covariance[:, i, j]
+    pd.DataFrame(columns).to_csv(tmp_path / "estimates.csv", index=False)
+    [read] = read_estimates(tmp_path / "estimates.csv", "mine", topic).values()
+    assert len(names) == 5
+    np.testing.assert_allclose(read["covariance"].reshape(covariance.shape), covariance, rtol=1e-15)

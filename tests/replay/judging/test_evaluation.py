@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from recorders.errors import BadInput
@@ -215,6 +216,27 @@ def test_a_component_without_truth_is_left_out_of_errors_and_nees():
     judged = ACCURACY.of(errors)
     assert np.isnan(judged.pop("heading_rmse_rad"))
     assert judged == pytest.approx({"position_rmse_m": np.sqrt(5), "estimates_without_truth": 0})
+
+
+def test_an_orientation_keeps_its_block_where_other_components_are_left_out():
+    """Three of the tangent space for its four components; the truth has another order and more."""
+    own = {f"orientation_{each}": "quaternion" for each in "wxyz"}
+    kinds = {"x_m": "linear", **own, "y_m": "linear", "v_mps": "linear"}
+    root = np.random.default_rng(2).normal(size=(6, 6))
+    covariance = root @ root.T
+    turned = np.array([0.02, -0.03, 0.05])
+    mean = [1, *Rotation.from_rotvec(turned).as_quat(scalar_first=True), 9, 4]
+    stated = {"components": ",".join(kinds), "kinds": ",".join(kinds.values())}
+    stream = gather([estimates([1], [mean], covariance, **stated)])
+    known = {"v_mps": "linear", **own, "w_mps": "linear", "x_m": "linear"}
+    stated = {"components": ",".join(known), "kinds": ",".join(known.values())}
+    errors = errors_of(stream, [Truths(source(truth([1], [[2, 1, 0, 0, 0, 9, 3]], **stated)))])
+    assert errors is not None
+    kept = [0, 1, 2, 3, 5]  # x, the orientation, v
+    error = np.array([-2, *turned, 2])
+    assert_allclose(errors.error, [error], atol=1e-12)
+    assert_array_equal(errors.covariance, [covariance[kept][:, kept]])
+    assert_allclose(errors.nees, error @ np.linalg.solve(covariance[kept][:, kept], error), rtol=1e-9)
 
 
 def test_of_an_ensemble_only_what_all_truths_have_is_judged():

@@ -1,5 +1,6 @@
 """Runs with estimates that are made, not replayed, drawn and read back."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,10 +15,11 @@ from replay.engine.vectors.tangent import tangent_components
 from replay.judging.errors.evaluation import Errors, Floats
 from replay.judging.judge import Judge
 from replay.timeline.show import show
-from tests.replay.timeline.reading import Picture, Titles, Wanted, picture_of, quality
+from tests.replay.timeline.reading import Picture, Titles, Wanted, check_clocks, picture_of, quality
 
 ESTIMATORS = ("one", "two")
 PLANE = ("x_m", "y_m")
+LATE_NS = 3_700_000_000
 
 
 class Drawn(NamedTuple):
@@ -82,12 +84,23 @@ def drawn(folder: Path, source: MemorySource, made: list[Stream]) -> Drawn:
     found = Judge([source], {}, gap_limit_s=2.0).add(outputs).errors
     errors = [each for each in found if each is not None]
     show(source, outputs, errors, save=folder / "run.rrd")
-    return Drawn(source, {each.topic: each for each in made}, errors, picture_of(folder / "run.rrd"))
+    picture = picture_of(folder / "run.rrd")
+    check_clocks(picture.moving, source.epoch_ns, made)
+    return Drawn(source, {each.topic: each for each in made}, errors, picture)
 
 
 def record(scenario: str, **parameters: Any) -> MemorySource:
-    """A run of a scenario in memory."""
-    return memory_source(*record_run(scenario, parameters, 5, 0))
+    """A run of a scenario in memory, logged after it was measured."""
+    return logged_late(memory_source(*record_run(scenario, parameters, 5, 0)))
+
+
+def logged_late(source: MemorySource) -> MemorySource:
+    """The same run, each message of which reaches the log 3.7 s after its stamp: stamps are drawn."""
+    late = {
+        topic: replace(stream, log_time_ns=stream.publish_time_ns + LATE_NS)
+        for topic, stream in source.streams.items()
+    }
+    return replace(source, streams=late)
 
 
 def of_both(source: MemorySource, *cases: str, rows: slice = slice(1, None)) -> list[Stream]:

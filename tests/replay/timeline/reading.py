@@ -12,6 +12,7 @@ import rerun.chunk as rc
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from recorders.log import Stream
 from replay.judging.errors.evaluation import Errors, Floats, chi_square_interval
 from replay.timeline.drawing.canvas import MUTED, PALETTE, TRUTH, Colour
 from tests.replay.timeline.test_timeline import Columns, read, told
@@ -209,6 +210,16 @@ def compare(moving: Mapping[str, Columns], wanted: Mapping[str, Wanted]) -> None
         values = np.asarray(values, float)
         relative, absolute = TOLERANCES.get(how, (1e-4, 1e-5 * max(np.abs(values).max(), 1.0)))
         np.testing.assert_allclose(found, values, relative, absolute, err_msg=entity)
+
+
+def check_clocks(moving: Mapping[str, Columns], epoch_ns: int, made: Sequence[Stream]) -> None:
+    """All that moves is on three clocks: stamps, time since the epoch, and the number of estimates."""
+    steps_ns = np.unique(np.concatenate([[0], *(each.publish_time_ns for each in made)]))[1:]
+    for entity, columns in moving.items():
+        stamps = np.array(columns["utc"])
+        assert np.array_equal(columns["sim_time"], stamps - epoch_ns), entity
+        before = np.searchsorted(steps_ns, stamps, side="right")
+        assert np.array_equal(columns["step"], np.maximum(before - 1, 0)), entity
 
 
 def consistent(degrees: int, time_ns: Any) -> Wanted:

@@ -13,7 +13,7 @@ from recorders.recording import Recording
 from replay.engine.streams.sources import MemorySource, memory_source
 from replay.timeline.drawing.canvas import PALETTE, WRONG
 from replay.timeline.show import Drawing
-from tests.replay.timeline.making import ESTIMATORS, columns, drawn, of_both, record
+from tests.replay.timeline.making import ESTIMATORS, columns, drawn, logged_late, of_both, record
 from tests.replay.timeline.reading import Wanted, check_views, compare, picture_of
 
 SECOND = 10**9
@@ -22,7 +22,7 @@ PLANE = {"components": "x_m,y_m", "kinds": "linear,linear"}
 
 def own(scenario: str, *streams: object) -> MemorySource:
     """A run of streams that are made."""
-    return memory_source(Recording([*streams]), RunMetadata(scenario, epoch_ns=SECOND))
+    return logged_late(memory_source(Recording([*streams]), RunMetadata(scenario, epoch_ns=SECOND)))
 
 
 def test_sets_are_drawn_with_their_areas(tmp_path: Path) -> None:

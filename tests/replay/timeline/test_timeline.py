@@ -370,6 +370,8 @@ def test_ellipses_lie_on_the_chosen_level_and_are_nan_without_one(seed: int) -> 
     np.testing.assert_allclose(squared, chi2.ppf(0.9, 2), rtol=1e-6)
     np.testing.assert_allclose(outlines[0, 0], outlines[0, -1], rtol=1e-9, atol=1e-9)
     assert np.isnan(outlines[1]).any()
+    flat = ellipses(means, np.array([np.zeros((2, 2)), [[0.0, 1.0], [1.0, 0.0]]]))
+    assert not np.isfinite(flat).all(axis=(1, 2)).any()
 
 
 def test_a_scenario_without_a_timeline_gets_every_component(ensemble: Replayed, tmp_path: Path) -> None:

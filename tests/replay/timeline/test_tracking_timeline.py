@@ -10,68 +10,76 @@ from recorders.recording import SIMULATION_EPOCH_NS
 from replay.engine.replaying.estimator import bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.judging.tracks.errors import instants_of, track_errors, tracks_at
+from replay.timeline.families.tracking import RAY_M
 from replay.timeline.show import show
-from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, passing, sensor
-from tests.replay.timeline.reading import Wanted, check_views, compare, picture_of
+from tests.replay.estimators.test_tracker import CAMERA, RADAR, SECOND, log, sensor
+from tests.replay.timeline.making import PLANE, block, columns, ellipses, logged_late, path, unit
+from tests.replay.timeline.reading import Wanted, check_clocks, check_views, compare, picture_of
 from tests.replay.timeline.test_timeline import read, told
 
 
 def test_the_map_holds_scans_rays_and_tracks(tmp_path: Path, uncompiled: None):
-    """The sensors are on a ship at (10, 0); its radar sees nothing at 15 s."""
+    """The sensors are on a ship that moves; its radar sees nothing at 15 s. All is logged late."""
     seconds = np.arange(24)
     stamps = SIMULATION_EPOCH_NS + seconds * SECOND
-    seen = [[(x - 10.0, y)] for [(x, y)] in passing(24)]
+    own = np.stack([10.0 + seconds, -0.5 * seconds], axis=1)
+    target = np.stack([2.0 * seconds, np.full(24, 100.0)], axis=1)
+    seen = [[tuple(each)] for each in target - own]
     seen[15] = []
-    bearings = [[np.arctan2(100.0, 2.0 * second - 10.0)] for second in seconds]
-    place = state_metadata(("x_m", "y_m"))
+    bearings = [[np.arctan2(y, x)] for x, y in target - own]
+    place = state_metadata(PLANE)
     ship = make_stream(
         "/ship/fix",
         schemas.POSITION_FIX,
         stamps,
         metadata=place,
-        position_m=np.tile([10.0, 0.0], (24, 1)),
+        position_m=own,
         covariance_m2=np.full((24, 4), np.nan),
     )
-    truth = make_stream(
-        "/vessel/truth",
-        schemas.TRUTH_STATE,
-        stamps,
-        metadata=place,
-        state=np.stack([2.0 * seconds, np.full(24, 100.0)], axis=1),
-    )
-    source = log(
-        [ship, truth],
-        sensor("radar", {**RADAR, "origin": "/ship/fix"}, seconds, seen),
-        sensor("camera", {**CAMERA, "origin": "/ship/fix"}, seconds, bearings),
-        scenario="autoferry",
+    truth = make_stream("/vessel/truth", schemas.TRUTH_STATE, stamps, metadata=place, state=target)
+    source = logged_late(
+        log(
+            [ship, truth],
+            sensor("radar", {**RADAR, "origin": "/ship/fix"}, seconds, seen),
+            sensor("camera", {**CAMERA, "origin": "/ship/fix"}, seconds, bearings),
+            scenario="autoferry",
+        )
     )
     outputs = collect(replay([source], bind("jipda", [source], {"kind": "tracker:jipda"})))
     show(source, outputs, [], save=tmp_path / "run.rrd")
-    found = read(tmp_path / "run.rrd")
-    points = found["/map/scans/radar"]["Points2D:positions"]
-    assert [len(row) for row in points] == [1] * 15 + [0] + [1] * 8
-    np.testing.assert_allclose(np.concatenate(points[:3]), [[0, 100], [2, 100], [4, 100]], atol=1e-5)
-    rays = [strip for row in found["/map/scans/camera"]["LineStrips2D:strips"] for strip in row]
-    np.testing.assert_allclose(np.array(rays)[:, 0], np.tile([10, 0], (24, 1)), atol=1e-5)
-    tracks = outputs["/estimates/jipda/track"].stream
-    assert set(tracks["track_id"]) == {1}
-    way = found["/map/jipda/track1/way"]["LineStrips2D:strips"]
-    assert len(way) == len(tracks) - 1
-    np.testing.assert_allclose(way[-1][0][1], tracks["mean"][-1][[0, 2]], rtol=1e-5)
-    legend = read(tmp_path / "run.rrd", static=True)["/map/legend"]
-    assert legend["Points2D:labels"] == [["truth", "sensors", "radar", "camera"]]
-    at_ns, truths = instants_of(source)
-    sizes = outputs["/estimates/jipda/set"].stream
-    gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
-    existence = outputs["/estimates/jipda/existence"].stream
-    curves = {
-        "gospa/jipda": (at_ns, gospa),
-        "count/jipda": (sizes.publish_time_ns, sizes["elements"]),
-        "existence/track1": (tracks.publish_time_ns, existence["existence"]),
-    }
     picture = picture_of(tmp_path / "run.rrd")
-    plots = {name: picture.moving[f"/plots/{name}"] for name in curves}
-    compare(plots, {name: Wanted("curve", *curve) for name, curve in curves.items()})
+    tracks, sizes, existence, pairs = (
+        outputs[f"/estimates/jipda/{leaf}"].stream
+        for leaf in ("track", "set", "existence", "association")
+    )
+    assert set(tracks["track_id"]) == {1}
+    heard = seconds[seconds != 15]
+    way = columns(tracks, "mean", *PLANE)
+    at_ns, truths = instants_of(source)
+    gospa = track_errors(tracks_at(sizes, tracks, at_ns), truths).gospa
+    at = (pairs.publish_time_ns - SIMULATION_EPOCH_NS) // SECOND
+    last = np.searchsorted(tracks.publish_time_ns, pairs.publish_time_ns, side="right") - 1
+    by_radar = pairs["sensor_id"] == pairs.metadata["sensors"].split(",").index("radar")
+    lines = np.stack([way[last], target[at]], axis=1)[by_radar]
+    away = RAY_M * unit(np.ravel(bearings))
+    wanted = {
+        "/map/scans/radar": Wanted("dots", stamps[heard], target[heard]),
+        "/map/scans/camera": Wanted("lines", stamps, np.stack([own, own + away], axis=1)),
+        "/map/ground/ship/fix": path(ship, own),
+        "/map/ground/vessel/truth": path(truth, target),
+        "/map/jipda/track1/way": path(tracks, way),
+        "/map/jipda/track1/ellipse": ellipses(tracks, way, block(tracks, *PLANE)),
+        "/map/jipda/associations/radar": Wanted("lines", pairs.publish_time_ns[by_radar], lines),
+        "/plots/gospa/jipda": Wanted("curve", at_ns, gospa),
+        "/plots/count/jipda": Wanted("curve", sizes.publish_time_ns, sizes["elements"]),
+        "/plots/existence/track1": Wanted("curve", tracks.publish_time_ns, existence["existence"]),
+        "/events/jipda": Wanted("told", tracks.publish_time_ns[:1], ["jipda: track 1 is confirmed"]),
+    }
+    compare(picture.moving, wanted)
+    check_clocks(picture.moving, SIMULATION_EPOCH_NS, [each.stream for each in outputs.values()])
+    empty = [len(row) == 0 for row in picture.moving["/map/scans/radar"]["Points2D:positions"]]
+    assert np.flatnonzero(empty).tolist() == [15]
+    assert picture.still["/map/legend"]["Points2D:labels"] == [["truth", "sensors", "radar", "camera"]]
     titles = {("GOSPA (m), c = 20 m", "plots/gospa"), ("Confirmed tracks", "plots/count")}
     titles |= {("Existence", "plots/existence"), ("Events", "events"), ("jipda", "map/jipda")}
     check_views(picture, titles, [])
@@ -96,7 +104,7 @@ def test_associations_and_what_happened(tmp_path: Path, uncompiled: None):
         state=np.stack([2.0 * seconds, np.full(50, 100.0)], axis=1),
     )
     radar = sensor("radar", {**RADAR, "joined_within_m": "12.0"}, seconds, seen)
-    source = log([truth], radar, scenario="autoferry")
+    source = logged_late(log([truth], radar, scenario="autoferry"))
     outputs = collect(
         replay([source], bind("hungarian", [source], {"kind": "tracker", "association": "hungarian"}))
     )

@@ -21,7 +21,7 @@ from replay.inference.model.checking import check_model
 from replay.inference.model.model import Model
 from replay.tracing.functions import Shape, TracedFunction, traced
 from replay.tracing.graph import Graph
-from replay.tracing.traced import where
+from replay.tracing.traced import _LOGICAL, _OPERATORS, PRIMITIVES, where
 from tests.replay.inference.replays import outputs
 from tests.replay.inference.scalar import SCALAR, VALUE, source
 from tests.replay.tracing.calls import by_compiler, by_python, linearised, over_points
@@ -296,3 +296,21 @@ def test_a_graph_holds_just_as_many_nodes_as_it_says(monkeypatch: pytest.MonkeyP
         graph.constant(value)
     with pytest.raises(BadInput, match="more than 3 operations"):
         graph.constant(4.0)
+
+
+def test_what_numpy_answers_with_yes_or_no_is_a_truth_and_nothing_else():
+    """As a truth it is a condition, has no slope, and is an int in C."""
+    graph = Graph()
+    operations = {**{each: each for each in PRIMITIVES}, **_OPERATORS}
+    for function, operation in operations.items():
+        count = getattr(function, "nin", 1)
+        given = [operation in _LOGICAL or 0.5] * count
+        node = graph.apply(operation, *(graph.input(k) for k in range(count)))
+        with np.errstate(all="ignore"):
+            assert node.is_truth == (np.asarray(function(*given)).dtype == bool), function
+
+
+@pytest.mark.parametrize("exponent", [-6, -5, -1, 1, 2, 3, 4, 7, 13])
+def test_a_power_of_a_known_number_is_known(exponent: int):
+    graph = Graph()
+    assert graph.power(graph.constant(1.5), exponent).value == pytest.approx(1.5**exponent, rel=1e-15)

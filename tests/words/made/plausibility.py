@@ -5,7 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.diagnosing.battery.car import FAULTS, UNIT_FAULTS, faulty, recorded, recorded_unit, ride
+from pipeline.diagnosing.battery.car import (
+    FAULTS,
+    UNIT_FAULTS,
+    faulty,
+    recorded,
+    recorded_unit,
+    ride,
+)
 from recorders.log import Stream
 from recorders.plausibility.checks import findings
 
@@ -14,6 +21,14 @@ def of_car() -> Iterator[str]:
     """A car with a compass: without a fault, and with each."""
     for name in FAULTS:
         yield f"{name}: {_said(recorded(faulty(2000, name)).streams)}"
+
+
+def of_car_without_compass() -> Iterator[str]:
+    """The same car without its compass: which of two is mirrored, nothing tells."""
+    for name in ("turn rate's sign", "E, N exchanged"):
+        streams = dict(recorded(faulty(2000, name)).streams)
+        del streams["/car/heading"]
+        yield f"{name}: {_said(streams)}"
 
 
 def of_unit() -> Iterator[str]:
@@ -42,4 +57,4 @@ def _said(streams: dict[str, Stream]) -> str:
     return " / ".join(each.mended for each in findings(streams)) or "nothing"
 
 
-FOUND = (of_car, of_unit, of_stamps)
+FOUND = (of_car, of_car_without_compass, of_unit, of_stamps)

@@ -1,0 +1,139 @@
+"""Timelines in words: how views are laid out, and of every entity how it looks and when it moves.
+
+Estimates are made; what values are drawn is tested in `tests/replay/timeline`.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import rerun.chunk as rc
+
+from replay.engine.streams.blocks import gather
+from replay.judging.judge import Judge
+from replay.timeline.show import show
+from tests.replay.timeline.making import estimate, record
+from tests.replay.timeline.test_timeline import Columns, read
+
+# By scenario, parameters of a short run, and whose estimates are made.
+FAMILIES: Mapping[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "acoustic-shots": ({"shots": 2}, ("shooter",)),
+    "axis": ({"steps": 4}, ("",)),
+    "biometric-scores": ({"users": 20}, ()),
+    "crossing": ({"duration_s": 4.0}, ()),
+    "extended-target": ({"points": 8}, ("",)),
+    "ispace": ({"steps": 4}, ("node1", "node2")),
+    "landmarks": ({"duration_s": 1.0, "landmarks": 3}, ("robot1",)),
+    "navigation": ({"duration_s": 12.0}, ()),
+    "optical-los": ({}, ("",)),
+    "orientation": ({"steps": 4}, ("",)),
+    "relative-bearings": ({"looks": 4}, ()),
+    "torus-headings": ({"steps": 4}, ("",)),
+    "vehicles": ({"duration_s": 2.0, "vehicles": 2}, ("vehicle1", "vehicle2", "infrastructure")),
+}
+OTHER = "of no family"  # the robots' log, by schema
+KINDS = {1: "tabs", 2: "side by side", 3: "one below the other", 4: "a grid"}
+# What is drawn is tested elsewhere, and is long.
+DATA = ("positions", "strips", "centers", "half_sizes", "quaternions", "buffer", "line_strings")
+
+
+def in_words(folder: Path) -> Iterator[str]:
+    """The layout and the entities of a short run of every family."""
+    recorded = {name: (record(name, **given), cases) for name, (given, cases) in FAMILIES.items()}
+    robots, cases = recorded["landmarks"]
+    recorded[OTHER] = replace(robots, run=replace(robots.run, scenario=OTHER)), cases
+    for scenario, (source, cases) in recorded.items():
+        common = source.streams.get("/truth")
+        truths = {case: source.streams.get(f"/{case}/truth", common) for case in cases}
+        made = [estimate("one", case, truth) for case, truth in truths.items() if truth is not None]
+        outputs = {each.topic: gather([each]) for each in made}
+        errors = Judge([source], {}, gap_limit_s=2.0).add(outputs).errors
+        path = folder / f"{scenario}.rrd"
+        show(source, outputs, [each for each in errors if each is not None], save=path)
+        yield f"# {scenario}"
+        yield from _layout(path)
+        moving, still = read(path), read(path, static=True)
+        alike: dict[str, list[str]] = defaultdict(list)
+        for entity in sorted({*moving, *still}):
+            told = ", ".join([*_looks(still.get(entity, {})), *_moves(moving.get(entity, {}))])
+            alike[told].append(entity)
+        for told, entities in alike.items():
+            yield from entities[:-1]
+            yield f"{entities[-1]}: {told}"
+        yield ""
+
+
+def _layout(path: Path) -> Iterator[str]:
+    """The boards and views, those within others set in."""
+    reader = rc.RrdReader(str(path))
+    parts: dict[str, dict[str, Any]] = defaultdict(dict)
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        batch = chunk.to_record_batch()
+        part, _, of = chunk.entity_path.strip("/").partition("/")
+        number, _, detail = of.partition("/")
+        named = {name: batch.column(name)[0].as_py() for name in batch.schema.names}
+        if "VisibleTimeRanges:ranges" in named:
+            shown = [each["range"]["start"] for each in named["VisibleTimeRanges:ranges"]]
+            named = {f"trail {detail}": [shown[0] / 1e9, shown[-1]]}
+        parts[f"{part}/{number}"] |= named
+    within = {each for part in parts.values() for each in part.get("ContainerBlueprint:contents", ())}
+    [root] = [each for each in parts if each.startswith("container/") and each not in within]
+    yield f"time: {parts['time_panel/']['TimePanelBlueprint:timeline'][0]}"
+    yield from _board(parts, root, 1)
+
+
+def _board(parts: Mapping[str, dict[str, Any]], name: str, depth: int) -> Iterator[str]:
+    """A board with its shares, or a view with what it shows, and all within it."""
+    part = parts[name]
+    if name.startswith("view/"):
+        [kind], [title] = part["ViewBlueprint:class_identifier"], part["ViewBlueprint:display_name"]
+        [origin] = part["ViewBlueprint:space_origin"]
+        roots = " ".join(each.replace("$origin", origin) for each in part["ViewContents:query"])
+        told = [f"{kind} '{title}' of {roots}"]
+        told += [f"from {low:.4g} to {high:.4g}" for low, high in part.get("ScalarAxis:range") or ()]
+        for bounds in part.get("VisualBounds2D:range") or ():
+            told += [f"{axis[0]} {_short(ends)}" for axis, ends in bounds.items()]
+        for way, words in (("PlotLegend:visible", "legend"), ("ScalarAxis:zoom_lock", "locked")):
+            told += [words] if (part.get(way) or [False])[0] else []
+        trails = {tuple(trail) for key, trail in part.items() if key.startswith("trail ")}
+        told += [f"trail {-seconds:g} s, {-steps} steps" for seconds, steps in sorted(trails)]
+    else:
+        [title] = part.get("ContainerBlueprint:display_name", [""])
+        told = [f"{KINDS[part['ContainerBlueprint:container_kind'][0]]} '{title}'"]
+        shares = part.get("ContainerBlueprint:col_shares") or part.get("ContainerBlueprint:row_shares")
+        told += [f"shares {_short(shares)}"] if shares else []
+        shown = part.get("ContainerBlueprint:active_tab")
+        contents = part["ContainerBlueprint:contents"]
+        told += [f"shows number {contents.index(shown[0]) + 1}"] if shown else []
+    yield "  " * depth + ", ".join(told)
+    for each in part.get("ContainerBlueprint:contents", ()):
+        yield from _board(parts, each, depth + 1)
+
+
+def _looks(columns: Columns) -> Iterator[str]:
+    """What holds at all times, but for the data: names, colours, widths."""
+    for name in sorted(columns):
+        values = columns[name][-1]
+        what = name.partition(":")[2]
+        if what in DATA or not values:
+            continue
+        if what == "colors":
+            values = list(dict.fromkeys(f"#{each:08x}" for each in values))
+        yield f"{what} {' '.join(map(_short, values[:8]))}"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return "(" + " ".join(map(_short, value)) + ")"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _moves(columns: Columns) -> Iterator[str]:
+    """What moves, how many rows of it, and from when to when."""
+    if columns:
+        kinds = {name.partition(":")[0] for name in columns if ":" in name}
+        times = columns["sim_time"]
+        span = f"from {times[0] / 1e9:.4f} to {times[-1] / 1e9:.4f} s"
+        yield f"{len(times)} of {' and '.join(sorted(kinds))} {span}"
