@@ -14,7 +14,11 @@ import rerun.blueprint as rrb
 
 import fuselog as fl
 from pipeline.comparing.candidates import _stored
+from pipeline.comparing.comparing import Differences
 from pipeline.comparing.groups import unlike_runs
+from pipeline.comparing.paired import ALL, Paired, under_stress
+from pipeline.output.alarms import Stressing
+from replay.judging.errors.differences import Difference
 from replay.timeline.side_by_side import _alone
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -207,6 +211,45 @@ def test_a_scene_beside_another_leaves_the_other_out() -> None:
     shown = [str(each) for each in alone.contents]
     assert shown[:2] == ["map/robot1/**", "map/landmarks/**"]
     assert shown[2] == "- map/robot1/ukf\\:2/**"
+
+
+def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() -> None:
+    """Each number of a pair in its column; of the candidates the one counts that is moved more."""
+    found = Difference(1.0, 3.0, 2.0, 1.5, 2.75, 0.02, "worse", 0.99, 8)
+    pair = Paired("ekf", "ukf", "position_rmse_m", "robot1", "low", found, (4.0, 6.0))
+    both = [pair, pair._replace(case=ALL, target=3.0, where=None)]
+    moved = {"position_rmse_m": 2.5, "position_rmse_m.robot1": 1.0}
+    verdicts = {
+        "ekf": Stressing("ekf", "sensitive", [], moved),
+        "ukf": Stressing("ukf", "harmless", [], {"position_rmse_m.robot1": 1.9}),
+    }
+    stressed = under_stress(both, verdicts)
+    assert [each.stressed for each in stressed] == [1.9, 2.5]
+    table = Differences([], 0.02, 0.2, [], stressed).table
+    assert table.iloc[0].to_dict() == {
+        "first": "ekf",
+        "second": "ukf",
+        "quantity": "position_rmse_m",
+        "case": "robot1",
+        "aim": "low",
+        "first_mean": 1.0,
+        "second_mean": 3.0,
+        "difference": 2.0,
+        "low": 1.5,
+        "high": 2.75,
+        "margin": 0.02,
+        "verdict": "worse",
+        "sure": 0.99,
+        "runs": 8,
+        "most_from_s": 4.0,
+        "most_to_s": 6.0,
+    }
+    assert table[["aim", "verdict"]].iloc[1].tolist() == ["3", "withheld"]
+    assert table[["most_from_s", "most_to_s"]].iloc[1].isna().all()
+    said = (
+        "position_rmse_m of robot1: ukf is worse than ekf: 3 against 1; difference 2, 95 % from 1.5 to "
+    )
+    assert stressed[0].sentence == f"{said}2.75 (8 runs, margin 0.02); most from 4.0 to 6.0 s"
 
 
 @pytest.mark.paper
