@@ -106,6 +106,9 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
 
     kept = fl.compare(result, result, estimators=["ekf"])
     assert set(kept.table["verdict"]) == {"no difference"}
+    names = [candidate.name for candidate in kept.groups[0]]
+    assert [row.estimator for row in kept.coverage] == names
+    assert "ekf" not in names
     monkeypatch.setattr(candidates, "replay", changed)
     found = fl.compare(result, estimators=["dead-reckoning", "ekf"])
     [note] = [each for each in found.notes if "replayed now" in each]

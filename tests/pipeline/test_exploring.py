@@ -162,7 +162,9 @@ def test_the_lens_shows_the_truth_near_its_instant(session: Session) -> None:
     assert shown.data["y"].tolist() == [-each for each in range(26, 35)]
 
 
-def test_the_page_draws_and_says_what_was_replayed(session: Session) -> None:
+def test_the_page_draws_and_says_what_was_replayed(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All plots are read back, of a filter that is too sure, above the one that was pinned."""
     document_of = pytest.importorskip("bokeh.document").Document
     from pipeline.exploring.page import Page
@@ -236,6 +238,10 @@ def test_the_page_draws_and_says_what_was_replayed(session: Session) -> None:
     assert seen.start < min(here["y"]) <= max(peak["y"]) < seen.end
     assert "Too sure of itself." in page._head.text
     assert "pinned" in page._head.text
+    for slow_s, is_said in ((1e9, False), (0.0, True)):
+        monkeypatch.setattr("pipeline.exploring.page.SLOW_S", slow_s)
+        page._show_head()
+        assert ("One replay takes" in page._head.text) == is_said
     page._command()
     assert "--set sigma_range_m=0.03" in page._saved.text
 
