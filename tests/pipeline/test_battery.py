@@ -232,6 +232,36 @@ def test_the_battery_is_counted_by_cell() -> None:
     assert np.isclose(counted["diagnosis.battery_runs"], 2.0)
 
 
+def test_the_battery_tries_every_cell_pair_and_unit_with_all_its_seeds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each of made outcomes is counted once: a cell's by the seed, pairs in half, units by the place."""
+
+    def made(cell: battery.Cell, seed: int) -> dict[str, Any]:
+        said = {"is_first": seed == 4, "is_within": True, "gain": float(seed), "value": float(seed)}
+        return {"cell": cell.name, "fault": cell.name, "seed": seed} | said
+
+    def of_unit(fault: str, seed: int) -> dict[str, Any]:
+        return {"fault": fault, "seed": seed, "is_first": seed < 6, "value": float(seed)}
+
+    def of_pair(pair: tuple[str, ...], seed: int, **_: bool) -> dict[str, Any]:
+        return {"pair": pair, "seed": seed, "are_named": seed == 5}
+
+    monkeypatch.setattr(battery, "tried", made)
+    monkeypatch.setattr(battery, "tried_together", of_pair)
+    monkeypatch.setattr(battery, "unit_tried", of_unit)
+    tables, metrics = battery.results([4, 5], lambda items, *_: items)
+    cells = [each.name for each in (*battery.cells(), *battery.cells(has_prior=True))]
+    assert tables["battery"]["cell"].tolist() == cells
+    assert {*tables["battery"]["runs"]} == {2}
+    assert len(tables["battery_pairs"]) == 2 * len(battery.PAIRS)
+    assert metrics["diagnosis.battery_pairs_share"] == 0.5
+    assert metrics["diagnosis.battery_first_share"] == 0.5
+    for fault, own in tables["battery_unit"].groupby("fault"):
+        assert own["seed"].tolist() == [*range(4, 4 + 2 * battery.UNIT_RUNS)]
+        assert metrics[f"diagnosis.unit_first.{battery._case(str(fault))}"] == 2.0
+
+
 def test_what_is_altered_is_what_a_diagnosis_supposes() -> None:
     """The new settings undo what is planted into columns, to the last digits."""
     clean, log = drive(SEED), recorded(drive(SEED))
