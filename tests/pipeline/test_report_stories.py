@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.output.alarms import Alarm
 from pipeline.output.claims import Claim
-from pipeline.output.report import _named
+from pipeline.output.report import _named, sweeps
 from pipeline.output.report.evidence import findings
 from pipeline.output.report.kinds import opening
 from pipeline.output.report.sheet import table_of_pairs
@@ -463,3 +463,11 @@ def test_a_standard_error_is_no_error() -> None:
     assert is_error("median_error_m")
     assert not is_error("standard_error")
     assert not is_error("standard_error_m")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [([0.5, 0.1, 0.2], "0.1 to 0.5"), (["b", "a", "b", "a"], "b, a"), ([2, "all", 2], "2, all")],
+)
+def test_what_was_swept_is_a_span_of_numbers_or_each_word_once(values: list[Any], words: str) -> None:
+    assert sweeps._ends(values) == words
