@@ -13,12 +13,12 @@ from scipy.stats import chi2
 
 from pipeline.output.alarms import Alarm
 from pipeline.output.claims import Claim
-from pipeline.output.report import _named, kinds, sweeps
+from pipeline.output.report import _named, kinds, sheet, sweeps
 from pipeline.output.report.evidence import findings
 from pipeline.output.report.kinds import opening
 from pipeline.output.report.sheet import table_of_pairs
 from pipeline.output.report.story import Story, story
-from pipeline.output.results import Result
+from pipeline.output.results import Measured, MetricTable, Result
 from pipeline.output.words import MINUS, is_error
 
 
@@ -499,3 +499,18 @@ def test_a_comparison_is_judged_case_by_case_by_the_means_of_both_sides() -> Non
             sides = table.quantities[name]
             assert {label: each.value for label, each in sides.items()} == {"a": mean, "b": mean + 0.5}
             assert all(each.bounds == bounds for each in sides.values())
+
+
+@pytest.mark.parametrize(
+    ("values", "looks"),
+    [({"a": 1.0, "b": 3.0}, ["best", ""]), ({"a": 3.0, "b": 1.0}, ["", "best"]), ({"a": 1.0}, ["", ""])],
+)
+def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[str]) -> None:
+    table = MetricTable("", ["a", "b"], {"position_rmse_m": {k: Measured(v) for k, v in values.items()}})
+    spreads = {"position_rmse_m": dict.fromkeys(values, (0.5, 4.0))}
+    row = sheet._row(SimpleNamespace(of={}), table, "position_rmse_m", ["a", "b"], spreads)  # type: ignore[arg-type]
+    assert [each.look for each in row.cells] == looks
+    assert [each.text == sheet.MISSING for each in row.cells] == [label not in values for label in "ab"]
+    assert [each.small for each in row.cells] == [
+        "0.50 to 4.00" if label in values else "" for label in "ab"
+    ]
