@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -228,7 +229,10 @@ def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() ->
     }
     stressed = under_stress(both, verdicts)
     assert [each.stressed for each in stressed] == [1.9, 2.5]
-    table = Differences([], 0.02, 0.2, [], stressed).table
+    given: Any = [[SimpleNamespace(pairs=dict.fromkeys(runs)) for runs in ("abc", "bc", "ab")]]
+    compared = Differences(given, 0.02, 0.2, [], stressed)
+    assert compared.drawable == ["b"]
+    table = compared.table
     assert table.iloc[0].to_dict() == {
         "first": "ekf",
         "second": "ukf",
