@@ -18,6 +18,7 @@ from pipeline.comparing.candidates import _stored
 from pipeline.comparing.comparing import Differences
 from pipeline.comparing.groups import unlike_runs
 from pipeline.comparing.paired import ALL, Paired, under_stress
+from pipeline.comparing.renamed import Renamed
 from pipeline.output.alarms import Stressing
 from replay.judging.errors.differences import Difference
 from replay.timeline.side_by_side import _alone
@@ -257,6 +258,24 @@ def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() ->
         "position_rmse_m of robot1: ukf is worse than ekf: 3 against 1; difference 2, 95 % from 1.5 to "
     )
     assert stressed[0].sentence == f"{said}2.75 (8 runs, margin 0.02); most from 4.0 to 6.0 s"
+
+
+def test_estimates_under_another_label_are_the_same_but_for_their_names() -> None:
+    done = fl.replay(fl.record("landmarks", duration_s=2.0), ["ekf", "ukf"])
+    own = done.estimates[0]
+    new = Renamed(own, "ukf", "b/c")  # type: ignore[arg-type]
+    assert (new.name, new.run, new.epoch_ns, new.start_ns) == (
+        own.name,
+        own.run,
+        own.epoch_ns,
+        own.start_ns,
+    )
+    poses = {old: old.replace("/ukf/", "/b/c/") for old in own.topics if "/ukf/" in old}
+    assert new.topics.keys() == {*poses.values()}
+    for old, name in poses.items():
+        assert new.topics[name].messages == own.topics[old].messages
+        for field, column in own.read([old])[old].columns.items():
+            np.testing.assert_array_equal(new.read([name])[name][field], column)
 
 
 @pytest.mark.paper

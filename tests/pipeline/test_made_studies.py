@@ -233,6 +233,12 @@ def test_tables_of_lines_of_sight(monkeypatch: pytest.MonkeyPatch) -> None:
         (1, 1, 7.0),
         (1, 2, 9.0),
     ]
+    monkeypatch.setattr(los, "one_bias_known", lambda _: np.arange(36.0).reshape(6, 6))
+    known = los._table_of_one_bias_known([case])
+    biases_of = [f"{angle}{sensor}" for sensor in (1, 2) for angle in ("yaw", "pitch", "roll")]
+    assert known["known"].tolist() == biases_of
+    assert [*known][2:] == [f"sigma_{name}_mrad" for name in biases_of]
+    assert known["sigma_roll1_mrad"].tolist() == [2.0, 8.0, 14.0, 20.0, 26.0, 32.0]
     assert printed._widest_span_deg(case) == pytest.approx(90.0)
     beside = printed.metrics_beside_print(case, paper)
     assert beside[f"{JOINT}.sigma_by_printed.c-1"] == [2.0, 4.0]
@@ -285,6 +291,13 @@ def test_shots_are_judged_by_mode_and_noise(monkeypatch: pytest.MonkeyPatch) -> 
     assert list(row.values()) == pytest.approx(
         [2, 3, 4.0, np.std([1.0, 2.0, 9.0]), 0.5, skew([1, 2, 9])]
     )
+    ellipses = acoustic._table_of_ellipses(cases).to_dict("records")
+    spread = np.cov([[3.0, 36.0, -3.0, 0.0], [4.0, 48.0, -4.0, 5.0]])
+    for place, label in enumerate((acoustic.NATIVE, acoustic.LOCAL)):
+        bound_m2, area_m2 = (
+            -2.0 * np.log(0.05) * np.pi * each for each in (12.0, np.linalg.det(spread) ** 0.5)
+        )
+        assert [*ellipses[place].values()] == [2, label, *map(pytest.approx, (bound_m2, area_m2, 5.0))]
     parts = acoustic._table_of_components(cases).to_dict("list")
     assert parts["rmse"][2] == pytest.approx(3.0**0.5)
     assert parts["sigma"][:3] == [3.0, 4.0, 0.5]
