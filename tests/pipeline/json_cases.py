@@ -187,6 +187,11 @@ def of_tuning(found: Any) -> Any:
         assert np.log(high / value) == pytest.approx(1.96 * found.standard_errors[place], rel=1e-3)
     held_out = {f"{label}-held-out": values for label, values in found.settings.items()}
     done = [fl.replay("run.mcap", found.settings), fl.replay("other.mcap", held_out)]
+    settings = json.loads(Path("tuned/result.json").read_text())["settings"]
+    assert settings["estimators"] == found.settings
+    kept = {"by": "likelihood", "gap_limit_s": 0.5, "notes": found.notes}
+    kept |= {"logs": ["run.mcap"], "held_out": ["other.mcap"]}
+    assert {name: settings[name] for name in kept} == kept
     return {
         "logs": ["run.mcap"],
         "held_out": ["other.mcap"],
@@ -305,7 +310,7 @@ CASES = [
     Case("observability run.mcap", of_observability),
     Case(
         "tune run.mcap -e ekf --free sigma_range_m --free sigma_bearing_rad --validate other.mcap "
-        "--out tuned",
+        "--gap-limit 0.5 --out tuned",
         of_tuning,
         "pipeline.tuning.command.tune",
     ),
