@@ -36,11 +36,6 @@ class Nis(NamedTuple):
     low: Floats
     high: Floats
 
-    @property
-    def outside(self) -> float:
-        """The share of spans outside."""
-        return _share((self.mean < self.low) | (self.mean > self.high))
-
 
 @dataclass(frozen=True)
 class Case:
@@ -71,24 +66,10 @@ class Case:
     log_likelihood: float = np.nan
 
     @property
-    def outside(self) -> Floats:
-        """The share of errors beyond 1.96 standard deviations (d,), where 5 % are right."""
-        assert self.errors is not None
-        sigma = np.sqrt(np.diagonal(self.errors.covariance, axis1=1, axis2=2))
-        return np.mean(np.abs(self.errors.error) > 1.96 * sigma, axis=0)
-
-    @property
     def nees_interval(self) -> tuple[float, float]:
         """Where 95 % of the NEES of a consistent filter lie."""
         low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.components)))
         return float(low), float(high)
-
-    @property
-    def nees_outside(self) -> float:
-        """The share of NEES outside that."""
-        assert self.errors is not None
-        low, high = self.nees_interval
-        return _share((self.errors.nees < low) | (self.errors.nees > high))
 
 
 def cases_of(outputs: Mapping[str, Ragged], errors: Sequence[Errors], epoch_ns: int) -> dict[str, Case]:
@@ -239,7 +220,3 @@ def map_points(source: MemorySource) -> Floats:
 
 def _elapsed_s(stream: Stream, epoch_ns: int) -> Floats:
     return np.asarray((stream.publish_time_ns - epoch_ns) * 1e-9, np.float64)
-
-
-def _share(outside: NDArray[np.bool_]) -> float:
-    return float(np.mean(outside)) if len(outside) else 0.0

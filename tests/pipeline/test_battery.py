@@ -14,6 +14,7 @@ import fuselog as fl
 from pipeline.altering.sources import alter
 from pipeline.diagnosing import portion
 from pipeline.diagnosing.battery import battery
+from pipeline.diagnosing.battery import car as battery_car
 from pipeline.diagnosing.battery.battery import FIX, HEADING, ODOMETRY
 from pipeline.diagnosing.battery.car import (
     FAULTS,
@@ -263,6 +264,55 @@ def test_the_battery_is_counted_by_cell() -> None:
     assert counted["diagnosis.battery_within_share"] == 0.5
     assert counted["diagnosis.battery_first_share"] == counted["diagnosis.battery_nothing_share"] == 0.5
     assert np.isclose(counted["diagnosis.battery_runs"], 2.0)
+
+
+def test_the_battery_tries_every_cell_pair_and_unit_with_all_its_seeds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each of made outcomes is counted once: a cell's by the seed, pairs in half, units by the place."""
+
+    def made(cell: battery.Cell, seed: int) -> dict[str, Any]:
+        said = {"is_first": seed == 4, "is_within": True, "gain": float(seed), "value": float(seed)}
+        return {"cell": cell.name, "fault": cell.name, "seed": seed} | said
+
+    def of_unit(fault: str, seed: int) -> dict[str, Any]:
+        return {"fault": fault, "seed": seed, "is_first": seed < 6, "value": float(seed)}
+
+    def of_pair(pair: tuple[str, ...], seed: int, **_: bool) -> dict[str, Any]:
+        return {"pair": pair, "seed": seed, "are_named": seed == 5}
+
+    monkeypatch.setattr(battery, "tried", made)
+    monkeypatch.setattr(battery, "tried_together", of_pair)
+    monkeypatch.setattr(battery, "unit_tried", of_unit)
+    tables, metrics = battery.results([4, 5], lambda items, *_: items)
+    cells = [each.name for each in (*battery.cells(), *battery.cells(has_prior=True))]
+    assert tables["battery"]["cell"].tolist() == cells
+    assert {*tables["battery"]["runs"]} == {2}
+    assert len(tables["battery_pairs"]) == 2 * len(battery.PAIRS)
+    assert metrics["diagnosis.battery_pairs_share"] == 0.5
+    assert metrics["diagnosis.battery_first_share"] == 0.5
+    for fault, own in tables["battery_unit"].groupby("fault"):
+        assert own["seed"].tolist() == [*range(4, 4 + 2 * battery.UNIT_RUNS)]
+        assert metrics[f"diagnosis.unit_first.{battery._case(str(fault))}"] == 2.0
+
+
+def test_faults_of_a_unit_are_what_their_names_say() -> None:
+    """Of a unit whose samples are the three axes: turned about the vertical, mirrored, scaled."""
+    axes, still = np.eye(3), np.array([0.5, -1.0, 2.0])
+    velocity = np.array([[1.0, 2.0], [3.0, 4.0]])
+    unit = battery_car.Unit(np.arange(3.0), axes, still, np.arange(2.0), velocity)
+    found = {name: put(unit) for name, put in battery_car.UNIT_FAULTS.items()}
+    for name, angle_rad in (("mounted 90 deg", -0.5 * np.pi), ("mounted 180 deg", np.pi)):
+        cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+        turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        np.testing.assert_allclose(found[name].force_mps2, axes @ turned.T, atol=1e-12)
+    np.testing.assert_array_equal(found["gravity's sign"].force_mps2, np.diag([1.0, 1.0, -1.0]))
+    np.testing.assert_allclose(9.80665 * found["accelerometer in g"].force_mps2, axes, rtol=1e-3)
+    np.testing.assert_array_equal(found["turn rate's sign"].turn_radps, -still)
+    np.testing.assert_allclose(np.radians(found["degrees"].turn_radps), still)
+    assert found["unit late .3 s"].sample_s.tolist() == [0.3, 1.3, 2.3]
+    assert found["E, N exchanged"].velocity_mps.tolist() == [[2.0, 1.0], [4.0, 3.0]]
+    assert found["nothing"] is unit
 
 
 def test_what_is_altered_is_what_a_diagnosis_supposes() -> None:

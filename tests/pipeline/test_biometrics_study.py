@@ -30,6 +30,11 @@ def test_tables_stand_beside_the_paper_and_follow_from_the_rates(result):
     assert row["rri"] == pytest.approx(
         relative_rate_increase(row["ours_percent"] / 100, [rate / 100 for rate in singles])[1]
     )
+    increases = {
+        f"{fusion}.relative_increase.{case}": of for (case, fusion), of in factors["rri"].items()
+    }
+    assert len(increases) > 4
+    assert {key: outcome.metrics[key] for key in increases} == increases
     impact = pd.read_parquet(folder / "tables" / "impact.parquet").set_index(["fused", "fusion"])
     two = factors.loc[[("matcher-1", "knn"), ("matcher-2", "knn")], "rri"].mean()
     assert impact.loc[("two modalities", "knn"), "rri"] == pytest.approx(two)

@@ -336,6 +336,10 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
             assert set(own["outside"][1]) == {low}
             own["outside"][1] = np.zeros(45)
     same(drawn, wanted)
+    least, most = chart.panels[0].y.limits or (0.0, 0.0)
+    shown = [each for own in wanted.values() for each in own.values()]
+    values = np.concatenate([np.concatenate(each[1:]) for each in shown])
+    assert least < values[values > 0].min() < values.max() < most
     assert "of a, 2 runs together;" in chart.title
     assert nis_chart(tmp_path, ["unknown"]) is None
 

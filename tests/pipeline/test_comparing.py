@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,12 @@ import rerun.blueprint as rrb
 
 import fuselog as fl
 from pipeline.comparing.candidates import _stored
+from pipeline.comparing.comparing import Differences
 from pipeline.comparing.groups import unlike_runs
+from pipeline.comparing.paired import ALL, Paired, under_stress
+from pipeline.comparing.renamed import Renamed
+from pipeline.output.alarms import Stressing
+from replay.judging.errors.differences import Difference
 from replay.timeline.side_by_side import _alone
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -102,6 +108,9 @@ def test_a_result_that_a_replay_no_longer_gives_is_compared_as_it_is(
 
     kept = fl.compare(result, result, estimators=["ekf"])
     assert set(kept.table["verdict"]) == {"no difference"}
+    names = [candidate.name for candidate in kept.groups[0]]
+    assert [row.estimator for row in kept.coverage] == names
+    assert "ekf" not in names
     monkeypatch.setattr(candidates, "replay", changed)
     found = fl.compare(result, estimators=["dead-reckoning", "ekf"])
     [note] = [each for each in found.notes if "replayed now" in each]
@@ -207,6 +216,66 @@ def test_a_scene_beside_another_leaves_the_other_out() -> None:
     shown = [str(each) for each in alone.contents]
     assert shown[:2] == ["map/robot1/**", "map/landmarks/**"]
     assert shown[2] == "- map/robot1/ukf\\:2/**"
+
+
+def test_a_row_says_who_is_first_and_stress_withholds_what_it_moves_further() -> None:
+    """Each number of a pair in its column; of the candidates the one counts that is moved more."""
+    found = Difference(1.0, 3.0, 2.0, 1.5, 2.75, 0.02, "worse", 0.99, 8)
+    pair = Paired("ekf", "ukf", "position_rmse_m", "robot1", "low", found, (4.0, 6.0))
+    both = [pair, pair._replace(case=ALL, target=3.0, where=None)]
+    moved = {"position_rmse_m": 2.5, "position_rmse_m.robot1": 1.0}
+    verdicts = {
+        "ekf": Stressing("ekf", "sensitive", [], moved),
+        "ukf": Stressing("ukf", "harmless", [], {"position_rmse_m.robot1": 1.9}),
+    }
+    stressed = under_stress(both, verdicts)
+    assert [each.stressed for each in stressed] == [1.9, 2.5]
+    given: Any = [[SimpleNamespace(pairs=dict.fromkeys(runs)) for runs in ("abc", "bc", "ab")]]
+    compared = Differences(given, 0.02, 0.2, [], stressed)
+    assert compared.drawable == ["b"]
+    table = compared.table
+    assert table.iloc[0].to_dict() == {
+        "first": "ekf",
+        "second": "ukf",
+        "quantity": "position_rmse_m",
+        "case": "robot1",
+        "aim": "low",
+        "first_mean": 1.0,
+        "second_mean": 3.0,
+        "difference": 2.0,
+        "low": 1.5,
+        "high": 2.75,
+        "margin": 0.02,
+        "verdict": "worse",
+        "sure": 0.99,
+        "runs": 8,
+        "most_from_s": 4.0,
+        "most_to_s": 6.0,
+    }
+    assert table[["aim", "verdict"]].iloc[1].tolist() == ["3", "withheld"]
+    assert table[["most_from_s", "most_to_s"]].iloc[1].isna().all()
+    said = (
+        "position_rmse_m of robot1: ukf is worse than ekf: 3 against 1; difference 2, 95 % from 1.5 to "
+    )
+    assert stressed[0].sentence == f"{said}2.75 (8 runs, margin 0.02); most from 4.0 to 6.0 s"
+
+
+def test_estimates_under_another_label_are_the_same_but_for_their_names() -> None:
+    done = fl.replay(fl.record("landmarks", duration_s=2.0), ["ekf", "ukf"])
+    own = done.estimates[0]
+    new = Renamed(own, "ukf", "b/c")  # type: ignore[arg-type]
+    assert (new.name, new.run, new.epoch_ns, new.start_ns) == (
+        own.name,
+        own.run,
+        own.epoch_ns,
+        own.start_ns,
+    )
+    poses = {old: old.replace("/ukf/", "/b/c/") for old in own.topics if "/ukf/" in old}
+    assert new.topics.keys() == {*poses.values()}
+    for old, name in poses.items():
+        assert new.topics[name].messages == own.topics[old].messages
+        for field, column in own.read([old])[old].columns.items():
+            np.testing.assert_array_equal(new.read([name])[name][field], column)
 
 
 @pytest.mark.paper

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import chdir
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -257,6 +258,51 @@ def test_refusals_write_nothing(tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="robot_ekf: is not empty; give another folder with -o"):
         fl.deploy(log, "ekf", out, model="robot")
     assert [each.name for each in out.iterdir()] == ["mine.c"]
+
+
+@pytest.mark.parametrize(
+    ("out", "name"),
+    [("new/Robot EKF", "robot_ekf"), ("empty/2 wheels", "n2_wheels"), ("Float", "float_")],
+)
+def test_a_filter_is_written_where_it_was_asked_for_and_nowhere_else(
+    tmp_path: Path, out: str, name: str
+) -> None:
+    """Into a new folder or an empty one, whose name it gets; over nothing, not even over itself."""
+
+    def state() -> dict[str, bytes]:
+        return {str(each): each.read_bytes() for each in Path().rglob("*") if each.is_file()}
+
+    log = recorded(tmp_path, "landmarks", duration_s=2.0)
+    words = ("deploy", log.name, "-e", "ekf", "--model", "robot", "-o")
+    with chdir(tmp_path):
+        Path("empty/2 wheels").mkdir(parents=True)
+        Path("a file").write_text("mine")
+        before = state()
+        said = run_here(*words, out)
+        assert (said.code, said.err) == (0, "")
+        files = {"CMakeLists.txt", "README.md", "certificate.json", "cortex_m4f.c", "cortex_m4f.ld"}
+        files |= {"fuselog_filter.h", "vectors.h", f"test_{name}.c", f"{name}_replay.c"}
+        files |= {f"{name}.c", f"{name}.h"}
+        written = state()
+        assert written.keys() - before.keys() == {str(Path(out, each)) for each in files}
+        assert written.items() >= before.items()
+        assert said.out.splitlines() == [
+            f"{Path(out)}: {', '.join(sorted(files))}",
+            f"{Path(out, 'README.md')} says how to build, test and replay it",
+        ]
+        assert f"{name}_init(" in written[str(Path(out, f"{name}.h"))].decode()
+        readme = written[str(Path(out, "README.md"))].decode()
+        data = "range_m, bearing_rad, landmarks_x_m, landmarks_y_m"
+        assert f"| `{name}_update_range_bearing` | range_bearing | {data} |" in readme
+        assert f"Made by `fuselog deploy` from {log.name};" in readme
+        for place, sentence in (
+            (out, f"{Path(out)}: is not empty; give another folder with -o, or empty it yourself\n"),
+            ("a file", "Invalid value for '-o' / '--out': Directory 'a file' is a file"),
+        ):
+            refused = run_here(*words, place)
+            assert refused.code == 2
+            assert refused.err.startswith(f"fuselog: {sentence}")
+        assert state() == written
 
 
 @pytest.mark.parametrize(("single", "away"), [(False, 1e-12), (True, 2e-6)])

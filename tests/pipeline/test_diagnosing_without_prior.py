@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from pipeline.diagnosing.battery.car import car
 from pipeline.diagnosing.causes import find_causes
 from pipeline.diagnosing.hypotheses.hypothesis import PARTS, Hypothesis
 from pipeline.diagnosing.hypotheses.listing import hypotheses
-from pipeline.diagnosing.likelihood import Likelihood, Trial, first_of_each
+from pipeline.diagnosing.likelihood import EVER_NS, Likelihood, Trial, _span, first_of_each
 from replay.engine.replaying.estimator import bind
 from tests.replay.inference.scalar import SCALAR, VALUE, simulate, source
 
@@ -204,3 +205,21 @@ def test_the_command_says_what_was_tried_and_compares_likelihoods_of_all(
     told.begin(base := Trial(car(2000, 1 / 256), OPEN))
     assert wrong["metrics"]["ekf.open_gate_log_likelihood"] == pytest.approx(told([base])[0])
     assert "16" in wrong["sentences"][0]["sentence"]
+
+
+def test_measurements_are_scored_while_all_controls_last_and_from_the_prior_on() -> None:
+    """Two controls from 1 to 9 s and from 2 to 8 s, of .5 and 1 s; a third has no messages."""
+
+    def topic(begin_s: float, end_s: float, step_s: float) -> Any:
+        stamps = np.arange(begin_s, end_s + 0.1 * step_s, step_s)
+        stamps_ns = (1e9 * stamps).astype(np.int64)
+        still = dict.fromkeys(("forward_mps", "turn_radps"), np.zeros(len(stamps)))
+        return fl.make_stream("/driven", fl.schemas.ODOMETRY, stamps_ns, **still)
+
+    streams = {"/a": topic(1, 9, 0.5), "/b": topic(2, 8, 1.0), "/none": topic(1, 0, 1.0)}
+    bound: Any = SimpleNamespace(priors=["/prior", "/absent"])
+    controls = ["/a", "/b", "/none"]
+    assert _span(controls, bound, streams) == (2 * 10**9, 8 * 10**9, 10**9)
+    later = {**streams, "/prior": topic(3, 3, 1.0)}
+    assert _span(controls, bound, later) == (3 * 10**9, 8 * 10**9, 10**9)
+    assert _span([], bound, streams) == (-EVER_NS, EVER_NS, 0)

@@ -518,3 +518,14 @@ def test_the_mean_nees_over_runs_has_its_interval_and_what_was_written_is_listed
     names = {"figures", "tables", "timeline.rrd", TIMINGS, "result.json"}
     assert {path.name for path in out.iterdir()} == names
     assert "nees_mean_over_runs" not in fuselog(*run, "--runs", "4").out
+
+
+def test_a_parameter_goes_to_all_estimators_that_have_it() -> None:
+    """What is set for one of them counts more."""
+    settings = {"bias_range_m": 0.5, "ekf": {"bias_range_m": 0.25}, "kappa": 1.0}
+    _, found = load_experiment("landmarks", settings, {})
+    set_to = {label: values.get("bias_range_m") for label, values in found.estimators.items()}
+    assert set_to == {"dead-reckoning": None, "ekf": 0.25, "ukf": 0.5}
+    assert [label for label, values in found.estimators.items() if "kappa" in values] == ["ukf"]
+    _, found = load_experiment("landmarks", {"turn_bias_radps": 0.1, "turn_scale": 0.9}, {})
+    assert [values.get("turn_scale") for values in found.estimators.values()] == [0.9] * 3

@@ -162,7 +162,9 @@ def test_the_lens_shows_the_truth_near_its_instant(session: Session) -> None:
     assert shown.data["y"].tolist() == [-each for each in range(26, 35)]
 
 
-def test_the_page_draws_and_says_what_was_replayed(session: Session) -> None:
+def test_the_page_draws_and_says_what_was_replayed(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """All plots are read back, of a filter that is too sure, above the one that was pinned."""
     document_of = pytest.importorskip("bokeh.document").Document
     from pipeline.exploring.page import Page
@@ -203,9 +205,18 @@ def test_the_page_draws_and_says_what_was_replayed(session: Session) -> None:
         np.testing.assert_allclose(middle, case.path.points[row], atol=1e-3)
     band, rows = drawn["error"][0, "band"].data, fewer(len(sigma))
     np.testing.assert_allclose((band["low"], band["high"]), (-sigma[rows], sigma[rows]))
-    for name, outside in (("error", np.mean(most > sigma)), ("nees", case.nees_outside)):
-        assert f": outside {100 * outside:.{int(outside < 0.1)}f} %" in titles[name]
-    assert titles["error"].startswith("Error of y_m")
+    is_out = {"Error of y_m": most > sigma, "NIS per component, by second": None, "NEES": None}
+    low, high = case.nees_interval
+    is_out["NEES"] = (case.errors.nees < low) | (case.errors.nees > high)
+    is_out["NIS per component, by second"] = (case.nis.mean < case.nis.low) | (
+        case.nis.mean > case.nis.high
+    )
+    for (words, outside), name in zip(is_out.items(), ("error", "nis", "nees"), strict=True):
+        share = np.mean(outside)
+        said = f"{words}: outside {100 * share:.{int(share < 0.1)}f} %; 5 % is right"
+        assert titles[name] == said
+    assert titles["scene"] == "Scene from above"
+    assert titles["lens"] == f"Lens at {page._at_s:.1f} s"
     for plot, low, high in (("nees", *case.nees_interval), ("nis", case.nis.low, case.nis.high)):
         interval = drawn[plot][0, "interval"].data
         assert np.all(interval["low"] == low)
@@ -223,8 +234,14 @@ def test_the_page_draws_and_says_what_was_replayed(session: Session) -> None:
     assert (peak["y"], here["x"]) == (max(line["y"]), slider.place(0.03))
     assert here["y"] == pytest.approx(np.interp(here["x"], line["x"], line["y"]))
     assert slider.words(slider.value(peak["x"][0])) in titles["likelihood"]
+    seen = page.plots["likelihood"].figure.y_range
+    assert seen.start < min(here["y"]) <= max(peak["y"]) < seen.end
     assert "Too sure of itself." in page._head.text
     assert "pinned" in page._head.text
+    for slow_s, is_said in ((1e9, False), (0.0, True)):
+        monkeypatch.setattr("pipeline.exploring.page.SLOW_S", slow_s)
+        page._show_head()
+        assert ("One replay takes" in page._head.text) == is_said
     page._command()
     assert "--set sigma_range_m=0.03" in page._saved.text
 

@@ -38,6 +38,9 @@ def decoded(path: str) -> dict[str, list[Any]]:
                 own = known.FromString(message.data)
                 assert str(own) == str(read)  # the log's own description says the same
                 assert message.publish_time >= 10**9
+                parts = [*getattr(own, "entities", ()), *getattr(own, "transforms", ())] or [own]
+                stamps = {each.timestamp.ToNanoseconds() for each in parts}
+                assert stamps == {message.publish_time}
                 found.setdefault(channel.topic, []).append(own)
     return found
 

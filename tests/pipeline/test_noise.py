@@ -39,6 +39,23 @@ def walking() -> np.ndarray:
     return unit(1, terms=Terms(1e-3, 1e-4))
 
 
+def test_samples_that_follow_each_other_are_averaged_until_they_are_white() -> None:
+    """How many and for how long is said, and of the white noise nothing is lost."""
+    rng, step_s = np.random.default_rng(0), 0.02
+    smooth = np.convolve(rng.normal(size=8_002), [0.25, 0.5, 0.25], "valid")
+    stamps = np.rint(1e9 * step_s * np.arange(len(smooth))).astype(np.int64)
+    columns = {"target_id": np.ones(len(smooth)), "range_m": smooth}
+    stream = fl.make_stream("/range", fl.schemas.RANGE, stamps, **columns)
+    source = fl.MemorySource({stream.topic: stream}, fl.RunMetadata("made", {}), "made")
+    [found] = fl.noise(source).columns
+    assert found.block > 2
+    said = (
+        f"samples are correlated; averaged over {found.block} ({found.block * step_s:.3g} s), they are"
+    )
+    assert any(said in note for note in found.notes)
+    assert found.numbers["white"].value == pytest.approx(step_s**0.5, rel=0.1)
+
+
 def test_allan_deviation_is_the_sheets() -> None:
     multiples = np.array([1, 2, 5, 10, 50, 100, 500, 1000, 5000, 10000, 20000])
     found = allan_deviation(unit(1), STEP_S, multiples)

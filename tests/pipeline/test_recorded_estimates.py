@@ -41,6 +41,19 @@ def test_its_innovations_say_which_noise_is_wrong(recording: Path):
         fl.diagnose(recording, "theirs", set={"sigma_range_m": 1.0})
 
 
+def test_its_truth_is_interpolated_over_gaps_that_are_allowed(recording: Path):
+    """The truth of every second: between two the estimates have none, unless a gap may be that long."""
+    log = fl.open(recording)
+    streams = log.read([*log.topics])
+    truth = streams["/robot1/truth"].take(slice(None, None, 20))
+    sparse = fl.MemorySource({**streams, truth.topic: truth}, log.log.run, "sparse", log.start_ns)
+    without = {}
+    for gap_limit_s in (0.2, 2.0):
+        metrics = fl.diagnose(sparse, "theirs", gap_limit_s=gap_limit_s).metrics
+        without[gap_limit_s] = metrics.set_index("quantity")["value"]["estimates_without_truth"]
+    assert without[2.0] == 0.0 < without[0.2]
+
+
 def test_ours_is_replayed_and_drawn_beside_them(recording: Path, tmp_path: Path):
     picture = str(tmp_path / "both.rrd")
     said = run_here("compare", str(recording), "-e", "theirs", "-e", "ekf", "--save", picture)

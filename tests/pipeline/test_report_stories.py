@@ -2,19 +2,23 @@
 
 import re
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import chi2
 
 from pipeline.output.alarms import Alarm
 from pipeline.output.claims import Claim
-from pipeline.output.report import _named
+from pipeline.output.report import _named, kinds, sheet, sweeps
 from pipeline.output.report.evidence import findings
 from pipeline.output.report.kinds import opening
 from pipeline.output.report.sheet import table_of_pairs
 from pipeline.output.report.story import Story, story
-from pipeline.output.results import Result
+from pipeline.output.results import Measured, MetricTable, Result
 from pipeline.output.words import MINUS, is_error
 
 
@@ -463,3 +467,50 @@ def test_a_standard_error_is_no_error() -> None:
     assert is_error("median_error_m")
     assert not is_error("standard_error")
     assert not is_error("standard_error_m")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [([0.5, 0.1, 0.2], "0.1 to 0.5"), (["b", "a", "b", "a"], "b, a"), ([2, "all", 2], "2, all")],
+)
+def test_what_was_swept_is_a_span_of_numbers_or_each_word_once(values: list[Any], words: str) -> None:
+    assert sweeps._ends(values) == words
+
+
+def test_a_comparison_is_judged_case_by_case_by_the_means_of_both_sides() -> None:
+    """NEES by chi square over so many runs; the mean over the cases is no case."""
+    rows = [
+        {"first": "a", "second": "b", "case": case, "quantity": quantity, "aim": aim, "runs": 10}
+        | {"first_mean": mean, "second_mean": mean + 0.5}
+        for case, mean in (("robot1", 1.0), ("robot2", 2.0), ("all", 9.0))
+        for quantity, aim in (("position_rmse_m", "low"), ("nees", "3"), ("nis_per_component", "1"))
+    ]
+    result: Any = SimpleNamespace(stress=[])
+    tables = {"differences": pd.DataFrame(rows)}
+    with patch.object(kinds, "runs_of", lambda *_: 10):
+        found = kinds._findings_of_comparison(result, tables, ["a", "b"])
+    low, high = (float(chi2.ppf(share, 30)) / 10 for share in (0.025, 0.975))
+    wanted = {"position_rmse_m": None, "nees": pytest.approx((low, high))}
+    wanted["nis_per_component"] = (1.0 - kinds.MATERIAL, 1.0 + kinds.MATERIAL)
+    assert [table.case for table in found.tables] == ["robot1", "robot2"]
+    for table, mean in zip(found.tables, (1.0, 2.0), strict=True):
+        assert table.quantities.keys() == wanted.keys()
+        for name, bounds in wanted.items():
+            sides = table.quantities[name]
+            assert {label: each.value for label, each in sides.items()} == {"a": mean, "b": mean + 0.5}
+            assert all(each.bounds == bounds for each in sides.values())
+
+
+@pytest.mark.parametrize(
+    ("values", "looks"),
+    [({"a": 1.0, "b": 3.0}, ["best", ""]), ({"a": 3.0, "b": 1.0}, ["", "best"]), ({"a": 1.0}, ["", ""])],
+)
+def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[str]) -> None:
+    table = MetricTable("", ["a", "b"], {"position_rmse_m": {k: Measured(v) for k, v in values.items()}})
+    spreads = {"position_rmse_m": dict.fromkeys(values, (0.5, 4.0))}
+    row = sheet._row(SimpleNamespace(of={}), table, "position_rmse_m", ["a", "b"], spreads)  # type: ignore[arg-type]
+    assert [each.look for each in row.cells] == looks
+    assert [each.text == sheet.MISSING for each in row.cells] == [label not in values for label in "ab"]
+    assert [each.small for each in row.cells] == [
+        "0.50 to 4.00" if label in values else "" for label in "ab"
+    ]

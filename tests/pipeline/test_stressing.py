@@ -14,7 +14,7 @@ from pipeline.output.alarms import NOT_TESTED, Stressing
 from pipeline.output.report.kinds import opening
 from pipeline.output.results import RUNS, Result, read_result, read_table
 from pipeline.stressing import stressing
-from pipeline.stressing.changes import CHANGES, SHIFT_NS, inputs_of, parameters_changed
+from pipeline.stressing.changes import CHANGES, DROPPED, SHIFT_NS, inputs_of, parameters_changed
 from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
 from recorders.errors import BadInput
@@ -573,3 +573,25 @@ def test_of_a_thousand_messages_ten_are_dropped_and_what_drives_comes_twice() ->
     np.testing.assert_array_equal(again["/car/b"]["value"], np.repeat(values, 2, axis=0))
     assert len(again["/car/a"]) == 10_000
     assert len(dropped["/car/prior"]) == 1
+
+
+@pytest.mark.parametrize("name", [name for name, each in CHANGES.items() if each.of_run is not None])
+def test_a_change_follows_from_its_seed_and_touches_inputs_alone(name: str) -> None:
+    """What is drawn is drawn anew by another seed; nothing is changed twice or in the log itself."""
+    log = fl.record("landmarks", duration_s=20.0)
+    topics = [topic for topic in log.topics if topic != "/landmarks"]
+    inputs, change = inputs_of(log, topics, ["/robot1/odometry"]), CHANGES[name].of_run
+    assert change is not None
+
+    def told(seed: int) -> dict[str, Any]:
+        return {
+            topic: (stream.publish_time_ns.tolist(), {k: v.tolist() for k, v in stream.columns.items()})
+            for topic, stream in change(log, inputs, 1.0, seed).streams.items()
+        }
+
+    first = told(1)
+    assert first == told(1)
+    is_drawn = name in ("stamps", "ulp", "start", DROPPED)
+    assert any(first != told(seed) for seed in (2, 3, 4, 5)) == is_drawn
+    for topic in ("/robot1/truth", "/landmarks"):
+        assert first[topic] == told(2)[topic]

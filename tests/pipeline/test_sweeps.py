@@ -2,6 +2,8 @@
 
 import json
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,7 +12,15 @@ import pytest
 import fuselog as fl
 from pipeline.command_line import main
 from pipeline.runs import experiment
-from pipeline.runs.sweeps import heat_maps, parse_over, points_of
+from pipeline.runs.sweeps import (
+    curves,
+    errors_of_runs,
+    heat_maps,
+    metrics_of,
+    parse_over,
+    point_table,
+    points_of,
+)
 from recorders.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -59,6 +69,55 @@ def test_a_sweep_gives_at_every_point_what_a_run_gives(tmp_path, capsys):
     assert (tmp_path / "sweep" / "figures" / "position_rmse_m-robot1.svg").is_file()
     assert not (tmp_path / "sweep.unfinished").exists()
     assert main(["report", str(tmp_path / "sweep"), "--out", str(tmp_path / "sweep.html")]) == 0
+
+
+def test_a_row_of_a_sweep_has_what_nine_in_ten_runs_have_and_what_it_should_be() -> None:
+    """Of the estimator's own runs and case; consistent filters of three components have a NEES of 3."""
+    rmse = np.arange(21.0)
+    runs = pd.DataFrame({"estimator": "ekf", "case": "a", "run": range(21), "position_rmse_m": rmse})
+    others = [runs.assign(estimator="ukf", position_rmse_m=99.0), runs.assign(case="b", nees=99.0)]
+    metrics = {"ekf.position_rmse_m.a": 9.0, "ekf.nees.a": 2.5, "ekf.nis_per_component.a": 1.5}
+    metrics |= {"ekf.position_nees.a": 1.75, "ekf.failed_runs.a": 2.0}
+    bounds = {"ekf.nees.a": (2.0, 4.0), "ekf.nis_per_component.a": (0.5, 1.25)}
+    bounds |= {"ekf.position_nees.a": (1.0, 3.0)}
+    judged = {"topic": SimpleNamespace(estimator="ekf", case="a", components="xyh", position="xy")}
+    table = pd.concat([runs, *others])
+    judge: Any = SimpleNamespace(runs_table=table, metrics=metrics, bounds=bounds, judged=judged)
+    rows = point_table(7, {"robots": 2}, judge).set_index("quantity")
+    assert {*rows["point"], *rows["robots"], *rows["case"]} == {7, 2, "a"}
+    numbers = rows[["value", "low", "high", "aim", "bound_low", "bound_high"]]
+    wanted = {
+        "position_rmse_m": [9.0, 1.0, 19.0, *[math.nan] * 3],
+        "nees": [2.5, math.nan, math.nan, 3.0, 2.0, 4.0],
+        "nis_per_component": [1.5, math.nan, math.nan, 1.0, 0.5, 1.25],
+        "position_nees": [1.75, math.nan, math.nan, 2.0, 1.0, 3.0],
+        "failed_runs": [2.0, *[math.nan] * 5],
+    }
+    for quantity, values in wanted.items():
+        assert numbers.loc[quantity].tolist() == pytest.approx(values, nan_ok=True), quantity
+    kept = errors_of_runs(7, judge)
+    assert list(kept) == ["point", "estimator", "case", "run", "position_rmse_m"]
+    assert (len(kept), {*kept["point"]}) == (63, {7})
+
+
+def test_curves_of_a_sweep_are_means_over_the_other_parameters() -> None:
+    over = [parse_over("a=1,2"), parse_over("b=1,2,4")]
+    values = np.array([6.0, 5.0, 4.0, 3.0, 1.0, 2.0])
+    table = pd.DataFrame(points_of(over)).assign(estimator="ekf", value=values)
+    table = table.assign(low=values - 0.5, high=values + 2.0, point=range(6), quantity="nees", case="")
+    chart = curves(table, over, "nees", "robot1")
+    for panel, places, means in zip(
+        chart.panels, ([1, 2], [1, 2, 4]), ([5.0, 2.0], [4.5, 3.0, 3.0]), strict=True
+    ):
+        [drawn], [around] = panel.series, panel.bands
+        assert (list(drawn.x), list(drawn.y)) == (places, means)
+        assert list(around.low) == [each - 0.5 for each in means]
+        assert list(around.high) == [each + 2.0 for each in means]
+    assert [panel.x.label for panel in chart.panels] == [each.label for each in over]
+    assert chart.title.endswith(" of robot1, means over the others; bands: nine in ten runs")
+    assert metrics_of(table[table["point"] != 2], 6)["ekf.nees"] == pytest.approx(
+        [6.0, 5.0, math.nan, 3.0, 1.0, 2.0], nan_ok=True
+    )
 
 
 def test_the_experiment_is_read_once_for_all_points(tmp_path, monkeypatch, capsys):

@@ -19,7 +19,7 @@ import pytest
 import fuselog as fl
 from pipeline.output.results import read_result
 from pipeline.runs.executors import InlineExecutor
-from pipeline.tuning.objective import Best
+from pipeline.tuning.objective import Best, Objective
 from pipeline.tuning.search import Cost, curvature
 from pipeline.tuning.tuning import ENOUGH
 from recorders.log import RunMetadata
@@ -105,6 +105,29 @@ def test_the_robot_of_the_sheet() -> None:
 def short() -> fl.MemorySource:
     """Twenty seconds of the sheet's robot, which tell little of its odometry."""
     return recorded(500, 20.0)
+
+
+def test_the_best_so_far_is_told_with_how_many_points_were_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tried, told = [0], list[Best]()
+    shared = Objective._shared
+
+    def counted(self: Objective, points: Any) -> Any:
+        tried.append(tried[-1] + len(points))
+        return shared(self, points)
+
+    monkeypatch.setattr(Objective, "_shared", counted)
+    bounds = {"sigma_range_m": (0.05, 0.2)}
+    log = fl.record("landmarks", duration_s=3.0)
+    found = fl.tune(log, "ekf", "sigma_range_m", bounds=bounds, grid=3, on_best=told.append)
+    counts = [each.evaluations for each in told]
+    assert {*counts} <= {*tried}
+    assert counts == sorted(counts)
+    assert 3 < counts[-1] <= tried[-1]
+    costs = [each.cost for each in told]
+    assert costs == sorted(costs, reverse=True)
+    assert told[-1].point == pytest.approx(found.parameters["value"].to_numpy(), rel=1e-3)
 
 
 @pytest.mark.paper

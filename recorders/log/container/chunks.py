@@ -121,7 +121,9 @@ def open_region(raw: bytes, offset: int) -> Contents:
     messages = dict(zip(channel_ids.tolist(), np.split(found.messages, borders), strict=False))
     spans: dict[Clock, Span] = {}
     if messages:
-        spans = {"log_time": Span(*found.log_time_ns), "publish_time": Span(*found.publish_time_ns)}
+        ends = found.log_time_ns, found.publish_time_ns
+        log_ns, publish_ns = (Span(*map(int, each)) for each in ends)
+        spans = {"log_time": log_ns, "publish_time": publish_ns}
     return Contents(data, messages, declarations, spans)
 
 
