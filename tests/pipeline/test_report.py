@@ -31,9 +31,9 @@ from pipeline.output.charts import (
 )
 from pipeline.output.claims import Claim
 from pipeline.output.report import write_report
-from pipeline.output.report.colours import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.first_run import Followed
 from pipeline.output.report.kinds import said
+from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.scene import typical_second
 from pipeline.output.results import Outcome, read_result, result_folder, write_outcome
 from recorders.errors import BadInput
@@ -506,7 +506,7 @@ def test_in_a_browser_trackers_and_claims_are_told_on_the_first_screen(
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         cards = page.locator(".card")
         names = cards.locator("h3").all_inner_texts()
-        assert names == ["pmbm", "jipda", "jpda", "claims"]
+        assert names == ["pmbm", "jipda", "jpda", "Claims"]
         assert long in cards.last.inner_text()
         if width == 1280:
             boxes = [each.bounding_box() for each in cards.all()]

@@ -23,12 +23,11 @@ from markupsafe import Markup, escape
 
 from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
-from pipeline.output.report.colours import text_colours
 from pipeline.output.report.evidence import Findings, Timings
 from pipeline.output.report.first_run import first_run, picture_of_timeline
 from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
-from pipeline.output.report.naming import distinct_names, title_of
+from pipeline.output.report.naming import distinct_names, text_colours, title_of
 from pipeline.output.report.scene import lens, nis_chart, plan, tracked
 from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
 from pipeline.output.report.sweeps import RUNS_TABLE
