@@ -92,10 +92,12 @@ def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
         was = before.get(name)
         ghost = f'<br><small style="color:{QUIET}">pinned {_number(name, *was)}</small>' if was else ""
         cells.append(
-            f'<div style="margin-right:32px"><small style="color:{QUIET}">{escape(name)}</small><br>'
+            f'<div><small style="color:{QUIET}">{escape(name)}</small><br>'
             f'<b style="font-size:18px">{_number(name, value, unit)}</b>{ghost}</div>'
         )
-    return f'<div class="numbers" style="display:flex">{"".join(cells)}</div>'
+    return (
+        f'<div class="numbers" style="display:flex;flex-wrap:wrap;gap:4px 32px">{"".join(cells)}</div>'
+    )
 
 
 def _number(name: str, value: float, unit: str) -> str:

@@ -88,7 +88,7 @@ class Page:
             "likelihood": likelihood_plot(),
             "error": error_plot(time, self._cursor),
             "nees": ratio_plot("nees", "NEES", time, self._cursor),
-            "nis": ratio_plot("nis", "NIS per component, by second", time, self._cursor),
+            "nis": ratio_plot("nis", "NIS per component", time, self._cursor),
         }
         for name in ("error", "nees", "nis"):
             self.plots[name].figure.on_event(MouseMove, self._move_cursor)

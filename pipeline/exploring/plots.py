@@ -168,6 +168,7 @@ def lens_plot() -> Plot:
     """The scene at one instant, so near that errors of centimetres are seen."""
     plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
+    plot.figure.xaxis.ticker = BasicTicker(desired_num_ticks=2)  # of many digits each
     plot.figure.match_aspect = True
     plot.figure.line("x", "y", source=plot.source(0, "truth", "x", "y"), line_color=INK, line_width=2)
     for of in (PINNED, 1, 0):
@@ -239,8 +240,7 @@ def _show_errors(plot: Plot, of: int | str, case: Case, component: str) -> None:
         plot.fill(of, "band", t=t[rows], low=middle - sigma[rows], high=middle + sigma[rows])
         if of == 0:
             plot.fill(0, "outside", t=[], foot=[])
-            says = "tinted: where it says that 95 % lie"
-            plot.say(f"{'Estimate' if is_known else 'Errors'} of {name}; {says}")
+            plot.say(f"{'Estimate' if is_known else 'Errors'} of {name}; tinted: 95 %, as it claims")
         return
     place = errors.components.index(component)
     error, t = errors.error[:, place], errors.elapsed_s
@@ -273,7 +273,7 @@ def _show_nis(plot: Plot, of: int | str, case: Case) -> None:
         of, "interval", t=nis.time_s[even], low=np.maximum(nis.low[even], 1e-6), high=nis.high[even]
     )
     outside = (nis.mean < nis.low) | (nis.mean > nis.high)
-    _show_foot(plot, of, "NIS per component, by second", nis.time_s, outside)
+    _show_foot(plot, of, "NIS per component", nis.time_s, outside)
 
 
 def _show_whiteness(plot: Plot, of: int | str, case: Case) -> None:

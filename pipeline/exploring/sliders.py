@@ -116,8 +116,8 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
     """
     factor, sign = _unit_for(max(abs(low), abs(high)), unit)
     first, last = low * factor, high * factor
-    power = 10.0 ** math.floor(math.log10((last - first) / 4))
-    step = power * next(each for each in STEPS_OF_TICKS if power * each >= (last - first) / 4)
+    power = 10.0 ** math.floor(math.log10((last - first) / 5))
+    step = power * next(each for each in STEPS_OF_TICKS if power * each >= (last - first) / 5)
     places = [place * step for place in range(math.ceil(first / step), math.floor(last / step) + 1)]
     texts = [f"{f'{place:.6g}'.replace('-', MINUS)}{sign}" if place else "0" for place in places]
     return {place / factor: text for place, text in zip(places, texts, strict=True)}

@@ -240,7 +240,7 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     assert page.texts["h1"] == ["2 results"]
     titles = [chart["title"] for chart in page.charts]
     forest, scene, lens = titles[:3]  # several logs, and estimates that the folder does not keep
-    assert forest.startswith("Every difference with its interval")
+    assert forest.startswith("Every difference in percent")
     assert scene.startswith("robot1, first run from above")
     assert lens.startswith("Lens: 1 s of the first run")
     axes = {panel["x"]["label"] for chart in page.charts for panel in chart["panels"]}

@@ -4,6 +4,7 @@ Begin with `opening`. Each kind has its own first sentences; cards and differenc
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -88,7 +89,8 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     notes = [str(each) for each in result.settings.get("notes", [])]
     tried = what_was_tried(result, found, tables)
     if result.experiment == "diagnose":
-        return Opening(tried, _of_diagnosis(base, notes), found, notes[1:])
+        further = [re.sub(r"^\d+\. ", "", each) for each in notes[1:]]
+        return Opening(tried, _of_diagnosis(base, notes), found, further)
     if result.experiment == "tune":
         meanings = result.settings.get("meanings", {})
         return Opening(tried, _of_tuning(base, tables, meanings), found, notes)
@@ -312,7 +314,7 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         least, most = min(*low, -100.0 * margin), max(*high, 100.0 * margin)
         room = 0.05 * float(most - least)
         x = Axis(
-            label=f"{second} less {first}, in percent of {first} or of the aim; lines: 95 %",
+            label=f"{second} less {first} (%)",
             limits=(float(least) - room, float(most) + room),
         )
         edges = [
@@ -330,7 +332,10 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         panels.append(
             Panel(x=x, y=y, series=[*edges, spread, curve(str(second), middle, places, "markers")])
         )
-    title = "Every difference with its interval; between the dashed lines it does not matter"
+    title = (
+        "Every difference in percent of the first or of the aim, with 95 %; "
+        "between the dashed lines it does not matter"
+    )
     return Chart(title=title, panels=panels, legend=False)
 
 
