@@ -1,7 +1,7 @@
 """Computes the curves of one replay of one filter: paths, errors, NEES, NIS, whiteness, likelihood."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -51,6 +51,7 @@ class Case:
         nis: by topic of the sensor or of the filter; None without innovations.
         whiteness: by measured component.
         log_likelihood: of all measurements; NaN where the filter states none.
+        beside: the estimates (n,) of parameters in the state, and of all else that the truth lacks.
     """
 
     name: str
@@ -64,21 +65,29 @@ class Case:
     nis: Nis | None = None
     whiteness: Mapping[str, Whiteness] = field(default_factory=dict)
     log_likelihood: float = np.nan
+    beside: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def nees_interval(self) -> tuple[float, float]:
-        """Where 95 % of the NEES of a consistent filter lie."""
-        low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.components)))
+        """Where 95 % of the NEES of a consistent filter lie, of the components that the truth has."""
+        assert self.errors is not None
+        low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.errors.components)))
         return float(low), float(high)
 
 
-def cases_of(outputs: Mapping[str, Ragged], errors: Sequence[Errors], epoch_ns: int) -> dict[str, Case]:
+def cases_of(
+    outputs: Mapping[str, Ragged],
+    errors: Sequence[Errors],
+    epoch_ns: int,
+    estimated: Sequence[str] = (),
+) -> dict[str, Case]:
     """What is drawn of a filter's outputs on one log, by the name of what is estimated.
 
     Args:
         outputs: by topic.
         errors: of them, where there is truth.
         epoch_ns: of the log.
+        estimated: parameters that are part of the state.
     """
     of_case = {each.case: each for each in errors}
     innovations = {
@@ -94,8 +103,17 @@ def cases_of(outputs: Mapping[str, Ragged], errors: Sequence[Errors], epoch_ns: 
         case = split_topic(topic)[1]
         if case in found:  # the first of a filter's estimates is its own, others add to it
             continue
-        found[case] = _case(case, stream, epoch_ns, of_case.get(case), innovations.get(case))
+        one = _case(case, stream, epoch_ns, of_case.get(case), innovations.get(case))
+        found[case] = replace(one, beside=_beside(one, stream, estimated))
     return found
+
+
+def _beside(case: Case, stream: Stream, estimated: Sequence[str]) -> dict[str, Floats]:
+    components = stream.components
+    mean = stream["mean"].reshape(len(stream), len(components))
+    known = {*case.components} - {*estimated} if case.errors is None else {*case.errors.components}
+    left = [name for name in case.components if name in components and name not in known]
+    return {name: mean[:, components.index(name)] for name in left}
 
 
 def _case(
@@ -193,6 +211,14 @@ def typical_time_s(case: Case) -> float | None:
     away = np.abs(share - outside.mean())
     near = starts[away <= away.min() + 1e-9]
     return float(near[np.argmin(np.abs(near - np.median(starts)))])
+
+
+def instant_of(case: Case | None) -> float:
+    """Where the lens looks at first: at a typical second, else in the middle."""
+    if case is None or not len(case.time_s):
+        return 0.0
+    found = typical_time_s(case)
+    return float(np.median(case.time_s)) if found is None else found
 
 
 def true_path(source: MemorySource, topic: str) -> Path | None:

@@ -1,34 +1,79 @@
 """The page's words as HTML: verdicts, numbers, the labels of sliders. All text is escaped."""
 
+from collections.abc import Iterable, Mapping
 from html import escape
 
-from pipeline.exploring.plots import COLOURS, QUIET, RED
+from pipeline.exploring.curves import LINES, Case
+from pipeline.exploring.plots import COLOURS, PINNED, QUIET, RED
 from pipeline.exploring.session import Played
 from pipeline.exploring.sliders import Slider, in_words
 from pipeline.exploring.verdict import Verdict, numbers_of
+from pipeline.output.words import MINUS, number
 
 MARKS = {"good": "✓", "doubtful": "✕", "failed": "✕"}
 SIDE = 300  # the width of the sliders' column, in pixels
+SLOW_S = 1.0  # a replay that takes longer is said to
 SPREAD = '<div style="display:flex;justify-content:space-between">'
 
 
-def label_of(slider: Slider, value: float) -> str:
-    """The name of a slider, its value, its ends and where the log's own value is."""
+def label_of(slider: Slider, value: float, *, is_estimated: bool = False) -> str:
+    """The name of a slider, its value, its ends and where the log's own value is.
+
+    Of a parameter in the state the value is where the estimate begins.
+    """
+    name = f"{slider.title}, estimated from" if is_estimated else slider.title
     changed = "" if value == slider.own else f"color:{COLOURS[0]};"
     mark = 100.0 * min(max(slider.place(slider.own), 0.0), 1.0)
     return (
         f'<div title="{escape(f"{slider.name}: {slider.meaning}")}" style="width:{SIDE - 20}px">'
-        f"{SPREAD}<span>{escape(slider.title)}</span>"
+        f"{SPREAD}<span>{escape(name)}</span>"
         f'<b style="{changed}">{escape(slider.words(value))}</b></div>'
         f'<div style="display:flex;justify-content:space-between;font-size:11px;color:{QUIET};'
         f'position:relative"><span>{escape(slider.words(slider.low))}</span>'
-        f'<span style="position:absolute;left:{mark:.1f}%" title="the log\'s own, '
+        f'<span style="position:absolute;top:9px;left:{mark:.1f}%;transform:translateX(-50%)" '
+        f"title=\"the log's own, "
         f'{escape(slider.words(slider.own))}">▾</span>'
         f"<span>{escape(slider.words(slider.high))}</span></div></div>"
     )
 
 
-def verdict_html(label: str, verdict: Verdict, colour: str) -> str:
+def heading_html(log: str) -> str:
+    """What the page is, and of which log."""
+    return f'<h1 style="font:inherit;margin:0"><b>fuselog</b> explore<br>{escape(log)}</h1>'
+
+
+def head_html(
+    labels: Iterable[str], played: Mapping[int | str, Played], case: str, estimated: Mapping[str, Slider]
+) -> str:
+    """What stands above the plots: verdicts, numbers, what is estimated in the state."""
+    parts = []
+    for place, label in enumerate(labels):
+        one = played[place]
+        verdict = one.verdicts.get(case, Verdict("failed", "It estimated nothing.", ""))
+        parts.append(_verdict_html(label, verdict, COLOURS[min(place, 1)]))
+        if case in one.cases:
+            parts.append(_numbers_html(one, played.get(PINNED), case))
+            parts += [f"<p>{escape(each)}</p>" for each in in_the_state(one.cases[case], estimated)]
+        if one.seconds > SLOW_S:
+            parts.append(f"<p>One replay takes {one.seconds:.1f} s.</p>")
+    if case in played[0].cases and len(played[0].cases[case].time_s) > LINES:
+        parts.append("<p>So long a log is drawn by the least and the greatest value of each span.</p>")
+    return "".join(parts)
+
+
+def in_the_state(case: Case, estimated: Mapping[str, Slider]) -> list[str]:
+    """What a filter makes of the parameters in its state, at the end of the log."""
+    found = []
+    for name, slider in estimated.items():
+        if name in case.beside and len(case.time_s):
+            sigma = float(case.sigma[-1, case.components.index(name)])
+            value = slider.words(float(case.beside[name][-1]))
+            found.append(f"Estimated in the state: {slider.title} is {value} at the end, "
+                         f"give or take {slider.words(1.96 * sigma)} (95 %).")  # fmt: skip
+    return found
+
+
+def _verdict_html(label: str, verdict: Verdict, colour: str) -> str:
     """A filter's verdict, in its colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"
@@ -39,7 +84,7 @@ def verdict_html(label: str, verdict: Verdict, colour: str) -> str:
     )
 
 
-def numbers_html(played: Played, pinned: Played | None, case: str) -> str:
+def _numbers_html(played: Played, pinned: Played | None, case: str) -> str:
     """Its numbers, above those that are pinned."""
     cells = []
     before = numbers_of(pinned.cases[case]) if pinned is not None and case in pinned.cases else {}
@@ -47,11 +92,15 @@ def numbers_html(played: Played, pinned: Played | None, case: str) -> str:
         was = before.get(name)
         ghost = f'<br><small style="color:{QUIET}">pinned {_number(name, *was)}</small>' if was else ""
         cells.append(
-            f'<div style="margin-right:32px"><small style="color:{QUIET}">{escape(name)}</small><br>'
+            f'<div><small style="color:{QUIET}">{escape(name)}</small><br>'
             f'<b style="font-size:18px">{_number(name, value, unit)}</b>{ghost}</div>'
         )
-    return f'<div class="numbers" style="display:flex">{"".join(cells)}</div>'
+    return (
+        f'<div class="numbers" style="display:flex;flex-wrap:wrap;gap:4px 32px">{"".join(cells)}</div>'
+    )
 
 
 def _number(name: str, value: float, unit: str) -> str:
-    return f"{value:,.0f}" if name == "log-likelihood" else escape(in_words(value, unit))
+    if name == "log-likelihood":
+        return f"{value:,.0f}".replace("-", MINUS)
+    return escape(in_words(value, unit) if unit else number(value))

@@ -8,20 +8,18 @@ from typing import Any
 from bokeh.document import Document
 from bokeh.events import MouseMove
 from bokeh.layouts import column, row
-from bokeh.models import Div, Range1d, Select, Span
+from bokeh.models import Div, Select, Span
 from bokeh.models import Slider as SliderWidget
 
-from pipeline.exploring.curves import LINES, true_path
-from pipeline.exploring.markup import SIDE, label_of, numbers_html, verdict_html
+from pipeline.exploring.curves import instant_of, true_path
+from pipeline.exploring.markup import SIDE, head_html, heading_html, label_of
 from pipeline.exploring.newest import NewestFirst
 from pipeline.exploring.plots import (
-    COLOURS,
     PINNED,
     QUIET,
     Plot,
     error_plot,
     fit_errors,
-    instant_of,
     lens_plot,
     likelihood_plot,
     ratio_plot,
@@ -33,14 +31,13 @@ from pipeline.exploring.plots import (
 )
 from pipeline.exploring.session import Played, Session
 from pipeline.exploring.sliders import Slider
-from pipeline.exploring.verdict import Verdict
-from pipeline.exploring.widgets import NONE, buttons, filter_choices, widget_of
+from pipeline.exploring.widgets import NONE, buttons, filter_choices, tags_of, time_range, widget_of
+from pipeline.output.words import label_of as label_of_quantity
 from recorders.errors import BadInput
 from recorders.log import schemas
 
 WRAP = {"flex-wrap": "wrap"}  # what does not fit beside goes below, as on a phone
 GROW = {"flex": "1 1 350px"}
-SLOW_S = 1.0  # a replay that takes longer is said to
 
 
 class Page:
@@ -60,7 +57,7 @@ class Page:
         self._work = NewestFirst(self._say_error)
         self._active = session.sliders[0] if session.sliders else None
         self._at_s: float | None = None
-        self._case = ""
+        self._known = dict(session.filters)  # those that were given can be chosen again
         self._is_setting = False
         self._make()
         self._first()
@@ -73,11 +70,12 @@ class Page:
 
     def _make(self) -> None:
         log = self.session.log
-        self._head = Div(name="verdict", sizing_mode="stretch_width")
-        self._said = Div(name="said", sizing_mode="stretch_width")
+        status = {"role": "status"}  # a screen reader says what changes
+        self._head = Div(name="verdict", sizing_mode="stretch_width", html_attributes=status)
+        self._said = Div(name="said", sizing_mode="stretch_width", html_attributes=status)
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
-        self._time = time = Range1d(0.0, 1.0)  # of the estimates, once there are some
+        self._time = time = time_range(self.session.source.epoch_ns)  # its ends come with estimates
         self.truths = [
             name
             for name, each in log.topics.items()
@@ -90,7 +88,7 @@ class Page:
             "likelihood": likelihood_plot(),
             "error": error_plot(time, self._cursor),
             "nees": ratio_plot("nees", "NEES", time, self._cursor),
-            "nis": ratio_plot("nis", "NIS per component, by second", time, self._cursor),
+            "nis": ratio_plot("nis", "NIS per component", time, self._cursor),
         }
         for name in ("error", "nees", "nis"):
             self.plots[name].figure.on_event(MouseMove, self._move_cursor)
@@ -99,6 +97,7 @@ class Page:
         self._case_choice.on_change("value", self._choose)
         self._component.on_change("value", self._choose)
         self._side = column(width=SIDE, name="side")
+        self._side.html_attributes = {"role": "form", "aria-label": "Settings"}
         figures = {name: plot.figure for name, plot in self.plots.items()}
         plane = row(figures["scene"], figures["lens"], sizing_mode="stretch_width", styles=WRAP)
         left = column(plane, figures["whiteness"], figures["likelihood"], sizing_mode="stretch_width")
@@ -106,6 +105,7 @@ class Page:
         left.styles = right.styles = {"flex": "1 1 330px"}
         both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
         main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
+        main.html_attributes = {"role": "main"}
         self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
         self._document.title = f"fuselog explore: {self.session.source.name}"
         self._fill_side()
@@ -113,8 +113,8 @@ class Page:
     def _fill_side(self) -> None:
         """All that is to the left: filters, buttons, sliders."""
         session = self.session
-        heading = Div(text=f"<b>fuselog</b> explore<br>{escape(session.source.name)}", width=SIDE)
-        choices = filter_choices(session.filters)
+        heading = Div(text=heading_html(session.source.name), width=SIDE)
+        choices = filter_choices(session.filters, self._known)
         for choice in choices:
             choice.on_change("value", partial(self._choose_filters, choices))
         acts: dict[str, Callable[[], None]] = {
@@ -151,7 +151,9 @@ class Page:
     def _label(self, slider: Slider) -> None:
         """The name of a slider, its value, its ends and the log's own value."""
         value = self.values.get(slider.name, slider.own)
-        self._widgets[slider.name][2].text = label_of(slider, value)
+        _, widget, label = self._widgets[slider.name]
+        label.text = label_of(slider, value, is_estimated=slider.name in self.session.estimated)
+        widget.tags = tags_of(slider, value)
 
     # What a person does.
 
@@ -164,15 +166,14 @@ class Page:
         """Look at other filters with the same values."""
         first, second = (each.value for each in choices)
         labels = [first] if second in (NONE, first) else [first, second]
-        own = self.session.filters
-        like = own[self._label_of(0)]
         try:
-            session = self.session.with_filters(
-                {label: own.get(label, {**like, "kind": label}) for label in labels}
-            )
+            chosen = {each: self._known.get(each) or self.session.like_first(each) for each in labels}
+            session = self.session.with_filters(chosen)
         except BadInput as error:
+            self._fill_side()  # the choices go back to what is drawn
             self._tell(str(error))
             return
+        self._tell()
         self.session = session
         self.played = {place: each for place, each in self.played.items() if place == PINNED}
         self.values = {name: self.values[name] for name in self.values if session.has(name)}
@@ -205,20 +206,23 @@ class Page:
 
     def _reset(self) -> None:
         self._tell()
+        self.session = self.session.with_estimated([])
         self._set({})
 
     def _tune(self) -> None:
-        free = list(self.values) or ([self._active.name] if self._active else [])
+        moved = list(self.values) or ([self._active.name] if self._active else [])
+        free = [name for name in moved if name not in self.session.estimated]
         values, label = dict(self.values), self._label_of(0)
         self._tell(f"tuning {', '.join(free)} ...")
 
         def work(_: Callable[[], bool]) -> None:
-            found = self.session.tuned(label, values, free)
-            said = ", ".join(f"{name} = {found[name]:.4g}" for name in free)
+            found, by = self.session.tuned(label, values, free)
+            sliders = [self.session.slider(name) for name in free]
+            said = ", ".join(f"{each.title} {each.words(found[each.name])}" for each in sliders)
 
             def show() -> None:
                 self._set(found)
-                self._tell(f"tuned by likelihood: {said}")
+                self._tell(f"tuned by {by}: {said}")
 
             self._later(show)
 
@@ -245,7 +249,8 @@ class Page:
         except BadInput as error:
             self._tell(str(error))
             return
-        self._tell(f"estimated beside the state: {', '.join(sorted(names)) or 'nothing'}")
+        self._tell(*([] if names else ["Nothing is estimated in the state any more."]))
+        self._label(self._widgets[name][0])
         self._replay()
 
     def _save(self) -> None:
@@ -291,7 +296,7 @@ class Page:
             for place, label in enumerate(self.session.filters)
         }
         self._take(played)
-        self._at_s = instant_of(self.played[0], self._chosen_case())
+        self._at_s = instant_of(self.played[0].cases.get(self._chosen_case()))
         self._cursor.location = self._at_s
         times = [case.time_s for case in self.played[0].cases.values() if len(case.time_s)]
         if times:
@@ -321,6 +326,7 @@ class Page:
                 points.append(point)
             now = values.get(active.name, active.own)
             self._later(lambda: show_likelihood(self.plots["likelihood"], active, points, now))
+            self._later(self.plots["likelihood"].show_if_drawn)
 
         self._work.ask(work)
 
@@ -336,23 +342,21 @@ class Page:
             self._case_choice.value = names[0]
         case = self.played[0].cases.get(self._chosen_case())
         components = list(case.components) if case else []
-        self._component.options = components
+        self._component.options = [(each, label_of_quantity(each)) for each in components]
         if components and self._component.value not in components:
             self._component.value = components[0]
 
     def _show(self) -> None:
         """Draw what was replayed, and say what it is worth."""
         case = self._chosen_case()
-        options = self._component.options
-        component = options.index(self._component.value) if self._component.value in options else 0
+        component = str(self._component.value or "")
         for place, played in self.played.items():
             show_played(self.plots, place, played, case, component)
-        self.plots["nees"].figure.visible = any(
-            one.errors is not None for each in self.played.values() for one in each.cases.values()
-        )
         if self.played[0].cases:
             fit_errors(self.plots["error"], self.played, case, component)
         self._show_lens()
+        for name in ("scene", "lens", "whiteness", "likelihood", "nees", "nis"):
+            self.plots[name].show_if_drawn()
         self._show_head()
 
     def _show_lens(self) -> None:
@@ -363,24 +367,12 @@ class Page:
         topics = [each for each in self.truths if one is not None and each.strip("/").startswith(case)]
         truth = true_path(self.session.log, topics[0]) if topics else None
         show_lens(self.plots["lens"], self.plots["scene"], self.played, case, truth, self._at_s)
-        self.plots["lens"].figure.title.text = f"Lens at {self._at_s:.1f} s"
+        self.plots["lens"].say(f"Lens at {self._at_s:.1f} s (m)")
 
     def _show_head(self) -> None:
+        estimated = {name: self.session.slider(name) for name in self.session.estimated}
         case = self._chosen_case()
-        parts = []
-        for place, label in enumerate(self.session.filters):
-            played = self.played[place]
-            verdict = played.verdicts.get(case, Verdict("failed", "It estimated nothing.", ""))
-            parts.append(verdict_html(label, verdict, COLOURS[min(place, 1)]))
-            if case in played.cases:
-                parts.append(numbers_html(played, self.played.get(PINNED), case))
-            if played.seconds > SLOW_S:
-                parts.append(f"<p>One replay takes {played.seconds:.1f} s.</p>")
-        if case in self.played[0].cases and len(self.played[0].cases[case].time_s) > LINES:
-            parts.append(
-                "<p>So long a log is drawn by the least and the greatest value of each span.</p>"
-            )
-        self._head.text = "".join(parts)
+        self._head.text = head_html(self.session.filters, self.played, case, estimated)
 
     def _chosen_case(self) -> str:
         return str(self._case_choice.value or "")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.models import (
+    BasicTicker,
     BasicTickFormatter,
     ColumnDataSource,
     FixedTicker,
@@ -24,10 +25,11 @@ from pipeline.exploring.curves import (
     fewer,
     map_points,
     true_path,
-    typical_time_s,
 )
 from pipeline.exploring.session import Played
-from pipeline.exploring.sliders import Slider
+from pipeline.exploring.sliders import Slider, ticks_between
+from pipeline.output.words import label_of, quantity
+from recorders.parameters import unit_of
 from replay.engine.streams.sources import MemorySource
 
 # The report's ink, quiet grey and crimson; a filter has its own colour, what is pinned is a grey ghost.
@@ -35,8 +37,10 @@ INK, QUIET, RED, GHOST, TINT = "#1c1f24", "#5b6470", "#b3123f", "#8b939e", "#e3e
 COLOURS = ("#a35c00", "#1f7a4d")
 PINNED = "pinned"
 SHIFTS: Mapping[int | str, float] = {PINNED: 0.3, 1: 0.15, 0: 0.0}  # so that lags can be told apart
-HEIGHT = 220
-LEAST_DROP = 100.0  # of log-likelihood, that its plot shows at least
+HEIGHT, HEIGHT_OVER_TIME = 220, 235
+LEAST_DROP = 10.0  # of log-likelihood, that its plot shows at least
+ABOUT_PEAK = 3  # values to either side of it that are seen
+LEAST_CORRELATION = 0.25
 Data = Mapping[str, Any]
 
 
@@ -58,6 +62,17 @@ class Plot:
         self.sources[of, what] = made
         return made
 
+    def say(self, title: str) -> None:
+        """Give it a title, which is also what a screen reader has of it."""
+        if title != self.figure.title.text:
+            self.figure.title.text = title
+            self.figure.html_attributes = {"role": "img", "aria-label": title}
+
+    def show_if_drawn(self) -> None:
+        """Show it only where something is drawn of a filter."""
+        sources = self.sources.values()
+        self.figure.visible = any(len(each) for of in sources for each in of.data.values())
+
     def clear(self, of: int | str) -> None:
         """Draw nothing of a filter."""
         for own, what in self.sources:
@@ -78,8 +93,8 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
     ranges = {} if over_time is None else {"x_range": over_time}
     made = figure(
         name=name,
-        title=title,
-        height=HEIGHT,
+        title="",
+        height=HEIGHT if over_time is None else HEIGHT_OVER_TIME,
         sizing_mode="stretch_width",
         toolbar_location=None,
         tools="",
@@ -100,7 +115,11 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
     made.axis.axis_label_text_color = QUIET
     made.background_fill_alpha = 0.0
     made.border_fill_alpha = 0.0
-    return Plot(made)
+    if over_time is not None:
+        made.xaxis.axis_label = over_time.name
+    plot = Plot(made)
+    plot.say(title)
+    return plot
 
 
 def error_plot(over_time: Range1d, cursor: Span) -> Plot:
@@ -129,7 +148,8 @@ def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
 
 def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
     """The plane from above: map, truth, estimates."""
-    plot = blank("scene", "Scene from above", match_aspect=True)
+    plot = blank("scene", "Scene from above (m)", match_aspect=True)
+    plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
     points = map_points(log)
     plot.figure.scatter(points[:, 0], points[:, 1], marker="triangle", size=8, line_color=QUIET,
                         fill_color=None)  # fmt: skip
@@ -147,6 +167,8 @@ def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
 def lens_plot() -> Plot:
     """The scene at one instant, so near that errors of centimetres are seen."""
     plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
+    plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
+    plot.figure.xaxis.ticker = BasicTicker(desired_num_ticks=2)  # of many digits each
     plot.figure.match_aspect = True
     plot.figure.line("x", "y", source=plot.source(0, "truth", "x", "y"), line_color=INK, line_width=2)
     for of in (PINNED, 1, 0):
@@ -175,7 +197,7 @@ def whiteness_plot() -> Plot:
 
 def likelihood_plot() -> Plot:
     """The log-likelihood of all measurements over the parameter that is dragged."""
-    plot = blank("likelihood", "Likelihood", y_range=Range1d(0.0, 1.0))
+    plot = blank("likelihood", "Likelihood", x_range=Range1d(-0.05, 1.05), y_range=Range1d(0.0, 1.0))
     plot.figure.yaxis.formatter = NumeralTickFormatter(format="0,0")
     source = plot.source(0, "line", "x", "y")
     plot.figure.line("x", "y", source=source, line_color=QUIET, line_width=1.5)
@@ -186,7 +208,7 @@ def likelihood_plot() -> Plot:
 
 
 def show_played(
-    plots: Mapping[str, Plot], of: int | str, played: Played, case: str, component: int
+    plots: Mapping[str, Plot], of: int | str, played: Played, case: str, component: str
 ) -> None:
     """Draw one replay: errors, NEES, NIS, whiteness, path."""
     one = played.cases.get(case)
@@ -203,19 +225,30 @@ def show_played(
         plots["scene"].fill(of, "line", x=one.path.points[rows, 0], y=one.path.points[rows, 1])
 
 
-def _show_errors(plot: Plot, of: int | str, case: Case, component: int) -> None:
-    if case.errors is None:
-        sigma, t = 1.96 * case.sigma[:, component], case.time_s
+def _show_errors(plot: Plot, of: int | str, case: Case, component: str) -> None:
+    """The error of a component; of what has no truth its estimate or how sure the filter is of it."""
+    errors, name = case.errors, label_of(component)
+    if errors is None or component not in errors.components:
+        if component not in case.components:  # as of a filter without it in the state
+            plot.clear(of)
+            return
+        sigma, t = 1.96 * case.sigma[:, case.components.index(component)], case.time_s
         rows = fewer(len(t))
-        plot.fill(of, "band", t=t[rows], low=-sigma[rows], high=sigma[rows])
+        middle = case.beside.get(component, np.zeros(len(t)))[rows]
+        is_known = component in case.beside
+        plot.fill(of, "line", x=t[rows] if is_known else [], y=middle if is_known else [])
+        plot.fill(of, "band", t=t[rows], low=middle - sigma[rows], high=middle + sigma[rows])
+        if of == 0:
+            plot.fill(0, "outside", t=[], foot=[])
+            plot.say(f"{'Estimate' if is_known else 'Errors'} of {name}; tinted: 95 %, as it claims")
         return
-    errors = case.errors
-    error, t = errors.error[:, component], errors.elapsed_s
-    sigma = 1.96 * np.sqrt(errors.covariance[:, component, component])
+    place = errors.components.index(component)
+    error, t = errors.error[:, place], errors.elapsed_s
+    sigma = 1.96 * np.sqrt(errors.covariance[:, place, place])
     rows, even = extremes(error), fewer(len(t))
     plot.fill(of, "line", x=t[rows], y=error[rows])
     plot.fill(of, "band", t=t[even], low=-sigma[even], high=sigma[even])
-    _show_foot(plot, of, f"Error of {errors.components[component]}", t, np.abs(error) > sigma)
+    _show_foot(plot, of, f"Error of {name}", t, np.abs(error) > sigma)
 
 
 def _show_nees(plot: Plot, of: int | str, case: Case) -> None:
@@ -239,13 +272,8 @@ def _show_nis(plot: Plot, of: int | str, case: Case) -> None:
     plot.fill(
         of, "interval", t=nis.time_s[even], low=np.maximum(nis.low[even], 1e-6), high=nis.high[even]
     )
-    _show_foot(
-        plot,
-        of,
-        "NIS per component, by second",
-        nis.time_s,
-        (nis.mean < nis.low) | (nis.mean > nis.high),
-    )
+    outside = (nis.mean < nis.low) | (nis.mean > nis.high)
+    _show_foot(plot, of, "NIS per component", nis.time_s, outside)
 
 
 def _show_whiteness(plot: Plot, of: int | str, case: Case) -> None:
@@ -258,7 +286,9 @@ def _show_whiteness(plot: Plot, of: int | str, case: Case) -> None:
     plot.fill(of, "line", x=lags + SHIFTS[of], y=white.correlation, zero=np.zeros(len(lags)))
     ends = [0.0, len(lags) + 1.0]
     plot.fill(of, "interval", t=ends, low=[-white.bound] * 2, high=[white.bound] * 2)
-    plot.figure.title.text = f"Whiteness of the innovations of {name}"
+    most = max(LEAST_CORRELATION, 1.1 * float(np.nanmax(np.abs(white.correlation))))
+    plot.figure.y_range.update(start=-most, end=most)
+    plot.say(f"Whiteness of the innovations of {quantity(name).name}")
 
 
 def show_lens(
@@ -311,36 +341,35 @@ def show_likelihood(
     here = slider.place(now)
     there = float(np.interp(here, places, likelihoods))
     plot.fill(0, "here", x=[here], y=[there])
-    below = 1.3 * max(likelihoods[best] - there, LEAST_DROP)
+    near = likelihoods[max(best - ABOUT_PEAK, 0) : best + ABOUT_PEAK + 1]
+    below = 1.3 * max(likelihoods[best] - min(there, *near), LEAST_DROP)
     plot.figure.y_range.update(start=likelihoods[best] - below, end=likelihoods[best] + 0.15 * below)
-    plot.figure.title.text = (
-        f"Likelihood over {slider.title}; greatest near {slider.words(points[best][0])}"
-    )
+    plot.say(f"Likelihood over {slider.title}; greatest near {slider.words(points[best][0])}")
     ticks = [0.0, 0.25, 0.5, 0.75, 1.0]
     plot.figure.xaxis.ticker = FixedTicker(ticks=ticks)
     plot.figure.xaxis.major_label_overrides = {each: slider.words(slider.value(each)) for each in ticks}
 
 
-def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: int) -> None:
+def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: str) -> None:
     """Choose the error's axis so that all but rare errors are seen, of what is pinned too."""
-    most = 0.0
+    most, ends = 0.0, [0.0]
     for each in played.values():
         one = each.cases.get(case)
-        if one is not None:
-            most = max(most, 1.96 * float(np.nanmedian(one.sigma[:, component])) * 2.0)
-            if one.errors is not None and len(one.errors.error):
-                most = max(most, float(np.quantile(np.abs(one.errors.error[:, component]), 0.995)))
+        if one is None or component not in one.components:
+            continue
+        sigma = float(np.nanmedian(one.sigma[:, one.components.index(component)]))
+        most = max(most, 1.96 * sigma * 2.0)
+        if component in one.beside:
+            ends += np.nanquantile(one.beside[component], [0.005, 0.995]).tolist()
+        elif one.errors is not None and len(one.errors.error):
+            errors = one.errors.error[:, one.errors.components.index(component)]
+            most = max(most, float(np.quantile(np.abs(errors), 0.995)))
     if most > 0.0:
-        plot.figure.y_range.update(start=-1.1 * most, end=1.1 * most)
-
-
-def instant_of(played: Played, case: str) -> float:
-    """Where the lens looks at first: at a typical second, else in the middle."""
-    one = played.cases.get(case)
-    if one is None or not len(one.time_s):
-        return 0.0
-    found = typical_time_s(one)
-    return float(np.median(one.time_s)) if found is None else found
+        low, high = min(ends) - 1.1 * most, max(ends) + 1.1 * most
+        plot.figure.y_range.update(start=low, end=high)
+        ticks = ticks_between(low, high, unit_of(component))
+        plot.figure.yaxis.ticker = FixedTicker(ticks=list(ticks))
+        plot.figure.yaxis.major_label_overrides = ticks
 
 
 def _lines(plot: Plot, x: str = "x", y: str = "y") -> None:
@@ -366,5 +395,5 @@ def _show_foot(plot: Plot, of: int | str, title: str, time_s: Floats, outside: A
         t = t[fewer(len(t))] if len(t) else t
         plot.fill(0, "outside", t=t, foot=np.full(len(t), 0.02))
         share = 100.0 * float(np.mean(outside)) if len(outside) else 0.0
-        shown = f"{share:.0f}" if share >= 10.0 else f"{share:.1f}"
-        plot.figure.title.text = f"{title}: outside {shown} %; 5 % is right"
+        shown = f"{share:.0f}" if share >= 10.0 or not share else f"{share:.1f}"
+        plot.say(f"{title}: outside {shown} %; 5 % is right")

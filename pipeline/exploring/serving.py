@@ -18,6 +18,7 @@ from tornado.ioloop import IOLoop
 
 from pipeline.exploring.page import Page
 from pipeline.exploring.session import Session
+from pipeline.exploring.widgets import NAME_SLIDERS
 
 LOOPBACK = "127.0.0.1"
 TEMPLATE = """
@@ -32,7 +33,10 @@ TEMPLATE = """
   }
 </style>
 {% endblock %}
+{% block postamble %}
+<script>
 """
+TEMPLATE += NAME_SLIDERS + "</script>{% endblock %}"
 CLOSED_MS = 3000  # after a page is closed; one that is loaded again is back by then
 
 

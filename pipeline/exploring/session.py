@@ -28,6 +28,8 @@ from replay.engine.replaying.estimator import Bound, Estimator, bind
 from replay.engine.replaying.replaying import collect, replay
 from replay.engine.streams.sources import LogSource, MemorySource
 from replay.foreign.naming import allowed, name_of
+from replay.inference.all_methods import modelled
+from replay.inference.estimators import model_of
 from replay.judging.judge import Judge
 from replay.timeline import viewer
 
@@ -94,6 +96,13 @@ class Session:
         """Tell whether a parameter has a slider."""
         return any(each.name == name for each in self.sliders)
 
+    def like_first(self, method: str) -> dict[str, Any]:
+        """The settings of a filter by another method, of the same model where that is one's own."""
+        like = next(iter(self.filters.values()))
+        kind = like.get("kind")
+        model = model_of(kind) if isinstance(kind, Estimator) else None
+        return {**like, "kind": modelled(model, method) if model else method}
+
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
         """The same log with other filters; raises BadInput where one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
@@ -101,8 +110,11 @@ class Session:
     def with_estimated(self, names: Sequence[str]) -> "Session":
         """The same with these parameters in the state, each from a quarter of its slider's way.
 
-        Raises BadInput where a model cannot estimate one.
+        Raises BadInput where a filter cannot estimate one.
         """
+        for label in self.filters:
+            if names and not self._takes(label, "estimate"):
+                raise BadInput(f"{label}: has no model that says what can be estimated in the state")
         sigmas = {name: 0.25 * (self.slider(name).high - self.slider(name).low) for name in names}
         return Session(self.source, self.filters, self.gap_limit_s, sigmas)
 
@@ -116,7 +128,8 @@ class Session:
         outputs = collect(replay(self._run.ensemble, bound))
         judge = Judge(self._run.ensemble, gap_limit_s=self.gap_limit_s)
         judged = judge.add(outputs)
-        cases = cases_of(outputs, judged.errors, self.source.epoch_ns)
+        estimated = self.settings(label, values).get("estimate", ())
+        cases = cases_of(outputs, judged.errors, self.source.epoch_ns, estimated)
         parameters = bound[0].parameters
         stated = {label: parameters.model_dump()} if parameters is not None else {}
         alarms, failures = alarms_of(judge, stated), judge.failures
@@ -140,8 +153,8 @@ class Session:
             if math.isfinite(likelihood):
                 yield value, likelihood
 
-    def tuned(self, label: str, values: Values, free: Sequence[str]) -> dict[str, float]:
-        """The values of most likelihood of some parameters, the others as they are set.
+    def tuned(self, label: str, values: Values, free: Sequence[str]) -> tuple[dict[str, float], str]:
+        """The best values of some parameters, the others as they are set, and by what they are best.
 
         Raises BadInput as `tune` does.
         """
@@ -149,7 +162,7 @@ class Session:
             self.source, {label: self.settings(label, values)}, free, gap_limit_s=self.gap_limit_s
         )
         best = found.parameters.set_index("parameter")["value"]
-        return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}
+        return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}, found.objective.by
 
     def diagnosed(self, label: str, values: Values) -> list[str]:
         """What is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.output.words import MINUS, number
 from pipeline.tuning.tuning import value_at_start
 from recorders.errors import BadInput
 from recorders.parameters import bounds_of, describe
@@ -25,6 +26,7 @@ SMALLER = {
     "rad": ((math.inf, 180.0 / math.pi, "°"),),
     "rad/s": ((math.inf, 180.0 / math.pi, "°/s"),),
 }
+STEPS_OF_TICKS = (1.0, 2.0, 5.0, 10.0)
 MOTION, GATE = "motion", "gate"
 
 
@@ -33,7 +35,7 @@ class Slider(NamedTuple):
 
     Attributes:
         name: of the parameter.
-        group: what it is of: a topic, or `MOTION` or `GATE`.
+        group: what it is of: a topic, `MOTION` or `GATE`; of an estimator without a model that itself.
         meaning, unit: of the parameter.
         own: its value as the log and the settings have it.
         low, high: the ends of the slider.
@@ -56,7 +58,7 @@ class Slider(NamedTuple):
         >>> Slider("sigma_range_m", "", "", "m", 0.1, 0.01, 1.0, True).title
         'sigma range'
         """
-        end = "_" + self.unit.replace("^", "").replace("1/", "per_").replace("/", "p")
+        end = "_" + self.unit.replace("^", "").replace("1/", "per_").replace("/", "p").lower()
         return self.name.removesuffix(end).replace("_", " ")
 
     def place(self, value: float) -> float:
@@ -90,14 +92,35 @@ class Slider(NamedTuple):
 def in_words(value: float, unit: str) -> str:
     """A number with its unit, as people write it.
 
-    >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(0.99, ""), in_words(0.004, "m")
-    ('10 cm', '1.15°', '0.99', '4 mm')
+    >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(-0.99, ""), in_words(0.0, "rad")
+    ('10 cm', '1.15°', '−0.99', '0°')
     """
+    factor, sign = _unit_for(value, unit)
+    text = f"{value * factor:.3g}".replace("-", MINUS)
+    return f"{number(value * factor) if 'e' in text else text}{sign}"
+
+
+def _unit_for(value: float, unit: str) -> tuple[float, str]:
+    """By what to multiply so that a number is of a handy size, and what to write behind it."""
     for most, factor, shorter in SMALLER.get(unit, ()):
-        if 0.0 < abs(value) < most:
-            space = "" if shorter.startswith("°") else " "
-            return f"{value * factor:.3g}{space}{shorter}"
-    return f"{value:.3g} {unit}".strip()
+        if 0.0 < abs(value) < most or most == math.inf:
+            return factor, shorter if shorter.startswith("°") else f" {shorter}"
+    return 1.0, f" {unit}" if unit else ""
+
+
+def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
+    """Round values between two ends, a few of them, as people write them: in one unit.
+
+    >>> ticks_between(-0.03, 0.03, "m")
+    {-0.02: '−2 cm', 0.0: '0', 0.02: '2 cm'}
+    """
+    factor, sign = _unit_for(max(abs(low), abs(high)), unit)
+    first, last = low * factor, high * factor
+    power = 10.0 ** math.floor(math.log10((last - first) / 5))
+    step = power * next(each for each in STEPS_OF_TICKS if power * each >= (last - first) / 5)
+    places = [place * step for place in range(math.ceil(first / step), math.floor(last / step) + 1)]
+    texts = [f"{f'{place:.6g}'.replace('-', MINUS)}{sign}" if place else "0" for place in places]
+    return {place / factor: text for place, text in zip(places, texts, strict=True)}
 
 
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
@@ -111,11 +134,11 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
         bound: by label.
     """
     found: dict[str, Slider] = {}
-    for each in bound.values():
+    for label, each in bound.items():
         if each.parameters is None:
             continue
         meanings = {entry.name: entry for entry in describe(type(each.parameters))}
-        for name, group in _groups(each).items():
+        for name, group in _groups(label, each).items():
             if name in found or name not in meanings:
                 continue
             entry = meanings[name]
@@ -126,7 +149,7 @@ def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> 
     return [slider for group in (*groups, GATE) for slider in found.values() if slider.group == group]
 
 
-def _groups(bound: Bound) -> dict[str, str]:
+def _groups(label: str, bound: Bound) -> dict[str, str]:
     """The names of parameters that matter on this log, with what they are of."""
     assert bound.parameters is not None
     names = number_fields(type(bound.parameters))
@@ -134,7 +157,7 @@ def _groups(bound: Bound) -> dict[str, str]:
         how_run = (
             ForeignParameters.model_fields if isinstance(bound.parameters, ForeignParameters) else ()
         )
-        return dict.fromkeys((name for name in names if name not in how_run), MOTION)
+        return dict.fromkeys((name for name in names if name not in how_run), label)
     reading = bound.reading()
     found = {name: topic or MOTION for name, topic in reading.noises.items()}
     for name, (_, topics) in reading.augmentable.items():

@@ -78,7 +78,8 @@ def _evidence(case: Case) -> str:
     if case.errors is not None and np.isfinite(case.errors.nees).any():
         nees = float(np.nanmean(case.errors.nees))
         facts.append(f"NEES is {nees:.2f} for {len(case.errors.components)}")
-    return f"{' and '.join(facts)} within their intervals." if facts else "There is nothing to judge by."
+    within = "within its interval" if len(facts) == 1 else "within their intervals"
+    return f"{' and '.join(facts)}, {within}." if facts else "There is nothing to judge by."
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:

@@ -1,20 +1,39 @@
-"""The page's sliders, buttons and choices, as Bokeh has them."""
+"""The page's sliders, buttons, choices and the axis of time, as Bokeh has them."""
 
 from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
 from typing import Any
 
 from bokeh.layouts import row
-from bokeh.models import Button, Select
+from bokeh.models import Button, Range1d, Select
 from bokeh.models import Slider as SliderWidget
 
 from pipeline.exploring.markup import SIDE
 from pipeline.exploring.plots import COLOURS
 from pipeline.exploring.sliders import STEPS, Slider
+from recorders.recording import SIMULATION_EPOCH_NS
 from replay.inference.all_methods import METHODS
 
 NONE = "none"
 A_ROW = 2  # buttons
 NO_FILTERS = ("bound",)  # methods that estimate nothing
+YEAR_2000_NS = 946_684_800_000_000_000  # clocks that show less do not show the date
+# Bokeh's sliders have no name for a screen reader, and say a place from 0 to 1: tags hold both in words.
+NAME_SLIDERS = """
+const view = Bokeh.Models.get("Slider").prototype.default_view.prototype;
+const render = view.render;
+view.render = function () {
+  render.call(this);
+  const say = () => {
+    const handle = this.slider_el.querySelector(".noUi-handle");
+    const [name, words] = this.model.tags;
+    handle.setAttribute("aria-label", name);
+    handle.setAttribute("aria-valuetext", words);
+  };
+  this._noUiSlider.on("update", say);
+  this.on_change(this.model.properties.tags, say);
+};
+"""
 
 
 def widget_of(slider: Slider, value: float) -> Any:
@@ -30,14 +49,28 @@ def widget_of(slider: Slider, value: float) -> Any:
         width=SIDE - 20,
         margin=(0, 5, 0, 5),
         name=slider.name,
+        tags=tags_of(slider, value),
         bar_color=COLOURS[0],
     )
 
 
-def filter_choices(filters: Iterable[str]) -> list[Any]:
+def tags_of(slider: Slider, value: float) -> list[str]:
+    """What a screen reader says of a slider: its name with what it is of, and its value."""
+    return [f"{slider.title}, {slider.group}", slider.words(value)]
+
+
+def time_range(epoch_ns: int) -> Range1d:
+    """The range of all plots over time, whose name says since when it counts."""
+    if epoch_ns == SIMULATION_EPOCH_NS or epoch_ns < YEAR_2000_NS:
+        return Range1d(0.0, 1.0, name="time since the log began (s)")
+    began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)
+    return Range1d(0.0, 1.0, name=f"seconds since {began:%Y-%m-%d %H:%M:%S} UTC")
+
+
+def filter_choices(filters: Iterable[str], known: Iterable[str]) -> list[Any]:
     """Choices of the first filter and of the second, which may be none: those at hand, and methods."""
     width = (SIDE - 20) // 2
-    names = list(dict.fromkeys([*filters, *(each for each in METHODS if each not in NO_FILTERS)]))
+    names = list(dict.fromkeys([*known, *(each for each in METHODS if each not in NO_FILTERS)]))
     first, second = [*filters, NONE][:2]
     return [
         Select(title="Filter", name="filter", options=names, value=first, width=width),

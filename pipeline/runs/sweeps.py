@@ -343,5 +343,5 @@ def heat_maps(rows: pd.DataFrame, over: Sequence[Over], name: str) -> "Figure":
             axis.set_ticks(list(shown), [f"{places[index]:.3g}" for index in shown])
         axes.tick_params(axis="x", rotation=45)  # nine numbers side by side
         axes.set(xlabel=x.label, ylabel=y.label, title=label)
-    figure.colorbar(picture, ax=figure.axes, label=name)
+    figure.colorbar(picture, ax=figure.axes, label=label_of(name.partition("-")[0]))
     return figure

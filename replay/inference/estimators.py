@@ -99,6 +99,12 @@ def modelled_by(
     )
 
 
+def model_of(estimator: Estimator[Any]) -> Model | None:
+    """Find the model of which `modelled_by` made an estimator; None where another made it."""
+    made = estimator.bind
+    return made.keywords["model"] if isinstance(made, partial) and made.func is bind_model else None
+
+
 def of_any_model(method: Method) -> Estimator[Any]:
     """Make the estimator that estimates, by one method, the registered model that fits a log."""
     return _OfAnyModel(method)

@@ -201,7 +201,7 @@ def test_a_map_of_a_sweep_has_its_cross_where_the_error_is_least() -> None:
         [[cross]] = [line.get_xydata().tolist() for line in axes.lines]
         assert tuple(cross) == least
         assert [text.get_text() for text in axes.get_xticklabels()] == ["10", "20", "40"]
-    assert bar.get_ylabel() == "position_rmse_m-robot1"
+    assert bar.get_ylabel() == "position error, RMS (m)"
     assert maps[0].images[0].norm is maps[1].images[0].norm
     [figure] = figures_of(swept(over, values, "nees"), over).values()
     assert not figure.axes[0].lines

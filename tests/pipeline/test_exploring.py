@@ -28,6 +28,7 @@ from pipeline.exploring.session import Session, open_session
 from pipeline.exploring.sliders import SMALLER, in_words
 from pipeline.exploring.verdict import numbers_of
 from recorders.errors import BadInput
+from replay.estimators.models.landmarks import ROBOT
 
 SURE = {"sigma_range_m": 0.03}  # of .1
 
@@ -118,15 +119,40 @@ def test_sliders_are_of_what_the_log_is_read_by(session: Session) -> None:
 def test_likelihood_is_greatest_where_tuning_ends(session: Session) -> None:
     points = list(session.likelihoods("ekf", SURE, "sigma_range_m"))
     best = max(points, key=lambda each: each[1])[0]
-    tuned = session.tuned("ekf", SURE, ["sigma_range_m"])["sigma_range_m"]
+    tuned = session.tuned("ekf", SURE, ["sigma_range_m"])[0]["sigma_range_m"]
     values = [value for value, _ in points]
     assert abs(values.index(best) - np.argmin(np.abs(np.log(np.array(values) / tuned)))) <= 1
     assert session.diagnosed("ekf", SURE)[0].startswith("1. sigma_range_m")
 
 
 def test_a_parameter_is_taken_into_the_state(session: Session) -> None:
-    wider = session.with_estimated(["bias_range_m"])
-    assert wider.play("ekf", {}).cases["robot1"].components[-1] == "bias_range_m"
+    """Its estimate is drawn and said; NEES is still of what the truth has."""
+    document_of = pytest.importorskip("bokeh.document").Document
+    from pipeline.exploring.page import Page
+    from pipeline.exploring.widgets import time_range
+
+    page = Page(session.with_estimated(["bias_range_m"]), document_of())
+    page.end()
+    page._component.value = "bias_range_m"
+    case = page.played[0].cases["robot1"]
+    assert case.components[-1] == "bias_range_m"
+    assert case.nees_interval == session.play("ekf", {}).cases["robot1"].nees_interval
+    drawn, figure = page.plots["error"].sources, page.plots["error"].figure
+    line, band = drawn[0, "line"].data, drawn[0, "band"].data
+    assert abs(line["y"][-1]) < 0.02
+    assert band["low"][-1] < line["y"][-1] < band["high"][-1]
+    assert figure.y_range.start < min(line["y"])
+    assert figure.title.text.startswith("Estimate of bias range (m); ")
+    assert "Estimated in the state: bias range is " in page._head.text
+    assert "bias range, estimated from" in page._widgets["bias_range_m"][2].text
+    assert figure.xaxis.axis_label == "time since the log began (s)"
+    assert time_range(1_250_000_000 * 10**9).name == "seconds since 2009-08-11 14:13:20 UTC"
+
+
+def test_other_methods_estimate_an_own_model(log: Path) -> None:
+    own = open_session(log, {"mine": fl.modelled(ROBOT, "ekf")})
+    other = own.with_filters({"ukf": own.like_first("ukf")})
+    assert other.play("ukf", {}).verdicts["robot1"].level == "good"
 
 
 def test_a_log_without_truth_is_explored(log: Path) -> None:
@@ -205,18 +231,18 @@ def test_the_page_draws_and_says_what_was_replayed(
         np.testing.assert_allclose(middle, case.path.points[row], atol=1e-3)
     band, rows = drawn["error"][0, "band"].data, fewer(len(sigma))
     np.testing.assert_allclose((band["low"], band["high"]), (-sigma[rows], sigma[rows]))
-    is_out = {"Error of y_m": most > sigma, "NIS per component, by second": None, "NEES": None}
+    is_out = {"Error of y (m)": most > sigma, "NIS per component": None, "NEES": None}
     low, high = case.nees_interval
     is_out["NEES"] = (case.errors.nees < low) | (case.errors.nees > high)
-    is_out["NIS per component, by second"] = (case.nis.mean < case.nis.low) | (
+    is_out["NIS per component"] = (case.nis.mean < case.nis.low) | (
         case.nis.mean > case.nis.high
     )
     for (words, outside), name in zip(is_out.items(), ("error", "nis", "nees"), strict=True):
         share = np.mean(outside)
         said = f"{words}: outside {100 * share:.{int(share < 0.1)}f} %; 5 % is right"
         assert titles[name] == said
-    assert titles["scene"] == "Scene from above"
-    assert titles["lens"] == f"Lens at {page._at_s:.1f} s"
+    assert titles["scene"] == "Scene from above (m)"
+    assert titles["lens"] == f"Lens at {page._at_s:.1f} s (m)"
     for plot, low, high in (("nees", *case.nees_interval), ("nis", case.nis.low, case.nis.high)):
         interval = drawn[plot][0, "interval"].data
         assert np.all(interval["low"] == low)
@@ -225,7 +251,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     assert end == pytest.approx(1.1 * max(2 * np.median(sigma), np.quantile(most, 0.995)), rel=0.3)
     assert end == -page.plots["error"].figure.y_range.start
     least = min(case.whiteness, key=lambda name: case.whiteness[name].probability)
-    assert titles["whiteness"].endswith(f" {least}")
+    assert titles["whiteness"].endswith(f" {least.rpartition('_')[0]}")
     np.testing.assert_array_equal(
         drawn["whiteness"][0, "line"].data["y"], case.whiteness[least].correlation
     )
@@ -249,7 +275,7 @@ def test_the_page_draws_and_says_what_was_replayed(
 def test_numbers_below_zero_are_written_as_those_above() -> None:
     for unit in SMALLER:
         for value in (1e-5, 0.003, 0.05, 2.0):
-            assert in_words(-value, unit) == f"-{in_words(value, unit)}"
+            assert in_words(-value, unit) == f"\N{MINUS SIGN}{in_words(value, unit)}"
 
 
 def test_the_newest_work_wins() -> None:
@@ -356,7 +382,7 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
     viewed, is_viewed = [], Event()
 
     def view(rrd: Path, *, at_s: float) -> None:
-        viewed.append((rrd.read_bytes()[:4], f"Lens at {at_s:.1f} s"))
+        viewed.append((rrd.read_bytes()[:4], f"Lens at {at_s:.1f} s (m)"))
         is_viewed.set()
 
     monkeypatch.setattr("replay.timeline.viewer.view", view)  # there is no screen
@@ -369,6 +395,11 @@ def test_in_a_browser_curves_follow_the_slider(log: Path, monkeypatch: pytest.Mo
         page.on("pageerror", lambda error: said.append(str(error)))
         page.goto(explorer.url)
         page.wait_for_selector("text=Nothing speaks against it.")
+        axe = pytest.importorskip("axe_playwright_python", reason="axe-playwright-python is missing")
+        page.evaluate((Path(axe.__file__).parent / "axe.min.js").read_text(encoding="utf-8"))
+        assert page.evaluate("axe.run().then((each) => each.violations.map((one) => one.id))") == []
+        handle = page.get_by_role("slider", name="sigma range, /robot1/range_bearing")
+        assert handle.get_attribute("aria-valuetext") == "10 cm"
         before = page.evaluate(NOW)
         for place in (0.9, 0.1, 0.7, 0.25):  # the last one wins
             page.evaluate(DRAG, place)

@@ -31,9 +31,9 @@ from pipeline.output.charts import (
 )
 from pipeline.output.claims import Claim
 from pipeline.output.report import write_report
-from pipeline.output.report.colours import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.first_run import Followed
 from pipeline.output.report.kinds import said
+from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.scene import typical_second
 from pipeline.output.results import Outcome, read_result, result_folder, write_outcome
 from recorders.errors import BadInput
@@ -240,7 +240,7 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     assert page.texts["h1"] == ["2 results"]
     titles = [chart["title"] for chart in page.charts]
     forest, scene, lens = titles[:3]  # several logs, and estimates that the folder does not keep
-    assert forest.startswith("Every difference with its interval")
+    assert forest.startswith("Every difference in percent")
     assert scene.startswith("robot1, first run from above")
     assert lens.startswith("Lens: 1 s of the first run")
     axes = {panel["x"]["label"] for chart in page.charts for panel in chart["panels"]}
@@ -506,7 +506,7 @@ def test_in_a_browser_trackers_and_claims_are_told_on_the_first_screen(
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         cards = page.locator(".card")
         names = cards.locator("h3").all_inner_texts()
-        assert names == ["pmbm", "jipda", "jpda", "claims"]
+        assert names == ["pmbm", "jipda", "jpda", "Claims"]
         assert long in cards.last.inner_text()
         if width == 1280:
             boxes = [each.bounding_box() for each in cards.all()]

@@ -15,7 +15,7 @@ from pipeline.output.alarms import Alarm
 from pipeline.output.claims import Claim
 from pipeline.output.report import _named, kinds, sheet, sweeps
 from pipeline.output.report.evidence import findings
-from pipeline.output.report.kinds import opening
+from pipeline.output.report.kinds import how_many_differ, opening
 from pipeline.output.report.sheet import table_of_pairs
 from pipeline.output.report.story import Story, story
 from pipeline.output.results import Measured, MetricTable, Result
@@ -111,6 +111,32 @@ def test_who_is_too_careful_in_every_run_is_not_honest_however_few_there_are() -
     assert words["b"] == words["d"] == "Too careful"
     assert words["c"] == "Honest, less accurate"
     assert told.doubts == ["the covariances of b and d, which are too large"]
+
+
+def test_of_those_that_tie_nobody_is_told_to_take_who_is_too_careful() -> None:
+    """Whose covariances are too large comes behind an honest one; where all are, the advice says so."""
+    error = 1.0 + NOISE[0]
+    nees = {"a": 1.5 + NOISE[1], "b": 3.0 + NOISE[2]}
+    runs = {
+        label: {"position_rmse_m": list(error + 1e-3 * place * NOISE[2]), "nees": list(of)}
+        for place, (label, of) in enumerate(nees.items())
+    }
+    told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
+    assert told.verdict == ["b and a tie in position error: take b, as a is too careful."]
+    assert [card.chip for card in told.cards] == ["As good as a", "As accurate as b, but too careful"]
+    runs["b"]["nees"] = runs["a"]["nees"]
+    told = _told(runs, {f"{label}.nees": HONEST for label in "ab"})
+    advice = "take either, but mend its covariance, which is too large."
+    assert told.verdict[0].endswith(f" tie in position error: {advice}")
+
+
+def test_a_comparison_says_of_whom_it_counts_the_metrics_that_differ() -> None:
+    row = {"first": "a", "second": "b", "quantity": "nees", "verdict": "worse"}
+    rows = [row, {**row, "verdict": "unclear"}, {**row, "second": "c", "verdict": "no difference"}]
+    told = "a and b differ in 1 of 2 metrics and a and c in none of 1 metric"
+    assert how_many_differ(pd.DataFrame(rows)) == told
+    many = [{**row, "second": second} for second in "bcde"]
+    assert how_many_differ(pd.DataFrame(many)) == "4 pairs differ in 4 of 4 metrics"
 
 
 @pytest.mark.parametrize(
@@ -239,7 +265,7 @@ def test_trackers_with_claims_are_told_whom_to_take_over_cases_that_are_cases() 
     first, claims = begun.story.verdict
     assert first == "Take pmbm: it has the least GOSPA, 3 m (mean of 3 cases)."
     assert claims == "1 of 4 claims confirmed; 3 refuted."
-    assert [card.estimator for card in begun.story.cards] == ["pmbm", "jpda", "nearest", "claims"]
+    assert [card.estimator for card in begun.story.cards] == ["pmbm", "jpda", "nearest", "Claims"]
     best, *_, last = begun.story.cards
     assert best.notes[:3] == [
         "Targets at a time: 1.5 missed.",
@@ -285,8 +311,8 @@ def test_a_page_of_claims_alone_has_a_card() -> None:
         claims=claims,
     )
     [card] = opening(result, {}).story.cards
-    assert (card.look, card.chip, card.value) == ("careful", "Not all confirmed", "1")
-    assert (card.unit, card.foot) == ("of 2 claims confirmed", ["1 not shown (may be chance)"])
+    told = "The experiment states 2 sentences; this result confirms 1 and leaves 1 to chance."
+    assert (card.look, card.chip, card.value, card.consistency) == ("claims", "", "", told)
 
 
 def test_of_a_study_nobody_is_taken_for_an_error_that_others_have_not() -> None:
@@ -303,11 +329,11 @@ def test_of_a_study_nobody_is_taken_for_an_error_that_others_have_not() -> None:
     )
     told = opening(result, {}).story
     assert told.verdict == ["The only claim is confirmed."]
-    assert [card.estimator for card in told.cards] == ["claims"]
+    assert [card.estimator for card in told.cards] == ["Claims"]
     both = result.model_copy(update={"metrics": {**metrics, "b.rule_error_m": 0.3, "b.nees": 3.0}})
     told = opening(both, {}).story
     assert told.verdict[0].startswith("Take a: ")
-    assert [card.estimator for card in told.cards] == ["a", "b", "claims"]
+    assert [card.estimator for card in told.cards] == ["a", "b", "Claims"]
     assert "the covariances of a, which nothing here judges" in told.doubts
 
 

@@ -24,18 +24,17 @@ from markupsafe import Markup, escape
 
 from pipeline.output.alarms import Cause
 from pipeline.output.charts import Chart
-from pipeline.output.report.colours import text_colours
 from pipeline.output.report.evidence import Findings, Timings
 from pipeline.output.report.first_run import first_run, picture_of_timeline
 from pipeline.output.report.glossary import Term, glossary
 from pipeline.output.report.kinds import Opening, opening
-from pipeline.output.report.naming import distinct_names, title_of
+from pipeline.output.report.naming import distinct_names, text_colours, title_of
 from pipeline.output.report.scene import lens, nis_chart, plan, tracked
 from pipeline.output.report.sheet import Sheet, sheets, table_of_pairs
 from pipeline.output.report.sweeps import RUNS_TABLE
 from pipeline.output.results import TIMINGS, Result, read_result, read_table, split_metric
 from pipeline.output.terminal import format_value
-from pipeline.output.words import TRACKING, quantity
+from pipeline.output.words import QUANTITIES, TRACKING, label_of, quantity
 from recorders.atomic import whole_file
 from recorders.errors import BadInput
 from recorders.parameters import Parameters, build
@@ -269,7 +268,9 @@ def _figure(path: Path) -> Shown:
         if not isinstance(values, dict):
             raise ValueError(f"{described.name} is not a chart")
         return _chart(name, build(Chart, values, str(described)))
-    return Shown(name, name, f"Figure: {name}", picture=_address("svg+xml", path.read_bytes()))
+    key, _, case = name.partition("-")
+    words = f"{label_of(key)}{f' of {case}' if case else ''}" if key in QUANTITIES else name
+    return Shown(name, words, f"Figure: {words}", picture=_address("svg+xml", path.read_bytes()))
 
 
 def _chart(name: str, chart: Chart) -> Shown:

@@ -295,42 +295,6 @@ class Findings:
         return float(min(sizes, key=lambda size: abs(chi_square_interval(size, runs)[1] - honest[1])))
 
 
-def broken_of(found: Findings) -> list[Evidence]:
-    """Who cannot be believed: who fails, then who is too sure, the worst first."""
-
-    def badness(each: Evidence) -> float:
-        return math.inf if each.state == "failed" else each.decisive.factor if each.decisive else 0.0
-
-    bad = [each for each in found.of.values() if each.state in ("failed", "too sure")]
-    return sorted(bad, key=badness, reverse=True)
-
-
-def choice_of(found: Findings) -> tuple[str, list[str]]:
-    """Whom to take, empty where there is none, and who draws with it: of those that can be believed."""
-    sound = [
-        each
-        for each in found.of.values()
-        if each.error is not None and each.state not in ("failed", "too sure")
-    ]
-    if not sound:
-        return "", []
-    best = min(sound, key=lambda each: each.error.value if each.error else math.inf).estimator
-    others = [each.estimator for each in sound if each.estimator != best]
-    return best, [
-        label for label in others if relation(found, best, label) in ("draw", "unclear", "withheld")
-    ]
-
-
-def in_order(found: Findings, broken: list[Evidence], take: str, equal: list[str]) -> list[str]:
-    """Whom to take, then who cannot be believed, the worst first, then the others by their error."""
-    rest = sorted(
-        found.labels,
-        key=lambda label: error.value if (error := found.of[label].error) else math.inf,
-    )
-    first = [each.estimator for each in broken]
-    return list(dict.fromkeys([*filter(None, [take]), *equal, *first, *rest]))
-
-
 def relation(found: Findings, first: str, second: str) -> Relation:
     """Whether the errors of two estimators differ: by the runs, or where they are few by the margin."""
     difference = found.difference(first, second, found.main, "low")

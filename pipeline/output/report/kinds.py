@@ -4,16 +4,18 @@ Begin with `opening`. Each kind has its own first sentences; cards and differenc
 """
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pandas as pd
 
 from pipeline.output.charts import Axis, Chart, Panel, Series, curve
-from pipeline.output.claims import NO_VERDICT
+from pipeline.output.claims import NO_VERDICT, Verdict
+from pipeline.output.report.choosing import MOST_CARDS
 from pipeline.output.report.evidence import (
     MARGIN,
     MATERIAL,
@@ -22,10 +24,19 @@ from pipeline.output.report.evidence import (
     findings,
     runs_of,
 )
-from pipeline.output.report.story import MOST_CARDS, Card, Look, Story, story
+from pipeline.output.report.story import Card, Story, story
 from pipeline.output.report.sweeps import RUNS_TABLE, story_of_sweep
 from pipeline.output.results import Measured, MetricTable, Result, read_table
-from pipeline.output.words import count, is_error, listed, meaning_alone, number, quantity, scale
+from pipeline.output.words import (
+    count,
+    interval,
+    is_error,
+    listed,
+    meaning_alone,
+    number,
+    quantity,
+    scale,
+)
 from recorders.parameters import unit_of
 from replay.judging.errors.evaluation import chi_square_interval
 
@@ -33,6 +44,15 @@ Tables = Mapping[str, pd.DataFrame]
 # More estimators than these are counted, and more claims that are refuted stand in the table alone.
 MOST_NAMED = 6
 MOST_CLAIMS = 2
+OF_CLAIMS: Mapping[Verdict | Literal["no verdict"], str] = {
+    "confirmed": "confirms {}",
+    "refuted": "refutes {}",
+    "not shown": "leaves {} to chance",
+    "not reproducible": "cannot reproduce {}",
+    NO_VERDICT: "does not judge {}",
+}
+MOST_PAIRS = 3
+DIFFER = ("better", "worse", "higher", "lower")  # verdicts on a difference beyond chance
 # The tables that sentences are made of.
 TOLD_BY = ("runs", "times", "differences", "sweep", RUNS_TABLE, "parameters")
 
@@ -69,7 +89,8 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     notes = [str(each) for each in result.settings.get("notes", [])]
     tried = what_was_tried(result, found, tables)
     if result.experiment == "diagnose":
-        return Opening(tried, _of_diagnosis(base, notes), found, notes[1:])
+        further = [re.sub(r"^\d+\. ", "", each) for each in notes[1:]]
+        return Opening(tried, _of_diagnosis(base, notes), found, further)
     if result.experiment == "tune":
         meanings = result.settings.get("meanings", {})
         return Opening(tried, _of_tuning(base, tables, meanings), found, notes)
@@ -132,15 +153,9 @@ def _with_claims(base: Story, result: Result) -> Story:
         more = len(refuted) - MOST_CLAIMS
         are = "is" if more == 1 else "are"
         notes.append(f"{more} more {are} refuted; the table has all claims.")
-    look: tuple[Look, str, str] = ("best", "✓", "All confirmed")
-    if refuted:
-        look = ("careful", "✕", f"{len(refuted)} refuted")
-    elif counts["confirmed"] < len(result.claims):
-        look = ("careful", "○", "Not all confirmed")
-    of_all = f"of {count(len(result.claims), 'claim')} confirmed"
-    rest = [f"{counts['not shown']} not shown (may be chance)"] if counts["not shown"] else []
-    rest += [f"{counts['not reproducible']} not reproducible"] if counts["not reproducible"] else []
-    card = Card("claims", *look, str(counts["confirmed"]), of_all, notes=notes, foot=rest)
+    does = [text.format(counts[verdict]) for verdict, text in OF_CLAIMS.items() if counts[verdict]]
+    text = f"The experiment states {count(len(result.claims), 'sentence')}; this result {listed(does)}."
+    card = Card("Claims", "claims", "", "", consistency=text, notes=notes)
     cards = base.cards[: MOST_CARDS - 1]
     left_out = [each.estimator for each in base.cards[MOST_CARDS - 1 :]] + base.left_out
     verdict = [*base.verdict, *claims_sentences(result)]
@@ -196,19 +211,16 @@ def _of_comparison(result: Result, tables: Tables) -> Opening:
     sides = [label for group in result.settings["sides"] for label in group]
     found = _findings_of_comparison(result, tables, list(dict.fromkeys(sides)))
     base = story(found)
-    differ = rows[rows["verdict"].isin(["better", "worse", "higher", "lower"])]
+    differ = rows[rows["verdict"].isin(DIFFER)]
     unclear = rows[rows["verdict"] == "unclear"]
     margin = f"{number(100 * float(result.settings.get('margin', MARGIN)))} %"
     runs = count(found.runs, "run")
     if found.runs and rows["low"].isna().all():
         summary = f"{runs} give no interval: whether the differences are chance is open."
-    elif differ.empty:
-        summary = f"Over {runs} none of {len(rows)} metrics differs by more than chance and {margin}"
-        summary += f"; in {unclear['quantity'].nunique()} they do not decide." if len(unclear) else "."
     else:
-        summary = (
-            f"Over {runs} {len(differ)} of {len(rows)} metrics differ by more than chance and {margin}."
-        )
+        open_in = f"; in {unclear['quantity'].nunique()} they do not decide" if len(unclear) else ""
+        summary = f"Over {runs} {how_many_differ(rows)} by more than chance and {margin}"
+        summary += f"{open_in if differ.empty else ''}."
     also = [_difference_sentence(row) for row in differ.to_dict("records")]
     tried = f"{listed(list(dict.fromkeys(sides)))} over the same {runs}{_length(tables)}, run by run."
     notes = [str(each) for each in result.settings.get("notes", [])]
@@ -243,6 +255,19 @@ def _findings_of_comparison(result: Result, tables: Tables, labels: list[str]) -
     return Findings(tables_of, rows, runs_of(result, tables), labels, stress=stress)
 
 
+def how_many_differ(rows: pd.DataFrame) -> str:
+    """In how many metrics each pair differs; of many pairs together."""
+    pairs = rows.groupby(["first", "second"], sort=False)
+    if len(pairs) > MOST_PAIRS:
+        number_of = int(rows["verdict"].isin(DIFFER).sum())
+        return f"{len(pairs)} pairs differ in {number_of or 'none'} of {len(rows)} metrics"
+    parts = []
+    for (first, second), of in pairs:
+        number_of = int(of["verdict"].isin(DIFFER).sum())
+        parts.append(f"{first} and {second} in {number_of or 'none'} of {count(len(of), 'metric')}")
+    return listed([parts[0].replace(" in ", " differ in ", 1), *parts[1:]])
+
+
 def _difference_sentence(row: Mapping[Any, Any]) -> str:
     """What differs, in words."""
     words = quantity(str(row["quantity"]))
@@ -251,7 +276,8 @@ def _difference_sentence(row: Mapping[Any, Any]) -> str:
     low, high = _number(row["low"]), _number(row["high"])
     of = f" of {row['case']}" if row["case"] else ""
     near = scale(words.unit, _number(row["difference"]))
-    ends = f"95 % {near.text(low)} to {near.text(high)} {near.sign}".rstrip()
+    sign = near.sign if near.sign == "°" else f" {near.sign}"
+    ends = f"95 % {interval(low, high, near)}{sign}".rstrip()
     return (
         f"{words.name}{of}: {row['second']} is {row['verdict']} than {row['first']}, "
         f"{own.with_unit(second)} against {own.with_unit(first)} (difference {ends})."
@@ -288,7 +314,7 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         least, most = min(*low, -100.0 * margin), max(*high, 100.0 * margin)
         room = 0.05 * float(most - least)
         x = Axis(
-            label=f"{second} less {first}, in percent of {first} or of the aim; lines: 95 %",
+            label=f"{second} less {first} (%)",
             limits=(float(least) - room, float(most) + room),
         )
         edges = [
@@ -306,7 +332,10 @@ def _forest(rows: pd.DataFrame, margin: float) -> Chart | None:
         panels.append(
             Panel(x=x, y=y, series=[*edges, spread, curve(str(second), middle, places, "markers")])
         )
-    title = "Every difference with its interval; between the dashed lines it does not matter"
+    title = (
+        "Every difference in percent of the first or of the aim, with 95 %; "
+        "between the dashed lines it does not matter"
+    )
     return Chart(title=title, panels=panels, legend=False)
 
 

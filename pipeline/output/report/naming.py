@@ -1,12 +1,22 @@
-"""Names the report's sections: the experiment, and what is different in its settings."""
+"""Names the report's sections, and gives the names of estimators the colours of their curves.
+
+A section is named by its experiment and by what is different in its settings; a colour is made dark or
+light enough to be read.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pipeline.output.charts import COLOURS
 from pipeline.output.results import Result
 from pipeline.output.terminal import format_value
 from pipeline.output.words import count, listed
+
+# The grounds of the page on which names stand; the first of each is the page's own.
+LIGHT, DARK = ("#ffffff", "#fdf1f5"), ("#14171a", "#2a1a20")
+READABLE = 4.6  # WCAG 2.2, 1.4.3 asks for 4.5 to 1
 
 
 def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[str]:
@@ -58,3 +68,33 @@ def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
     if isinstance(settings.get("logs"), Mapping):
         return f"{title}: {listed(list(labels)) or count(runs, 'run')}"
     return f"{title}, swept" if "sweep" in settings else title
+
+
+def luminance(colour: str) -> float:
+    """The relative luminance of a colour such as `#2f7fd1`, from 0 to 1 (WCAG 2.2)."""
+    channels = [int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)]
+    linear = [each / 12.92 if each <= 0.04045 else ((each + 0.055) / 1.055) ** 2.4 for each in channels]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def contrast(one: str, other: str) -> float:
+    """The contrast of two colours, from 1 to 21."""
+    dark, light = sorted((luminance(one), luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def readable(colour: str, grounds: tuple[str, ...], towards: int) -> str:
+    """The colour, mixed with black (0) or white (255) until it is read on all grounds."""
+    channels = [int(colour[place : place + 2], 16) for place in (1, 3, 5)]
+    for share in range(0, 101, 2):
+        mixed = [round(each + (towards - each) * share / 100) for each in channels]
+        text = "#" + "".join(f"{each:02x}" for each in mixed)
+        if all(contrast(text, ground) >= READABLE for ground in grounds):
+            return text
+    raise AssertionError("black or white is read on any ground")
+
+
+@cache
+def text_colours() -> list[tuple[str, str]]:
+    """Of each curve's colour what is read on the light page and on the dark one."""
+    return [(readable(each, LIGHT, 0), readable(each, DARK, 255)) for each in COLOURS]

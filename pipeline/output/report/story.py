@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from pipeline.output.alarms import Alarm, Cause, Stressing
+from pipeline.output.report.choosing import MOST_CARDS, broken_of, choice_of, in_order, of_the_tied
 from pipeline.output.report.doubts import doubts_of
 from pipeline.output.report.evidence import (
     MARGIN,
@@ -16,9 +17,6 @@ from pipeline.output.report.evidence import (
     Findings,
     Spread,
     Timings,
-    broken_of,
-    choice_of,
-    in_order,
     is_withheld,
     relation,
 )
@@ -27,16 +25,18 @@ from pipeline.output.words import MISSING, Scale, alike, count, interval, listed
 from replay.judging.diagnostics import LEAST_SHARE
 from replay.judging.errors.differences import FEWEST_RUNS
 
-MOST_CARDS = 4
 CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
 
-Look = Literal["broken", "careful", "best", "fair"]
+Look = Literal["broken", "careful", "best", "fair", "claims"]
 
 
 @dataclass(frozen=True)
 class Card:
-    """What is said of one estimator: how good it is, if it can be believed, why not, what it costs."""
+    """What is said of one estimator: how good it is, if it can be believed, why not, what it costs.
+
+    The look `claims` is of the card that says how many of a result's claims hold.
+    """
 
     estimator: str
     look: Look
@@ -160,16 +160,17 @@ def _advice(
     how = "RMS" if "rmse" in found.main else "mean"
     of_cases = f" ({how} of {cases} cases)" if cases > 1 else ""
     if equal:
-        both = listed([take, *equal])
-        either = "either" if len(equal) == 1 else "any of them"
+        tied = [take, *equal]
+        both = listed(tied) if len(tied) <= MOST_CARDS else f"{take} and {len(equal)} others"
+        whom, left = of_the_tied(found, tied)
         if all(relation(found, take, each) == "draw" for each in equal):
-            return f"{both} tie in {main}: take {either}{_cheapest([take, *equal], timings)}."
+            return f"{both} tie in {main}: {whom}{_cheapest(left, timings)}."
         if any(relation(found, take, each) == "withheld" for each in equal):
             return (
                 f"No verdict between {both}: changes that should not matter move the {main} "
                 "farther than they differ."
             )
-        return f"A tie so far: {runs} do not tell {both} apart; take {either}."
+        return f"A tie so far: {runs} do not tell {both} apart; {whom}."
     if all(relation(found, take, each) == "untold" for each in found.labels if each != take):
         alone = "on this run" if found.runs == 1 else f"over {runs}"
         few = found.runs < FEWEST_RUNS
@@ -181,11 +182,11 @@ def _advice(
 
 def _cheapest(labels: list[str], timings: Timings) -> str:
     """Who of estimators that are as good needs the least time, where that is known and matters."""
-    seconds = {label: timings.get(label, {}).get("seconds", 0.0) for label in labels}
-    first, second = sorted(labels, key=lambda label: seconds[label])[:2]
-    if not TIMED_S < seconds[first] < CHEAPER * seconds[second]:
+    of = sorted((timings.get(label, {}).get("seconds", 0.0), label) for label in labels)[:2]
+    if len(of) < 2 or not TIMED_S < of[0][0] < CHEAPER * of[1][0]:
         return ""
-    return f"; {first} needs {number(seconds[first] / seconds[second], 2)} times the time of {second}"
+    (least_s, first), (next_s, second) = of
+    return f"; {first} needs {number(least_s / next_s, 2)} times the time of {second}"
 
 
 def _alone(found: Findings, only: Evidence, own: Scale, causes: dict[str, Cause]) -> list[str]:
@@ -281,10 +282,12 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
     if state == "too sure":
         is_far = each.decisive is None or each.decisive.is_far
         return ("broken", "✕", "Overconfident") if is_far else ("careful", "✕", "Slightly overconfident")
-    if each.estimator == take and len(found.labels) > 1:
-        return "best", "✓", f"As good as {listed(equal)}" if equal else "Take this one"
-    if each.estimator in equal:
-        return "best", "✓", f"As good as {listed([take, *(o for o in equal if o != each.estimator)])}"
+    if each.estimator in (take, *equal) and len(found.labels) > 1:
+        others = [label for label in (take, *equal) if label != each.estimator]
+        as_who = listed(others) if len(others) < MOST_CARDS else f"{len(others)} others"
+        if others and state == "too careful":
+            return "careful", "○", f"As accurate as {as_who}, but too careful"
+        return "best", "✓", f"As good as {as_who}" if others else "Take this one"
     if state == "too careful":
         return "careful", "○", "Too careful"
     honest = "Honest" if state == "honest" else "Not judged"

@@ -189,7 +189,11 @@ def _with_points(
 ) -> Story:
     """The story of estimators at their best points, with these points."""
     moved = [label for label in errors if label not in still]
-    sentences = [f"{label} errs least with {sweep.where(best[label])}." for label in moved]
+    sentences = []
+    for point in dict.fromkeys(best[label] for label in moved):
+        there = [label for label in moved if best[label] == point]
+        err = "errs" if len(there) == 1 else "err"
+        sentences.append(f"{listed(there)} {err} least with {sweep.where(point)}.")
     if still:
         are = "do not depend" if len(still) > 1 else "does not depend"
         sentences.append(f"{listed(still)} {are} on it.")
@@ -205,7 +209,7 @@ def _with_points(
             cards.append(replace(card, notes=["Its errors are the same at all points.", *card.notes]))
     first, *further = base.verdict or [""]
     verdict = [*filter(None, [first]), *sentences, *further]
-    at_best = ", where it errs least"
+    at_best = ", each where it errs least" if len(base.cards) > 1 else ", where it errs least"
     others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in base.doubts]
     return replace(base, verdict=verdict, cards=cards, doubts=[*doubts, *others])
 
