@@ -24,7 +24,7 @@ from pipeline.stressing.changes import (
     inputs_of,
     parameters_changed,
 )
-from pipeline.stressing.partings import partings
+from pipeline.stressing.partings import Parting, partings
 from pipeline.stressing.verdicts import HARMLESS, MARGIN, Stress, Stressed, Tried
 from recorders.errors import BadInput
 from recorders.log import Clock, RunMetadata, Stream, schemas
@@ -33,6 +33,7 @@ from replay.engine.replaying.estimator import Bound, Recursive, bind
 from replay.engine.replaying.late import Late
 from replay.engine.replaying.replaying import Report, collect
 from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
 from replay.engine.streams.sources import Ensemble, LogSource, MemorySource, is_sensed
 from replay.foreign.naming import allowed
 from replay.judging.judge import Judge
@@ -155,6 +156,16 @@ class _Replayed:
             topic: each.take(np.argsort(each.publish_time_ns, kind="stable"))
             for topic, each in found.items()
         }
+
+    def failure(self, run: int) -> str:
+        """When and why a run ends before its time; empty where it does not."""
+        for rows in self.outputs.values():
+            if rows.stream.schema.full_name == schemas.FAILURE.full_name:
+                own = rows.of_run(run)
+                if len(own):
+                    at_s = (int(own.publish_time_ns[0]) - self.sources[run].epoch_ns) * 1e-9
+                    return f"at {at_s:.3f} s: {sentences_of(own)[0]}"
+        return ""
 
     @cached_property
     def _metrics(self) -> Mapping[int, Mapping[tuple[str, str], float]]:
@@ -295,9 +306,9 @@ def _doubtful(tried: Iterable[Tried]) -> list[str]:
         for each in tried
         if CHANGES[each.name].is_scaled
         and not each.why
-        and (each.largest >= HARMLESS or each.is_beyond or each.is_wider)
+        and (each.largest >= HARMLESS or each.beyond or each.is_wider)
     ]
-    own.sort(key=lambda each: (not each.is_wider, -each.largest))
+    own.sort(key=lambda each: (not each.is_wider, -each.size))
     return [each.name for each in own[:MOST_HALVED]]
 
 
@@ -307,15 +318,36 @@ def _tried(
     within_ns = SHIFT_NS if name == "stamps" else 0
     found = partings(base, done.estimates(run), within_ns, has_less=name == DROPPED)
     largest = max(found, key=lambda each: each.amplification.max(initial=0.0), default=None)
+    failed = done.failure(run)
+    if before.failure(row):
+        if largest is None:
+            return Tried(name, why=f"it fails {before.failure(row)}")
+        failed = ""
     one, other = before.metrics(row), done.metrics(run)
     moved = {key: other[key] - value for key, value in one.items() if key in other}
     main = _main([key[1] for key in one])
-    if largest is None and not main:
+    if largest is None and not main and not failed:
         return Tried(name, why="no estimate is one Gaussian, and no error is known")
-    is_beyond = any(
-        abs(by) > MARGIN * abs(one[key]) for key, by in moved.items() if key[1] == main and main
-    )
-    return Tried(name, largest, moved, is_beyond)
+    reach = _reach(found, main)
+    shares = [
+        min(abs(by), reach) / abs(one[key])
+        for key, by in moved.items()
+        if key[1] == main and one[key] != 0.0
+    ]
+    share = max(shares, default=0.0)
+    beyond = f"{main} changes by {100 * share:.2g} %" if share > MARGIN else ""
+    return Tried(name, largest, moved, beyond, failed=failed)
+
+
+def _reach(found: Sequence[Parting], main: str) -> float:
+    """By how much an RMSE can change: no more than the estimates of common stamps are apart.
+
+    What a copy has not an estimate of, as at a stamp where the message is lost, is in one RMSE alone.
+    """
+    unit = main.rpartition("_")[2]
+    apart = [each.metres if unit == "m" else each.degrees for each in found]
+    known = [float(np.nanmax(each)) for each in apart if np.isfinite(each).any()]
+    return max(known) if known and unit in ("m", "deg") else np.inf
 
 
 def _main(quantities: Sequence[str]) -> str:
@@ -352,6 +384,15 @@ def _with_parameters(
     changed = {name: value for name, value in changed.items() if value != known[name]}
     if not changed:
         return "no parameter is a number other than zero"
+    refused = ""
+    for name in [*changed]:
+        try:
+            bind(label, sources, merge(settings, {name: changed[name]}))
+        except BadInput as error:  # as of a setting that its method has by name, and does not use
+            refused = str(error)
+            del changed[name]
+    if not changed:
+        return refused
     try:
         return _replayed(sources, label, merge(settings, changed), done.how)
     except BadInput as error:

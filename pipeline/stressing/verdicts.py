@@ -35,20 +35,40 @@ class Tried(NamedTuple):
         name: a key of `CHANGES`.
         parting: of the estimate that it moves most; None where no estimate is a Gaussian.
         moved: by (case, metric) how far a metric is from that of the unchanged replay.
-        is_beyond: whether the main metric moved beyond the margin.
+        beyond: how far the main metric moved, in words; empty where that is within the margin.
         why: why it was not tried.
+        failed: when and why the copy ends, where the unchanged replay does not.
     """
 
     name: str
     parting: Parting | None = None
     moved: Mapping[tuple[str, str], float] = {}
-    is_beyond: bool = False
+    beyond: str = ""
     why: str = ""
+    failed: str = ""
 
     @property
     def largest(self) -> float:
         """The largest A."""
         return float(self.parting.amplification.max(initial=0.0)) if self.parting else 0.0
+
+    @property
+    def size(self) -> float:
+        """The largest A; of an estimate without covariances the largest distance, in m or degrees."""
+        if self.parting is None or self.parting.has_sigmas:
+            return self.largest
+        return float(np.nanmax([self.parting.metres, self.parting.degrees], initial=0.0))
+
+    @property
+    def far(self) -> str:
+        """How far the estimate moves, in words."""
+        if self.parting is None:
+            return f"the metric moves: {self.beyond}" if self.beyond else "the metric stays"
+        sizes = [(self.parting.metres, "m"), (self.parting.degrees, "deg")]
+        words = [f"{self.largest:.3g} sigma"] if self.parting.has_sigmas else []
+        words += [f"{_largest(size):.3g} {unit}" for size, unit in sizes if np.any(size >= 0.0)]
+        more = f"; {self.beyond}" if self.beyond and self.largest < HARMLESS else ""
+        return f"at most {', '.join(words)}{more}"
 
     @property
     def is_wider(self) -> bool:
@@ -100,14 +120,16 @@ class Stressed:
     def ratio(self, name: str) -> float:
         """How many times more the whole change does than half of it, in A; NaN where none was halved."""
         half = self.halves.get(name)
-        return self.tried[name].largest / half.largest if half and half.largest > 0.0 else np.nan
+        return self.tried[name].size / half.size if half and half.size > 0.0 else np.nan
 
     def verdict(self, name: str) -> Verdict:
         """What a change does."""
         each = self.tried[name]
         if each.why:
             return "not tried"
-        if each.largest < HARMLESS and not each.is_beyond:
+        if each.failed:
+            return "discontinuous or chaotic"
+        if each.largest < HARMLESS and not each.beyond:
             return "harmless"
         if CHANGES[name].is_scaled:
             shrinks = HALVES[0] <= self.ratio(name) <= SQUARED
@@ -123,7 +145,7 @@ class Stressed:
     def deciding(self) -> str:
         """Which change decides the worst verdict: of those that have it what moves most."""
         own = [name for name in self.tried if self.verdict(name) == self.worst]
-        return max(own, key=lambda name: self.tried[name].largest)
+        return max(own, key=lambda name: (bool(self.tried[name].failed), self.tried[name].size))
 
     @property
     def is_per_prediction(self) -> bool:
@@ -136,7 +158,13 @@ class Stressed:
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
-        return whole.parting.spread < SHRINKS * half.parting.spread
+        return whole.parting.spread < SHRINKS * half.parting.spread and not self.is_redrawn
+
+    @property
+    def is_redrawn(self) -> bool:
+        """Whether an ulp of the inputs, too, changes a covariance: it is not the stamps that do."""
+        ulp = self.tried["ulp"].parting
+        return ulp is not None and ulp.spread > PER_PREDICTION
 
     @cached_property
     def undetermined(self) -> Undetermined | None:
@@ -154,11 +182,11 @@ class Stressed:
                 "estimator": self.estimator,
                 "change": name,
                 "verdict": self.verdict(name),
-                "amplification": each.largest if each.parting else np.nan,
+                "amplification": each.largest if each.parting and each.parting.has_sigmas else np.nan,
                 **dict.fromkeys(("metres", "degrees", "growth", "parted_s"), np.nan),
                 "halved": self.ratio(name),
                 "topic": "",
-                "note": each.why,
+                "note": each.why or (f"fails {each.failed}" if each.failed else ""),
             }
             if each.parting is not None:
                 row["metres"] = _largest(each.parting.metres)
@@ -186,11 +214,11 @@ class Stressed:
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
         name = self.deciding
-        each, parting = self.tried[name], self.tried[name].parting
-        far = "the metric moves" if parting is None else f"at most {each.largest:.3g} sigma"
-        sizes = () if parting is None else ((parting.metres, "m"), (parting.degrees, "deg"))
-        far += "".join(f", {_largest(size):.3g} {unit}" for size, unit in sizes if np.any(size >= 0.0))
-        begin = f"{self.worst}: {self.estimator} of {self.run}: {CHANGES[name].words}: {far}"
+        each = self.tried[name]
+        begin = f"{self.worst}: {self.estimator} of {self.run}: {CHANGES[name].words}: "
+        if each.failed:
+            return f"{begin}the copy fails {each.failed}"
+        begin += each.far
         if self.worst == "harmless":
             return f"{begin}; so does every other change that was tried less"
         if self.worst == "sensitive":
@@ -216,6 +244,11 @@ class Stressed:
             sentences.append(
                 "a microsecond decides what is taken together: what has one stamp is one step, and what "
                 "comes later waits for the next"
+            )
+        if self.is_redrawn:
+            sentences.append(
+                "an ulp of the inputs changes the covariance: other samples are drawn, or something is "
+                "decided otherwise; if it takes samples, more of them bring the copies nearer"
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined
