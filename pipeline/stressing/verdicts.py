@@ -22,6 +22,7 @@ ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous
 HARMLESS = 0.1  # A below this
 MARGIN = 0.02  # of the metric, as compare's
 HALVES = (1.9, 2.1)  # how many times less half of a change does, where it is in proportion
+BENT = 1.2  # half the change does less, but not half as much: a quarter tells
 SQUARED = 4.2  # where it goes by the change's square; what shrinks by more has jumped
 ONE_SIGMA = 1.0  # A of a change that has no half: beyond it the copies are two results
 PER_PREDICTION = 1e-4  # the share by which moved stamps change a sigma, from which on half is tried
@@ -85,7 +86,8 @@ class Stressed:
     Attributes:
         source: the run.
         estimator: the label.
-        tried: each change, whole; halves: those that were halved.
+        tried: each change, whole.
+        halves, quarters: those that were halved, and those of these that were halved again.
         sensors: the stamps of each topic that was sensed.
         estimates: those of the unchanged replay, by topic.
         copies: those of each change, whole.
@@ -96,6 +98,7 @@ class Stressed:
     estimator: str
     tried: Mapping[str, Tried]
     halves: Mapping[str, Tried]
+    quarters: Mapping[str, Tried]
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
     copies: Mapping[str, Mapping[str, Stream]]
@@ -118,9 +121,13 @@ class Stressed:
         return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
-        """How many times more the whole change does than half of it, in A; NaN where none was halved."""
-        half = self.halves.get(name)
-        return self.tried[name].size / half.size if half and half.size > 0.0 else np.nan
+        """How many times more a change does than half of it, in A; NaN where none was halved.
+
+        Where half of the change was halved again, it is that which is compared.
+        """
+        half, quarter = self.halves.get(name), self.quarters.get(name)
+        more, less = (half, quarter) if half and quarter else (self.tried[name], half)
+        return more.size / less.size if less and less.size > 0.0 else np.nan
 
     def verdict(self, name: str) -> Verdict:
         """What a change does."""
@@ -131,7 +138,7 @@ class Stressed:
             return "discontinuous or chaotic"
         if each.largest < HARMLESS and not each.beyond:
             return "harmless"
-        if CHANGES[name].is_scaled:
+        if CHANGES[name].is_scaled and name in self.halves:
             shrinks = HALVES[0] <= self.ratio(name) <= SQUARED
             return "sensitive" if shrinks else "discontinuous or chaotic"
         return "sensitive" if self._is_explained(name) else "discontinuous or chaotic"
@@ -221,15 +228,19 @@ class Stressed:
         begin += each.far
         if self.worst == "harmless":
             return f"{begin}; so does every other change that was tried less"
-        if self.worst == "sensitive":
-            if name not in self.halves:
-                return begin
-            more = ": it shrinks faster than the change" if self.ratio(name) > HALVES[1] else ""
-            return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it{more}"
         if not np.isfinite(self.ratio(name)):
             return begin
-        how = "it jumps" if self.ratio(name) > SQUARED else "it does not shrink with it"
-        return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it: {how}"
+        return f"{begin}; {self._shrinking(name)}"
+
+    def _shrinking(self, name: str) -> str:
+        """What half of a change does, in words, and a quarter where that was tried."""
+        share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
+        half = f"half the change does {share:.2g} of it"
+        if name in self.quarters:
+            half += f", and a quarter {1.0 / ratio:.2g} of that"
+        if self.worst == "sensitive":
+            return f"{half}: it shrinks faster than the change" if ratio > HALVES[1] else half
+        return f"{half}: it {'jumps' if ratio > SQUARED else 'does not shrink with it'}"
 
     @property
     def sentences(self) -> list[str]:
