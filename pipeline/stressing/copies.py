@@ -136,7 +136,7 @@ def compared(
     failed = done.failure(run)
     if before.failure(row):
         if largest is None:
-            return Tried(name, why=f"it fails {before.failure(row)}")
+            return Tried(name, why=f"it fails {before.failure(row)}", failed=before.failure(row))
         failed = ""
     one, other = before.metrics(row), done.metrics(run)
     moved = {key: other[key] - value for key, value in one.items() if key in other}

@@ -52,7 +52,8 @@ def stress(
         gap_limit_s: the truth is not interpolated over longer gaps.
         set: parameters of estimators, and how topics are altered first, as for `replay`.
 
-    Raises BadInput where an estimator cannot replay a run.
+    Raises BadInput where an estimator cannot replay a run, or fails in all of them before it has an
+    estimate.
 
     >>> from pipeline.api.api import record
     >>> stress(record("landmarks", duration_s=5.0), "ekf").stressed[0].worst
@@ -63,7 +64,12 @@ def stress(
     if given:
         settings = with_settings(settings, allowed(given))
     sources = [_in_memory(source) for source in sources_of(logs, alterations)]
-    return Stress(stress_runs(sources, settings, How(seed, gap_limit_s)), gap_limit_s)
+    found = stress_runs(sources, settings, How(seed, gap_limit_s))
+    for label in settings:
+        own = [each for each in found if each.estimator == label]
+        if all(each.failed for each in own):
+            raise BadInput(f"{own[0].run}: estimator {label} fails {own[0].failed}")
+    return Stress(found, gap_limit_s)
 
 
 def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -> list[Stressed]:

@@ -38,7 +38,8 @@ class Tried(NamedTuple):
         moved: by (case, metric) how far a metric is from that of the unchanged replay.
         beyond: how far the main metric moved, in words; empty where that is within the margin.
         why: why it was not tried.
-        failed: when and why the copy ends, where the unchanged replay does not.
+        failed: when and why the copy ends, where the unchanged replay does not; of what was not tried,
+            that one, where it ends before it has an estimate.
     """
 
     name: str
@@ -103,6 +104,12 @@ class Stressed:
     estimates: Mapping[str, Stream]
     copies: Mapping[str, Mapping[str, Stream]]
     is_recursive: bool
+
+    @property
+    def failed(self) -> str:
+        """When and why the unchanged replay ends before it has an estimate; empty where it has one."""
+        said = [each.failed for each in self.tried.values() if each.why]
+        return next(filter(None, said), "")
 
     @property
     def run(self) -> str:

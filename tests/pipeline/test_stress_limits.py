@@ -1,8 +1,10 @@
 """Stress of what is no plain filter: copies that fail, no covariances, random samples, what bends."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 
 import fuselog as fl
 from pipeline.stressing.partings import partings
@@ -49,6 +51,11 @@ def test_a_copy_that_fails_and_a_change_that_bends() -> None:
     assert stressed.worst == stressed.verdict("stamps") == "discontinuous or chaotic"
     said = "stamps moved by up to 1 us: the copy fails at 4.000 s: a stamp is not one of whole"
     assert said in stressed.sentences[0]
+    odd = line([0.1, 0.2])
+    seen = odd.streams[1]
+    late = replace(seen, publish_time_ns=seen.publish_time_ns + 1)
+    with pytest.raises(BadInput, match="a stamp is not one of whole milliseconds"):
+        fl.stress(fl.Recording([odd.streams[0], late], epoch_ns=EPOCH_NS), {"own": {"kind": BENDS}})
 
 
 def test_other_samples_are_no_noise_per_prediction() -> None:
