@@ -16,7 +16,8 @@ from pipeline.runs.executors import WorkerPool, pool_for
 from pipeline.runs.experiment import Experiment, Setting, Study, numbers_of
 from pipeline.runs.initial_states import order_of
 from pipeline.runs.runner import Runner
-from pipeline.stressing.stressing import TOGETHER, How, stress_runs
+from pipeline.stressing.copies import How
+from pipeline.stressing.stressing import TOGETHER, stress_runs
 from pipeline.stressing.sums import StressSums
 from recorders.errors import BadInput
 from recorders.parameters import build

@@ -30,7 +30,8 @@ class Parting(NamedTuple):
         stamps_ns: (n,) of the unchanged replay.
         amplification: (n,) A.
         metres, degrees: (n,) of positions and of angles; NaN where the state has none.
-        spread: how much the standard deviations differ at most, as a share of them.
+        spread: how much the standard deviations differ at most, as a share of them; NaN where none is
+            known.
         explained: (n,) how large A may be where the other replay had less data, else 0.
     """
 
@@ -41,6 +42,11 @@ class Parting(NamedTuple):
     degrees: Floats
     spread: float
     explained: Floats
+
+    @property
+    def has_sigmas(self) -> bool:
+        """Whether any covariance is known, without which A is zero."""
+        return bool(np.isfinite(self.spread))
 
     @property
     def growth(self) -> float:
@@ -99,9 +105,13 @@ def _parting(base: Stream, copy: Stream, within_ns: int, has_less: bool) -> Part
         np.nan_to_num(amplification),
         _norm(apart, [name in AXES for name, _ in names]),
         np.degrees(_norm(apart, [kind in ("angle", "rotation") for _, kind in names])),
-        float(np.max(np.nan_to_num(spread, posinf=0.0), initial=0.0)),
+        _largest_finite(spread) if np.any(sigmas > 0.0) else np.nan,
         _explained(covariance, other) if has_less else np.zeros(len(covariance)),
     )
+
+
+def _largest_finite(spread: Floats) -> float:
+    return float(np.max(np.nan_to_num(spread, posinf=0.0), initial=0.0))
 
 
 def _explained(covariance: Floats, other: Floats) -> Floats:

@@ -5,57 +5,31 @@ Runs that hold the same topics are replayed together with all their copies, as f
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from pipeline.altering.sources import split_settings
 from pipeline.api.planning import Log, Named, settings_of, sources_of
-from pipeline.runs.ensemble import RUNS_AT_ONCE, Settings, parameters_of, replay_blocks, stated_of
+from pipeline.runs.ensemble import RUNS_AT_ONCE, Settings
 from pipeline.runs.settings import with_settings
 from pipeline.stressing.changes import (
     CHANGES,
-    DROPPED,
     PARAMETERS,
-    SHIFT_NS,
     Inputs,
     inputs_of,
-    parameters_changed,
 )
-from pipeline.stressing.partings import partings
-from pipeline.stressing.verdicts import HARMLESS, MARGIN, Stress, Stressed, Tried
+from pipeline.stressing.copies import How, compared, replayed, with_parameters
+from pipeline.stressing.verdicts import BENT, HALVES, HARMLESS, Stress, Stressed, Tried
 from recorders.errors import BadInput
-from recorders.log import Clock, RunMetadata, Stream, schemas
-from recorders.parameters import merge
+from recorders.log import RunMetadata
 from replay.engine.replaying.estimator import Bound, Recursive, bind
-from replay.engine.replaying.late import Late
-from replay.engine.replaying.replaying import Report, collect
-from replay.engine.streams.blocks import Ragged
-from replay.engine.streams.sources import Ensemble, LogSource, MemorySource, is_sensed
+from replay.engine.streams.sources import LogSource, MemorySource, is_sensed
 from replay.foreign.naming import allowed
-from replay.judging.judge import Judge
 
-MOST_HALVED = 3
+MOST_HALVED, MOST_REPLAYS = 3, 12
 # Runs that are stressed together: with their copies about as many as a replay holds at once.
 TOGETHER = max(1, RUNS_AT_ONCE // (1 + len(CHANGES)))
-
-
-class How(NamedTuple):
-    """Says how runs are replayed and stressed.
-
-    Attributes:
-        seed: of signs, coins, and what is dropped.
-        gap_limit_s: the truth is not interpolated over longer gaps.
-        order: the clock to go by.
-        late: what is done about messages that come late, in the order of log time.
-    """
-
-    seed: int = 0
-    gap_limit_s: float = 0.2
-    order: Clock = "publish_time"
-    late: Late | None = None
 
 
 def stress(
@@ -68,8 +42,8 @@ def stress(
 ) -> Stress:
     """Replay under changes that should not matter, and say what they do to the result.
 
-    A run and an estimator take twelve replays at most: one as it is, one for each change, and one with
-    half the change for the three that do most.
+    A run and an estimator take twelve replays at most: one as it is, one for each change, one with half
+    the change for the three that do most, and one with a quarter where half does neither half nor all.
 
     Args:
         logs: paths, logs that were opened, or recordings.
@@ -78,7 +52,8 @@ def stress(
         gap_limit_s: the truth is not interpolated over longer gaps.
         set: parameters of estimators, and how topics are altered first, as for `replay`.
 
-    Raises BadInput where an estimator cannot replay a run.
+    Raises BadInput where an estimator cannot replay a run, or fails in all of them before it has an
+    estimate.
 
     >>> from pipeline.api.api import record
     >>> stress(record("landmarks", duration_s=5.0), "ekf").stressed[0].worst
@@ -89,7 +64,12 @@ def stress(
     if given:
         settings = with_settings(settings, allowed(given))
     sources = [_in_memory(source) for source in sources_of(logs, alterations)]
-    return Stress(stress_runs(sources, settings, How(seed, gap_limit_s)), gap_limit_s)
+    found = stress_runs(sources, settings, How(seed, gap_limit_s))
+    for label in settings:
+        own = [each for each in found if each.estimator == label]
+        if all(each.failed for each in own):
+            raise BadInput(f"{own[0].run}: estimator {label} fails {own[0].failed}")
+    return Stress(found, gap_limit_s)
 
 
 def stress_runs(sources: Sequence[MemorySource], settings: Settings, how: How) -> list[Stressed]:
@@ -127,65 +107,6 @@ def _in_memory(source: LogSource | MemorySource) -> MemorySource:
     return MemorySource(source.read(topics), run, source.name, source.start_ns, source.end_ns)
 
 
-@dataclass(frozen=True)
-class _Replayed:
-    """Runs and copies that one estimator replayed.
-
-    Attributes:
-        sources: runs and copies.
-        bound: the estimator.
-        outputs: what it gave, by topic.
-        how: how they were replayed.
-    """
-
-    sources: Ensemble[MemorySource]
-    bound: Sequence[Bound]
-    outputs: Mapping[str, Ragged]
-    how: How
-
-    def estimates(self, run: int) -> dict[str, Stream]:
-        """The Gaussian estimates of a run, by topic, in the order of their stamps."""
-        wanted = schemas.GAUSSIAN_ESTIMATE.full_name
-        found = {
-            topic: rows.of_run(run)
-            for topic, rows in self.outputs.items()
-            if rows.stream.schema.full_name == wanted
-        }
-        return {
-            topic: each.take(np.argsort(each.publish_time_ns, kind="stable"))
-            for topic, each in found.items()
-        }
-
-    @cached_property
-    def _metrics(self) -> Mapping[int, Mapping[tuple[str, str], float]]:
-        judge = Judge(self.sources, {}, gap_limit_s=self.how.gap_limit_s)
-        judge.add(self.outputs)
-        found: dict[int, dict[tuple[str, str], float]] = defaultdict(dict)
-        for row in judge.runs_table.to_dict("records"):
-            found[row["run"]] |= {
-                (str(row["case"]), str(quantity)): float(value)
-                for quantity, value in row.items()
-                if quantity != "run" and isinstance(value, int | float) and np.isfinite(value)
-            }
-        return found
-
-    def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
-        """The metrics of one run by case and quantity, those that are known."""
-        return self._metrics.get(run, {})
-
-
-def _replayed(
-    sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
-) -> _Replayed:
-    ensemble = Ensemble(sources)
-    bound, report = bind(label, ensemble, settings), Report()
-    blocks = replay_blocks(ensemble, bound, report, order=how.order, late=how.late)
-    outputs = collect(list(block.values()) for block in blocks)
-    for refusal in report.refused.values():
-        raise refusal
-    return _Replayed(ensemble, bound, outputs, how)
-
-
 def _stressed(
     sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
 ) -> list[Stressed]:
@@ -216,50 +137,57 @@ def _stressed(
     ]
     refused: dict[str, str] = {}
     try:
-        done = _replayed([*sources, *copies(whole, 1.0)], label, settings, how)
+        done = replayed([*sources, *copies(whole, 1.0)], label, settings, how)
     except BadInput:
-        _replayed(sources, label, settings, how)  # which raises where it is no fault of a copy
+        replayed(sources, label, settings, how)  # which raises where it is no fault of a copy
         for name in CHANGES:
             own = [what for what in whole if what[1] == name]
             try:
-                _replayed([*sources, *copies(own, 1.0)], label, settings, how)
+                replayed([*sources, *copies(own, 1.0)], label, settings, how)
             except BadInput as error:
                 refused[name] = str(error)
         whole = [what for what in whole if what[1] not in refused]
-        done = _replayed([*sources, *copies(whole, 1.0)], label, settings, how)
+        done = replayed([*sources, *copies(whole, 1.0)], label, settings, how)
     rows = {what: len(sources) + place for place, what in enumerate(whole)}
     base = [done.estimates(run) for run in range(len(sources))]
-    other = _with_parameters(done, sources, label, settings, 1.0)
+    other = with_parameters(done, sources, label, settings, 1.0)
 
     def tried(run: int, name: str) -> Tried:
         if name == PARAMETERS:
             if isinstance(other, str):
                 return Tried(name, why=other)
-            return _tried(name, done, run, other, run, base[run])
+            return compared(name, done, run, other, run, base[run])
         if (run, name) not in rows:
             return Tried(name, why=refused.get(name) or _lacking(name, inputs[run]))
-        return _tried(name, done, run, done, rows[run, name], base[run])
+        return compared(name, done, run, done, rows[run, name], base[run])
 
     found = [{name: tried(run, name) for name in CHANGES} for run in range(len(sources))]
     doubtful = [(run, name) for run, own in enumerate(found) for name in _doubtful(own.values())]
-    halved = [what for what in doubtful if what[1] != PARAMETERS]
-    halves: list[dict[str, Tried]] = [{} for _ in sources]
-    if halved:
-        again = _replayed(copies(halved, 0.5), label, settings, how)
-        for row, (run, name) in enumerate(halved):
-            halves[run][name] = _tried(name, done, run, again, row, base[run])
-    runs = [run for run, name in doubtful if name == PARAMETERS]
-    if runs:
-        less = _with_parameters(done, [sources[run] for run in runs], label, settings, 0.5)
-        for row, run in enumerate([] if isinstance(less, str) else runs):
-            assert not isinstance(less, str)
-            halves[run][PARAMETERS] = _tried(PARAMETERS, done, run, less, row, base[run])
+
+    def smaller(of: Sequence[tuple[int, str]], size: float) -> dict[tuple[int, str], Tried]:
+        """These changes of these runs, so much smaller."""
+        own, less = [what for what in of if what[1] != PARAMETERS], dict[tuple[int, str], Tried]()
+        if own:
+            again = replayed(copies(own, size), label, settings, how)
+            for row, (run, name) in enumerate(own):
+                less[run, name] = compared(name, done, run, again, row, base[run])
+        runs = [run for run, name in of if name == PARAMETERS]
+        if runs:
+            changed = with_parameters(done, [sources[run] for run in runs], label, settings, size)
+            for row, run in enumerate([] if isinstance(changed, str) else runs):
+                assert not isinstance(changed, str)
+                less[run, PARAMETERS] = compared(PARAMETERS, done, run, changed, row, base[run])
+        return less
+
+    halves = smaller(doubtful, 0.5)
+    quarters = smaller(_bent(found, halves), 0.25)
     return [
         Stressed(
             source,
             label,
             found[run],
-            halves[run],
+            {name: each for (of, name), each in halves.items() if of == run},
+            {name: each for (of, name), each in quarters.items() if of == run},
             {t: np.sort(source.streams[t].publish_time_ns) for t in inputs[run].sensed},
             base[run],
             {name: done.estimates(row) for (of, name), row in rows.items() if of == run}
@@ -268,6 +196,27 @@ def _stressed(
         )
         for run, source in enumerate(sources)
     ]
+
+
+def _bent(
+    found: Sequence[Mapping[str, Tried]], halves: Mapping[tuple[int, str], Tried]
+) -> list[tuple[int, str]]:
+    """Which changes are quartered: those whose half does less, but not half as much, worst first.
+
+    What bends is in proportion where it is small enough. No run is replayed more than twelve times.
+    """
+    chosen = []
+    for run, own in enumerate(found):
+        less = {name: each for (of, name), each in halves.items() if of == run}
+        bent = [
+            name
+            for name, each in less.items()
+            if BENT * each.size <= own[name].size < HALVES[0] * each.size
+        ]
+        replays = 1 + sum(not each.why for each in own.values()) + len(less)
+        bent.sort(key=lambda name: -own[name].size)
+        chosen += [(run, name) for name in bent[: max(0, MOST_REPLAYS - replays)]]
+    return chosen
 
 
 def _topics(bound: Sequence[Bound]) -> list[str]:
@@ -295,64 +244,7 @@ def _doubtful(tried: Iterable[Tried]) -> list[str]:
         for each in tried
         if CHANGES[each.name].is_scaled
         and not each.why
-        and (each.largest >= HARMLESS or each.is_beyond or each.is_wider)
+        and (each.largest >= HARMLESS or each.beyond or each.is_wider)
     ]
-    own.sort(key=lambda each: (not each.is_wider, -each.largest))
+    own.sort(key=lambda each: (not each.is_wider, -each.size))
     return [each.name for each in own[:MOST_HALVED]]
-
-
-def _tried(
-    name: str, before: _Replayed, row: int, done: _Replayed, run: int, base: Mapping[str, Stream]
-) -> Tried:
-    within_ns = SHIFT_NS if name == "stamps" else 0
-    found = partings(base, done.estimates(run), within_ns, has_less=name == DROPPED)
-    largest = max(found, key=lambda each: each.amplification.max(initial=0.0), default=None)
-    one, other = before.metrics(row), done.metrics(run)
-    moved = {key: other[key] - value for key, value in one.items() if key in other}
-    main = _main([key[1] for key in one])
-    if largest is None and not main:
-        return Tried(name, why="no estimate is one Gaussian, and no error is known")
-    is_beyond = any(
-        abs(by) > MARGIN * abs(one[key]) for key, by in moved.items() if key[1] == main and main
-    )
-    return Tried(name, largest, moved, is_beyond)
-
-
-def _main(quantities: Sequence[str]) -> str:
-    """The metric that a verdict goes by: RMSE of the position or orientation, else the first one."""
-    errors = [each for each in quantities if "rmse" in each]
-    main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in errors]
-    return next(iter([*main, *errors]), "")
-
-
-def _parameters(done: _Replayed, label: str) -> dict[str, Any]:
-    """All parameters of an estimator: those that it has, and those that one channel states."""
-    stated = {}
-    for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
-        number, _, topics = words.partition(" (")
-        if "(" in topics:  # channels that state different ones
-            continue
-        try:
-            stated[name] = float(number)
-        except ValueError:
-            continue
-    return stated | parameters_of(done.bound).get(label, {})
-
-
-def _with_parameters(
-    done: _Replayed,
-    sources: Sequence[MemorySource],
-    label: str,
-    settings: Mapping[str, Any],
-    size: float,
-) -> _Replayed | str:
-    """Runs replayed with other parameters than they were, or why that cannot be."""
-    known = _parameters(done, label)
-    changed = parameters_changed(known, size, np.random.default_rng(done.how.seed))
-    changed = {name: value for name, value in changed.items() if value != known[name]}
-    if not changed:
-        return "no parameter is a number other than zero"
-    try:
-        return _replayed(sources, label, merge(settings, changed), done.how)
-    except BadInput as error:
-        return str(error)

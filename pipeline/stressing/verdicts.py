@@ -22,6 +22,7 @@ ORDER: Sequence[Verdict] = ("not tried", "harmless", "sensitive", "discontinuous
 HARMLESS = 0.1  # A below this
 MARGIN = 0.02  # of the metric, as compare's
 HALVES = (1.9, 2.1)  # how many times less half of a change does, where it is in proportion
+BENT = 1.2  # half the change does less, but not half as much: a quarter tells
 SQUARED = 4.2  # where it goes by the change's square; what shrinks by more has jumped
 ONE_SIGMA = 1.0  # A of a change that has no half: beyond it the copies are two results
 PER_PREDICTION = 1e-4  # the share by which moved stamps change a sigma, from which on half is tried
@@ -35,20 +36,41 @@ class Tried(NamedTuple):
         name: a key of `CHANGES`.
         parting: of the estimate that it moves most; None where no estimate is a Gaussian.
         moved: by (case, metric) how far a metric is from that of the unchanged replay.
-        is_beyond: whether the main metric moved beyond the margin.
+        beyond: how far the main metric moved, in words; empty where that is within the margin.
         why: why it was not tried.
+        failed: when and why the copy ends, where the unchanged replay does not; of what was not tried,
+            that one, where it ends before it has an estimate.
     """
 
     name: str
     parting: Parting | None = None
     moved: Mapping[tuple[str, str], float] = {}
-    is_beyond: bool = False
+    beyond: str = ""
     why: str = ""
+    failed: str = ""
 
     @property
     def largest(self) -> float:
         """The largest A."""
         return float(self.parting.amplification.max(initial=0.0)) if self.parting else 0.0
+
+    @property
+    def size(self) -> float:
+        """The largest A; of an estimate without covariances the largest distance, in m or degrees."""
+        if self.parting is None or self.parting.has_sigmas:
+            return self.largest
+        return float(np.nanmax([self.parting.metres, self.parting.degrees], initial=0.0))
+
+    @property
+    def far(self) -> str:
+        """How far the estimate moves, in words."""
+        if self.parting is None:
+            return f"the metric moves: {self.beyond}" if self.beyond else "the metric stays"
+        sizes = [(self.parting.metres, "m"), (self.parting.degrees, "deg")]
+        words = [f"{self.largest:.3g} sigma"] if self.parting.has_sigmas else []
+        words += [f"{_largest(size):.3g} {unit}" for size, unit in sizes if np.any(size >= 0.0)]
+        more = f"; {self.beyond}" if self.beyond and self.largest < HARMLESS else ""
+        return f"at most {', '.join(words)}{more}"
 
     @property
     def is_wider(self) -> bool:
@@ -65,7 +87,8 @@ class Stressed:
     Attributes:
         source: the run.
         estimator: the label.
-        tried: each change, whole; halves: those that were halved.
+        tried: each change, whole.
+        halves, quarters: those that were halved, and those of these that were halved again.
         sensors: the stamps of each topic that was sensed.
         estimates: those of the unchanged replay, by topic.
         copies: those of each change, whole.
@@ -76,10 +99,17 @@ class Stressed:
     estimator: str
     tried: Mapping[str, Tried]
     halves: Mapping[str, Tried]
+    quarters: Mapping[str, Tried]
     sensors: Mapping[str, Any]
     estimates: Mapping[str, Stream]
     copies: Mapping[str, Mapping[str, Stream]]
     is_recursive: bool
+
+    @property
+    def failed(self) -> str:
+        """When and why the unchanged replay ends before it has an estimate; empty where it has one."""
+        said = [each.failed for each in self.tried.values() if each.why]
+        return next(filter(None, said), "")
 
     @property
     def run(self) -> str:
@@ -98,18 +128,24 @@ class Stressed:
         return bool(np.all(parting.amplification <= limit))
 
     def ratio(self, name: str) -> float:
-        """How many times more the whole change does than half of it, in A; NaN where none was halved."""
-        half = self.halves.get(name)
-        return self.tried[name].largest / half.largest if half and half.largest > 0.0 else np.nan
+        """How many times more a change does than half of it, in A; NaN where none was halved.
+
+        Where half of the change was halved again, it is that which is compared.
+        """
+        half, quarter = self.halves.get(name), self.quarters.get(name)
+        more, less = (half, quarter) if half and quarter else (self.tried[name], half)
+        return more.size / less.size if less and less.size > 0.0 else np.nan
 
     def verdict(self, name: str) -> Verdict:
         """What a change does."""
         each = self.tried[name]
         if each.why:
             return "not tried"
-        if each.largest < HARMLESS and not each.is_beyond:
+        if each.failed:
+            return "discontinuous or chaotic"
+        if each.largest < HARMLESS and not each.beyond:
             return "harmless"
-        if CHANGES[name].is_scaled:
+        if CHANGES[name].is_scaled and name in self.halves:
             shrinks = HALVES[0] <= self.ratio(name) <= SQUARED
             return "sensitive" if shrinks else "discontinuous or chaotic"
         return "sensitive" if self._is_explained(name) else "discontinuous or chaotic"
@@ -123,7 +159,7 @@ class Stressed:
     def deciding(self) -> str:
         """Which change decides the worst verdict: of those that have it what moves most."""
         own = [name for name in self.tried if self.verdict(name) == self.worst]
-        return max(own, key=lambda name: self.tried[name].largest)
+        return max(own, key=lambda name: (bool(self.tried[name].failed), self.tried[name].size))
 
     @property
     def is_per_prediction(self) -> bool:
@@ -136,7 +172,13 @@ class Stressed:
         whole, half = self.tried["stamps"], self.halves.get("stamps")
         if not whole.is_wider or whole.parting is None or half is None or half.parting is None:
             return False
-        return whole.parting.spread < SHRINKS * half.parting.spread
+        return whole.parting.spread < SHRINKS * half.parting.spread and not self.is_redrawn
+
+    @property
+    def is_redrawn(self) -> bool:
+        """Whether an ulp of the inputs, too, changes a covariance: it is not the stamps that do."""
+        ulp = self.tried["ulp"].parting
+        return ulp is not None and ulp.spread > PER_PREDICTION
 
     @cached_property
     def undetermined(self) -> Undetermined | None:
@@ -154,11 +196,11 @@ class Stressed:
                 "estimator": self.estimator,
                 "change": name,
                 "verdict": self.verdict(name),
-                "amplification": each.largest if each.parting else np.nan,
+                "amplification": each.largest if each.parting and each.parting.has_sigmas else np.nan,
                 **dict.fromkeys(("metres", "degrees", "growth", "parted_s"), np.nan),
                 "halved": self.ratio(name),
                 "topic": "",
-                "note": each.why,
+                "note": each.why or (f"fails {each.failed}" if each.failed else ""),
             }
             if each.parting is not None:
                 row["metres"] = _largest(each.parting.metres)
@@ -186,22 +228,26 @@ class Stressed:
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
         name = self.deciding
-        each, parting = self.tried[name], self.tried[name].parting
-        far = "the metric moves" if parting is None else f"at most {each.largest:.3g} sigma"
-        sizes = () if parting is None else ((parting.metres, "m"), (parting.degrees, "deg"))
-        far += "".join(f", {_largest(size):.3g} {unit}" for size, unit in sizes if np.any(size >= 0.0))
-        begin = f"{self.worst}: {self.estimator} of {self.run}: {CHANGES[name].words}: {far}"
+        each = self.tried[name]
+        begin = f"{self.worst}: {self.estimator} of {self.run}: {CHANGES[name].words}: "
+        if each.failed:
+            return f"{begin}the copy fails {each.failed}"
+        begin += each.far
         if self.worst == "harmless":
             return f"{begin}; so does every other change that was tried less"
-        if self.worst == "sensitive":
-            if name not in self.halves:
-                return begin
-            more = ": it shrinks faster than the change" if self.ratio(name) > HALVES[1] else ""
-            return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it{more}"
         if not np.isfinite(self.ratio(name)):
             return begin
-        how = "it jumps" if self.ratio(name) > SQUARED else "it does not shrink with it"
-        return f"{begin}; half the change does {1.0 / self.ratio(name):.2g} of it: {how}"
+        return f"{begin}; {self._shrinking(name)}"
+
+    def _shrinking(self, name: str) -> str:
+        """What half of a change does, in words, and a quarter where that was tried."""
+        share, ratio = self.halves[name].size / self.tried[name].size, self.ratio(name)
+        half = f"half the change does {share:.2g} of it"
+        if name in self.quarters:
+            half += f", and a quarter {1.0 / ratio:.2g} of that"
+        if self.worst == "sensitive":
+            return f"{half}: it shrinks faster than the change" if ratio > HALVES[1] else half
+        return f"{half}: it {'jumps' if ratio > SQUARED else 'does not shrink with it'}"
 
     @property
     def sentences(self) -> list[str]:
@@ -216,6 +262,11 @@ class Stressed:
             sentences.append(
                 "a microsecond decides what is taken together: what has one stamp is one step, and what "
                 "comes later waits for the next"
+            )
+        if self.is_redrawn:
+            sentences.append(
+                "an ulp of the inputs changes the covariance: other samples are drawn, or something is "
+                "decided otherwise; if it takes samples, more of them bring the copies nearer"
             )
         if self.worst not in ("harmless", "not tried") and self.undetermined is not None:
             least = self.undetermined

@@ -265,7 +265,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     assert "Too sure of itself." in page._head.text
     assert "pinned" in page._head.text
     for slow_s, is_said in ((1e9, False), (0.0, True)):
-        monkeypatch.setattr("pipeline.exploring.page.SLOW_S", slow_s)
+        monkeypatch.setattr("pipeline.exploring.markup.SLOW_S", slow_s)
         page._show_head()
         assert ("One replay takes" in page._head.text) == is_said
     page._command()

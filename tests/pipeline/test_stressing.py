@@ -13,7 +13,7 @@ import fuselog as fl
 from pipeline.output.alarms import NOT_TESTED, Stressing
 from pipeline.output.report.kinds import opening
 from pipeline.output.results import RUNS, Result, read_result, read_table
-from pipeline.stressing import stressing
+from pipeline.stressing import copies, stressing
 from pipeline.stressing.changes import CHANGES, DROPPED, SHIFT_NS, inputs_of, parameters_changed
 from pipeline.stressing.experiments import stress_result
 from pipeline.stressing.partings import Parting, partings, undetermined
@@ -445,18 +445,19 @@ def test_experiments_are_stressed(fuselog: Callable[..., Any], tmp_path: Any, mo
 
 
 def test_runs_and_their_copies_are_replayed_together(monkeypatch: Any) -> None:
-    """At most twelve replays of each run, in at most four passes; and each as if it were alone."""
+    """At most twelve replays of each run, in at most six passes; and each as if it were alone."""
     sizes: list[int] = []
-    replayed = stressing._replayed
+    replayed = stressing.replayed
 
     def counted(sources: Sequence[Any], *rest: Any) -> Any:
         sizes.append(len(sources))
         return replayed(sources, *rest)
 
-    monkeypatch.setattr(stressing, "_replayed", counted)
+    monkeypatch.setattr(stressing, "replayed", counted)
+    monkeypatch.setattr(copies, "replayed", counted)
     logs = [fl.record("landmarks", seed=seed, duration_s=2.0) for seed in range(3)]
     together = fl.stress(logs, "ekf").stressed
-    assert len(sizes) <= 4
+    assert len(sizes) <= 6
     assert 9 * 3 <= sum(sizes) <= 12 * 3
     for log, each in zip(logs, together, strict=True):
         [alone] = fl.stress(log, "ekf").stressed
@@ -479,9 +480,9 @@ def test_a_copy_that_is_refused_is_not_tried(monkeypatch: Any) -> None:
 
 def test_parameters_that_channels_state_differently_stay(monkeypatch: Any) -> None:
     stated = {"ekf": {"one": "0.1 (/a)", "two": "0.1 (/a), 0.2 (/b)", "word": "yes (/a)"}}
-    monkeypatch.setattr(stressing, "stated_of", lambda *_: stated)
+    monkeypatch.setattr(copies, "stated_of", lambda *_: stated)
     done = SimpleNamespace(bound=(), sources=[None])
-    assert stressing._parameters(done, "ekf") == {"one": 0.1}
+    assert copies._parameters(done, "ekf") == {"one": 0.1}
 
 
 def test_pages_withhold_what_stress_moves_further() -> None:

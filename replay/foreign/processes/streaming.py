@@ -14,7 +14,6 @@ little-endian. The program begins with its description, and answers every frame 
 A status from 1 on counts in the description's failures. The end of standard input is the end.
 """
 
-import os
 import queue
 import struct
 import threading
@@ -67,11 +66,14 @@ class Stream(Program):
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        """Cut what it writes into frames, as it comes."""
+        """Cut what it writes into frames, as it comes.
+
+        By the file and not by its number, which is another program's after `end` has closed the file.
+        """
         assert self.process.stdout is not None
         buffer = bytearray()
         with suppress(OSError, ValueError):
-            while came := os.read(self.process.stdout.fileno(), 1 << 16):
+            while came := self.process.stdout.read1(1 << 16):  # type: ignore[attr-defined]
                 buffer += came
                 while len(buffer) >= 4:
                     size = _HEAD.unpack_from(buffer)[0]

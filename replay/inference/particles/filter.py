@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field, NonNegativeInt
+from pydantic import Field, NonNegativeInt, model_validator
 
 from recorders.log import make_stream, schemas
 from replay.engine.arrays import Integers
@@ -33,8 +33,10 @@ from replay.inference.particles.particles import (
     ParticleMemory,
     SensorMemory,
     moving,
+    resampling,
     summing_up,
 )
+from replay.inference.particles.progressive import kernel_of, renewing
 from replay.inference.particles.update import weighing
 from replay.inference.run.filtering import Filter, FilterState
 from replay.inference.run.recursion import Estimates, FilterEvents, Innovations
@@ -54,21 +56,33 @@ class ParticleParameters(MethodParameters):
             share of all.
         seed: seed of the random numbers.
         cloud: whether every estimate comes with all its particles.
+        progressive: whether a measurement that would leave fewer effective ones than `resample_below`
+            is taken in by parts, and particles are spread by a Gaussian kernel where they are resampled.
     """
 
     particles: Annotated[int, Field(ge=1, le=MOST_PARTICLES)] = 1000
     resample_below: Annotated[float, Field(ge=0, le=1)] = 0.5
     seed: NonNegativeInt = 0
     cloud: bool = False
+    progressive: bool = False
+
+    @model_validator(mode="after")
+    def _parts_are_possible(self) -> Self:
+        if self.progressive and self.resample_below == 1.0:
+            raise ValueError(
+                "progressive leaves resample_below of all effective, which cannot be 1; give less"
+            )
+        return self
 
 
-def particle_steps(stage: Stage, particles: int, resample_below: float) -> Steps:
+def particle_steps(stage: Stage, particles: int, resample_below: float, *, progressive: bool) -> Steps:
     """Make the steps of a bootstrap filter.
 
     Args:
         stage: the model as the method takes it.
         particles: how many.
         resample_below: the share of them; they are resampled where fewer are effective.
+        progressive: see `ParticleParameters`.
     """
     model, motion, sensors = stage.model, stage.motion, stage.sensors
     n, t = model.size, model.tangent
@@ -91,10 +105,12 @@ def particle_steps(stage: Stage, particles: int, resample_below: float) -> Steps
             sensors=tuple(_sensor_memory(each, particles) for each in sensors)
             or (_sensor_memory(None, particles),),
             work=workspace(stage),
+            kernel=kernel_of(particles if progressive else 0, n, t),
         )
 
-    updates = tuple(weighing(stage, number) for number in range(len(sensors)))
-    return Steps(memory, moving(stage, by_control), updates, summing_up(model))
+    updates = tuple(weighing(stage, number, progressive=progressive) for number in range(len(sensors)))
+    renew = renewing(model) if progressive else resampling
+    return Steps(memory, moving(stage, by_control, renew), updates, summing_up(model))
 
 
 def _sensor_memory(sensor: Sensor | None, particles: int) -> SensorMemory:
@@ -261,15 +277,15 @@ def draw(model: Model, cloud: Cloud, run: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def _of_so_many(particles: int, resample_below: float) -> Method:
+def _of_so_many(particles: int, resample_below: float, progressive: bool) -> Method:
     def steps(stage: Stage) -> Steps:
-        return particle_steps(stage, particles, resample_below)
+        return particle_steps(stage, particles, resample_below, progressive=progressive)
 
     return Method(**{**vars(BOOTSTRAP), "steps": steps, "made_for": None})
 
 
 def _made_for(parameters: ParticleParameters) -> Method:
-    return _of_so_many(parameters.particles, parameters.resample_below)
+    return _of_so_many(parameters.particles, parameters.resample_below, parameters.progressive)
 
 
 def _lacks_likelihood(model: Model) -> str:

@@ -82,6 +82,25 @@ class SensorMemory(NamedTuple):
     kept: Integers
 
 
+class Kernel(NamedTuple):
+    """Holds what resampled particles are spread with, see `progressive`.
+
+    Attributes:
+        width: of the Gaussian kernel, as a share of the cloud's own deviation.
+        numbers, words, drawn: normals, what they are made of, and normals as (N, t).
+        mean, covariance: (n,), (t, t) of the cloud, then the factor of that.
+        trial: (N,) weights.
+    """
+
+    width: float
+    numbers: Floats
+    words: Words
+    drawn: Floats
+    mean: Floats
+    covariance: Floats
+    trial: Floats
+
+
 class ParticleMemory(NamedTuple):
     """Holds what the steps of one core work in.
 
@@ -94,6 +113,7 @@ class ParticleMemory(NamedTuple):
         likelihood: (N,) logarithms.
         sensors: one for each sensor.
         work: for derivatives by noise.
+        kernel: to spread them; of no particles where they are not.
     """
 
     least_effective: float
@@ -108,12 +128,16 @@ class ParticleMemory(NamedTuple):
     likelihood: Floats
     sensors: tuple[SensorMemory, ...]
     work: Workspace
+    kernel: Kernel
 
 
-def moving(stage: Stage, by_control: int) -> Function:
+def moving(stage: Stage, by_control: int, renew: Function) -> Function:
     """Make the prediction: every particle moves with noise of its own, after resampling where due.
 
-    The first `by_control` draws of a particle are errors of the control.
+    Args:
+        stage: the model as the method takes it.
+        by_control: how many of a particle's draws, the first ones, are errors of the control.
+        renew: `renew(run, cloud, memory)` resamples, and says whether all is well.
     """
     model, motion = stage.model, stage.motion
     read_state, fill, add = tuple_of(model.size), filling(model.size), boxplus(model.kinds)
@@ -124,7 +148,10 @@ def moving(stage: Stage, by_control: int) -> Function:
 
     def predict(run: int, cloud: Cloud, interval: Interval, memory: ParticleMemory) -> bool:
         states, offsets, key = cloud.states[run], cloud.offsets[run], cloud.key[run]
-        cloud.counter[run] = resample(states, cloud.weight[run], key, cloud.counter[run], memory)
+        if effective_number(cloud.weight[run]) < memory.least_effective and not renew(
+            run, cloud, memory
+        ):
+            return False
         cloud.counter[run] = fill_normals(memory.numbers, memory.words, key, cloud.counter[run])
         if not spread(states, offsets, interval, memory):
             return False
@@ -138,8 +165,15 @@ def moving(stage: Stage, by_control: int) -> Function:
     return predict
 
 
+def resampling(run: int, cloud: Cloud, memory: ParticleMemory) -> bool:
+    """Resample, and leave the particles where they are; returns True."""
+    states, weight, key = cloud.states[run], cloud.weight[run], cloud.key[run]
+    cloud.counter[run] = resample(states, weight, key, cloud.counter[run], memory)
+    return True
+
+
 def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: ParticleMemory) -> int:
-    """Resample where the effective number of particles is too small; returns the counter after it.
+    """Resample, so that all weigh the same; returns the counter after it.
 
     Args:
         states: (N, n).
@@ -148,8 +182,6 @@ def resample(states: Floats, weight: Floats, key: Words, counter: int, memory: P
         counter: of its generator.
         memory: to work in.
     """
-    if not effective_number(weight) < memory.least_effective:
-        return counter
     choose_systematically(weight, unit(philox(counter + 1, key)[0]), memory.chosen)
     for i in range(len(weight)):
         for k in range(states.shape[1]):
@@ -167,6 +199,28 @@ def effective_number(weight: Floats) -> float:
     for i in range(len(weight)):
         squared += weight[i] * weight[i]
     return 1.0 / squared
+
+
+def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
+    """Multiply weights (N,) of sum 1 by a power of likelihoods, and norm them.
+
+    The likelihoods are given as logarithms. Returns log sum w p^power. Where a likelihood is NaN, the
+    particle gets the mean of the others. NaN, and weights of no use, where none is above zero.
+    """
+    best = -np.inf
+    for i in range(len(weight)):
+        if weight[i] > 0.0 and likelihood[i] > best:
+            best = likelihood[i]
+    share, total = 0.0, 0.0
+    for i in range(len(weight)):
+        if not np.isnan(likelihood[i]):
+            share += weight[i]
+            weight[i] *= np.exp(power * (likelihood[i] - best))
+            total += weight[i]
+    mean = total / share
+    for i in range(len(weight)):
+        weight[i] *= 1.0 / mean if not np.isnan(likelihood[i]) else 1.0
+    return power * best + np.log(mean) if best > -np.inf else np.nan
 
 
 def _driving(stage: Stage) -> Function:

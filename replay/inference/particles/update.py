@@ -31,10 +31,11 @@ from replay.inference.linear_algebra.gaussian import (
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.tuples import filling, tuple_of
 from replay.inference.model.stage import Stage
-from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory
+from replay.inference.particles.particles import Cloud, ParticleMemory, SensorMemory, reweigh
+from replay.inference.particles.progressive import taking_in_parts
 
 
-def weighing(stage: Stage, number: int) -> Function:
+def weighing(stage: Stage, number: int, *, progressive: bool) -> Function:
     """Make the update by sensor `number`: it weighs particles by the likelihood of the measurement.
 
     The innovation that is recorded, its NIS and the gate are of the cloud's first two moments; the
@@ -44,10 +45,15 @@ def weighing(stage: Stage, number: int) -> Function:
     Args:
         stage: the model with the sensors at hand.
         number: the sensor's, among these.
+        progressive: whether a measurement is taken in by parts.
     """
     sensor = stage.sensors[number]
     m, write_innovation = len(sensor.measured), writing_innovation(stage, number)
     compare, likelihood = _comparing(stage, number), _likelihood(stage, number)
+    take = _at_once(likelihood)
+    if progressive:
+        look = _looking(compare, number) if sensor.log_likelihood is None else _as_before
+        take = taking_in_parts(stage.model, look, likelihood)
     angular = tuple(kind == "angle" for kind in sensor.measured.values())
 
     def update(
@@ -74,12 +80,49 @@ def weighing(stage: Stage, number: int) -> Function:
         if not accepted:
             return ALL_WELL
         factor_kept(own, kept)
-        for i in range(len(weight)):
-            memory.likelihood[i] = likelihood(cloud.states[run], i, data, parameters, own, kept)
-        record.numbers[1] = reweigh(weight, memory.likelihood)
+        record.numbers[1], well = take(run, cloud, data, parameters, memory, own, kept)
+        if not well:
+            return NOT_POSITIVE_DEFINITE
         return NOT_EXPLAINED if np.isnan(record.numbers[1]) else ALL_WELL
 
     return update
+
+
+def _at_once(likelihood: Function) -> Function:
+    """Make `take`, see `taking_in_parts`, of a measurement that is taken in at once."""
+
+    def take(
+        run: int,
+        cloud: Cloud,
+        data: Floats,
+        parameters: Any,
+        memory: ParticleMemory,
+        own: SensorMemory,
+        kept: int,
+    ) -> tuple[float, bool]:
+        states, weight, found = cloud.states[run], cloud.weight[run], memory.likelihood
+        for i in range(len(weight)):
+            found[i] = likelihood(states, i, data, parameters, own, kept)
+        return reweigh(weight, found, 1.0), True
+
+    return take
+
+
+def _looking(compare: Function, number: int) -> Function:
+    """Make `look`, see `taking_in_parts`, where the likelihood is that of Gaussian noise."""
+
+    def look(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory, kept: int) -> int:
+        compare(states, data, parameters, memory)
+        kept = keep_predicted(memory.sensors[number])
+        factor_kept(memory.sensors[number], kept)
+        return kept
+
+    return look
+
+
+def _as_before(states: Floats, data: Floats, parameters: Any, memory: ParticleMemory, kept: int) -> int:
+    """Prepare nothing, for a likelihood that asks for nothing but the state."""
+    return kept
 
 
 def _comparing(stage: Stage, number: int) -> Function:
@@ -247,25 +290,3 @@ def gaussian_likelihood(
     factor = inflation(squared, size, parameters)
     known = own.determinant[number] + size * LOG_TWO_PI
     return -0.5 * (squared / factor + known + size * np.log(factor))
-
-
-def reweigh(weight: Floats, likelihood: Floats) -> float:
-    """Multiply weights (N,) of sum 1 by likelihoods, whose logarithms are given, and norm them.
-
-    Returns log sum w p. Where a likelihood is NaN, the particle gets the mean of the others. NaN, and
-    weights of no use, where none is above zero.
-    """
-    best = -np.inf
-    for i in range(len(weight)):
-        if weight[i] > 0.0 and likelihood[i] > best:
-            best = likelihood[i]
-    share, total = 0.0, 0.0
-    for i in range(len(weight)):
-        if not np.isnan(likelihood[i]):
-            share += weight[i]
-            weight[i] *= np.exp(likelihood[i] - best)
-            total += weight[i]
-    mean = total / share
-    for i in range(len(weight)):
-        weight[i] *= 1.0 / mean if not np.isnan(likelihood[i]) else 1.0
-    return best + np.log(mean) if best > -np.inf else np.nan

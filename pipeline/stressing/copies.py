@@ -1,0 +1,216 @@
+"""Replays copies of a run and compares them with it: estimates, metrics, and whether they fail."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.runs.ensemble import parameters_of, replay_blocks, stated_of
+from pipeline.stressing.changes import (
+    DROPPED,
+    SHIFT_NS,
+    parameters_changed,
+)
+from pipeline.stressing.partings import Parting, partings
+from pipeline.stressing.verdicts import MARGIN, Tried
+from recorders.errors import BadInput
+from recorders.log import Clock, Stream, schemas
+from recorders.parameters import merge
+from replay.engine.replaying.estimator import Bound, bind
+from replay.engine.replaying.late import Late
+from replay.engine.replaying.replaying import Report, collect
+from replay.engine.streams.blocks import Ragged
+from replay.engine.streams.failures import sentences_of
+from replay.engine.streams.sources import Ensemble, MemorySource
+from replay.judging.judge import Judge
+
+
+class How(NamedTuple):
+    """Says how runs are replayed and stressed.
+
+    Attributes:
+        seed: of signs, coins, and what is dropped.
+        gap_limit_s: the truth is not interpolated over longer gaps.
+        order: the clock to go by.
+        late: what is done about messages that come late, in the order of log time.
+    """
+
+    seed: int = 0
+    gap_limit_s: float = 0.2
+    order: Clock = "publish_time"
+    late: Late | None = None
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """Runs and copies that one estimator replayed.
+
+    Attributes:
+        sources: runs and copies.
+        bound: the estimator.
+        outputs: what it gave, by topic.
+        how: how they were replayed.
+    """
+
+    sources: Ensemble[MemorySource]
+    bound: Sequence[Bound]
+    outputs: Mapping[str, Ragged]
+    how: How
+
+    def estimates(self, run: int) -> dict[str, Stream]:
+        """The Gaussian estimates of a run, by topic, in the order of their stamps."""
+        wanted = schemas.GAUSSIAN_ESTIMATE.full_name
+        found = {
+            topic: rows.of_run(run)
+            for topic, rows in self.outputs.items()
+            if rows.stream.schema.full_name == wanted
+        }
+        return {
+            topic: each.take(np.argsort(each.publish_time_ns, kind="stable"))
+            for topic, each in found.items()
+        }
+
+    def failure(self, run: int) -> str:
+        """When and why a run ends before its time; empty where it does not."""
+        for rows in self.outputs.values():
+            if rows.stream.schema.full_name == schemas.FAILURE.full_name:
+                own = rows.of_run(run)
+                if len(own):
+                    at_s = (int(own.publish_time_ns[0]) - self.sources[run].epoch_ns) * 1e-9
+                    return f"at {at_s:.3f} s: {sentences_of(own)[0]}"
+        return ""
+
+    @cached_property
+    def _metrics(self) -> Mapping[int, Mapping[tuple[str, str], float]]:
+        judge = Judge(self.sources, {}, gap_limit_s=self.how.gap_limit_s)
+        judge.add(self.outputs)
+        found: dict[int, dict[tuple[str, str], float]] = defaultdict(dict)
+        for row in judge.runs_table.to_dict("records"):
+            found[row["run"]] |= {
+                (str(row["case"]), str(quantity)): float(value)
+                for quantity, value in row.items()
+                if quantity != "run" and isinstance(value, int | float) and np.isfinite(value)
+            }
+        return found
+
+    def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
+        """The metrics of one run by case and quantity, those that are known."""
+        return self._metrics.get(run, {})
+
+
+def replayed(
+    sources: Sequence[MemorySource], label: str, settings: Mapping[str, Any], how: How
+) -> Replayed:
+    """Replay runs by one estimator.
+
+    Raises BadInput where it can replay none of them.
+    """
+    ensemble = Ensemble(sources)
+    bound, report = bind(label, ensemble, settings), Report()
+    blocks = replay_blocks(ensemble, bound, report, order=how.order, late=how.late)
+    outputs = collect(list(block.values()) for block in blocks)
+    for refusal in report.refused.values():
+        raise refusal
+    return Replayed(ensemble, bound, outputs, how)
+
+
+def compared(
+    name: str, before: Replayed, row: int, done: Replayed, run: int, base: Mapping[str, Stream]
+) -> Tried:
+    """Compare a copy with its run.
+
+    Args:
+        name: of the change.
+        before: what holds the run, in `row`; its estimates are `base`.
+        row: see there.
+        done: what holds the copy.
+        run: where it is in that.
+        base: see there.
+    """
+    within_ns = SHIFT_NS if name == "stamps" else 0
+    found = partings(base, done.estimates(run), within_ns, has_less=name == DROPPED)
+    largest = max(found, key=lambda each: each.amplification.max(initial=0.0), default=None)
+    failed = done.failure(run)
+    if before.failure(row):
+        if largest is None:
+            return Tried(name, why=f"it fails {before.failure(row)}", failed=before.failure(row))
+        failed = ""
+    one, other = before.metrics(row), done.metrics(run)
+    moved = {key: other[key] - value for key, value in one.items() if key in other}
+    main = _main([key[1] for key in one])
+    if largest is None and not main and not failed:
+        return Tried(name, why="no estimate is one Gaussian, and no error is known")
+    reach = _reach(found, main)
+    shares = [
+        min(abs(by), reach) / abs(one[key])
+        for key, by in moved.items()
+        if key[1] == main and one[key] != 0.0
+    ]
+    share = max(shares, default=0.0)
+    beyond = f"{main} changes by {100 * share:.2g} %" if share > MARGIN else ""
+    return Tried(name, largest, moved, beyond, failed=failed)
+
+
+def _reach(found: Sequence[Parting], main: str) -> float:
+    """By how much an RMSE can change: no more than the estimates of common stamps are apart.
+
+    What a copy has not an estimate of, as at a stamp where the message is lost, is in one RMSE alone.
+    """
+    unit = main.rpartition("_")[2]
+    if unit not in ("m", "deg", "rad"):
+        return np.inf
+    apart = [each.metres if unit == "m" else each.degrees for each in found]
+    known = [float(np.nanmax(each)) for each in apart if np.isfinite(each).any()]
+    return np.radians(max(known)) if known and unit == "rad" else max(known, default=np.inf)
+
+
+def _main(quantities: Sequence[str]) -> str:
+    """The metric that a verdict goes by: RMSE of the position or orientation, else the first one."""
+    errors = [each for each in quantities if "rmse" in each]
+    main = [each for each in ("position_rmse_m", "orientation_rmse_deg") if each in errors]
+    return next(iter([*main, *errors]), "")
+
+
+def _parameters(done: Replayed, label: str) -> dict[str, Any]:
+    """All parameters of an estimator: those that it has, and those that one channel states."""
+    stated = {}
+    for name, words in stated_of(done.bound, done.sources[0]).get(label, {}).items():
+        number, _, topics = words.partition(" (")
+        if "(" in topics:  # channels that state different ones
+            continue
+        try:
+            stated[name] = float(number)
+        except ValueError:
+            continue
+    return stated | parameters_of(done.bound).get(label, {})
+
+
+def with_parameters(
+    done: Replayed,
+    sources: Sequence[MemorySource],
+    label: str,
+    settings: Mapping[str, Any],
+    size: float,
+) -> Replayed | str:
+    """Replay runs with other parameters than they had; returns why where that cannot be."""
+    known = _parameters(done, label)
+    changed = parameters_changed(known, size, np.random.default_rng(done.how.seed))
+    changed = {name: value for name, value in changed.items() if value != known[name]}
+    if not changed:
+        return "no parameter is a number other than zero"
+    refused = ""
+    for name in [*changed]:
+        try:
+            bind(label, sources, merge(settings, {name: changed[name]}))
+        except BadInput as error:  # as of a setting that its method has by name, and does not use
+            refused = str(error)
+            del changed[name]
+    if not changed:
+        return refused
+    try:
+        return replayed(sources, label, merge(settings, changed), done.how)
+    except BadInput as error:
+        return str(error)

@@ -1,0 +1,160 @@
+"""Takes measurements in by parts, and spreads resampled particles: good ones do not stay few.
+
+A measurement far narrower than the cloud leaves a handful of particles, and without noise of the motion
+all later ones are copies of these. So its likelihood is raised to a power that leaves enough of them
+effective, they are resampled, and the rest of it follows. Resampled particles are drawn of a Gaussian
+kernel around each, shrunk to their mean so that mean and covariance stay.
+
+Progressive correction: Musso, Oudjane and Le Gland, "Improving regularised particle filters", 2001, in
+Sequential Monte Carlo Methods in Practice; the shrinkage: West, JRSS B 55(2), 1993.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from replay.engine.arrays import Floats, Function
+from replay.engine.philox import WORDS, fill_normals
+from replay.inference.kalman.regression import settling
+from replay.inference.linear_algebra.gaussian import semidefinite_cholesky
+from replay.inference.linear_algebra.manifold import boxminus, boxplus
+from replay.inference.linear_algebra.moments import moments_of
+from replay.inference.model.model import Model
+from replay.inference.particles.particles import (
+    Cloud,
+    Kernel,
+    ParticleMemory,
+    SensorMemory,
+    effective_number,
+    resample,
+    reweigh,
+)
+
+MOST_PARTS = 100  # of one measurement
+_HALVINGS = 10  # of the interval in which the power lies, and more where it is less than all of these
+_MOST_HALVINGS = 60
+
+
+def kernel_of(particles: int, n: int, t: int) -> Kernel:
+    """Make what so many particles of n components and t tangent ones are spread with.
+
+    The width is the best one for Gaussians: Silverman, Density Estimation, 1986, eq. 4.14.
+    """
+    size = -(-particles * t // WORDS) * WORDS
+    numbers = np.empty(size)
+    return Kernel(
+        width=min(1.0, (4.0 / ((t + 2.0) * max(particles, 1))) ** (1.0 / (t + 4.0))),
+        numbers=numbers,
+        words=np.empty(size, np.uint64),
+        drawn=numbers[: particles * t].reshape(particles, t),
+        mean=np.empty(n),
+        covariance=np.empty((t, t)),
+        trial=np.empty(particles),
+    )
+
+
+def renewing(model: Model) -> Function:
+    """Make `renew(run, cloud, memory)`: it resamples, and spreads what it has resampled.
+
+    Returns False where the covariance of the particles is no covariance.
+    """
+    n, t = model.size, model.tangent
+    subtract, add, settle = boxminus(model.kinds), boxplus(model.kinds), settling(model.kinds)
+    moments = moments_of(0, t)
+
+    def renew(run: int, cloud: Cloud, memory: ParticleMemory) -> bool:
+        states, weight, offsets = cloud.states[run], cloud.weight[run], cloud.offsets[run]
+        kernel, shift, key = memory.kernel, cloud.shift[run], cloud.key[run]
+        for k in range(n):
+            kernel.mean[k] = states[0, k]
+        for i in range(len(states)):
+            subtract(states[i], kernel.mean, offsets, i)
+        settle(weight, offsets, kernel.mean, shift)
+        moments(weight, offsets, offsets, shift, kernel.covariance, kernel.covariance)
+        if not semidefinite_cholesky(kernel.covariance, kernel.covariance, t):
+            return False
+        counter = resample(states, weight, key, cloud.counter[run], memory)
+        cloud.counter[run] = fill_normals(kernel.numbers, kernel.words, key, counter)
+        kept = np.sqrt(1.0 - kernel.width * kernel.width)
+        for i in range(len(states)):
+            subtract(states[i], kernel.mean, offsets, i)
+            for k in range(t):
+                offsets[i, k] *= kept
+                for j in range(k + 1):
+                    offsets[i, k] += kernel.width * kernel.covariance[k, j] * kernel.drawn[i, j]
+            for k in range(n):
+                states[i, k] = kernel.mean[k]
+            add(states[i], offsets[i])
+        return True
+
+    return renew
+
+
+def taking_in_parts(model: Model, look: Function, likelihood: Function) -> Function:
+    """Make `take(run, cloud, data, parameters, memory, own, kept)`: it weighs and moves the particles.
+
+    Returns the log-likelihood, NaN where no particle explains what was measured, and whether all is
+    well otherwise.
+
+    Args:
+        model: whose state the particles have.
+        look: `look(states, data, parameters, memory, kept)` prepares what the likelihood needs of
+            particles that moved, and says how many components are used.
+        likelihood: log p at one particle, see `update.weighing`.
+    """
+    renew = renewing(model)
+
+    def take(
+        run: int,
+        cloud: Cloud,
+        data: Floats,
+        parameters: Any,
+        memory: ParticleMemory,
+        own: SensorMemory,
+        kept: int,
+    ) -> tuple[float, bool]:
+        states, weight, found = cloud.states[run], cloud.weight[run], memory.likelihood
+        left, total = 1.0, 0.0
+        for part in range(MOST_PARTS):
+            for i in range(len(weight)):
+                found[i] = likelihood(states, i, data, parameters, own, kept)
+            share = left
+            if part + 1 < MOST_PARTS:
+                share = _power(weight, found, left, memory)
+            total += reweigh(weight, found, share)
+            if np.isnan(total):
+                return total, True
+            left -= share
+            if left <= 0.0:
+                break
+            if not renew(run, cloud, memory):
+                return total, False
+            kept = look(states, data, parameters, memory, kept)
+        return total, True
+
+    return take
+
+
+def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemory) -> float:
+    """The largest power up to what is left that leaves enough particles effective."""
+    least = memory.least_effective
+    if not effective_after(weight, likelihood, left, memory.kernel.trial) < least:
+        return left
+    low, high = 0.0, left
+    for halving in range(_MOST_HALVINGS):
+        if halving >= _HALVINGS and low > 0.0:
+            break
+        middle = 0.5 * (low + high)
+        if effective_after(weight, likelihood, middle, memory.kernel.trial) < least:
+            high = middle
+        else:
+            low = middle
+    return low if low > 0.0 else high
+
+
+def effective_after(weight: Floats, likelihood: Floats, power: float, trial: Floats) -> float:
+    """Count the effective particles after a power of the likelihoods; `trial` (N,) is to work in."""
+    for i in range(len(weight)):
+        trial[i] = weight[i]
+    reweigh(trial, likelihood, power)
+    return effective_number(trial)

@@ -1,0 +1,92 @@
+"""Stress of what is no plain filter: copies that fail, no covariances, random samples, what bends."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fuselog as fl
+from pipeline.stressing.partings import partings
+from pipeline.stressing.verdicts import Tried
+from recorders.errors import BadInput
+from tests.pipeline.test_stressing import EPOCH_NS, LINE, VECTOR, line
+
+
+class GainParameters(fl.Parameters):
+    """What the estimate follows.
+
+    Attributes:
+        gain: one where it is unchanged.
+    """
+
+    gain: float = 1.0
+
+
+def bends(streams: fl.OneRun, parameters: Any) -> fl.Estimates:
+    """An estimate in proportion to small changes of its gain; it fails at odd stamps."""
+    stamps_ns = streams["seen"].publish_time_ns
+    if np.any(stamps_ns % 10**6):
+        raise BadInput("a stamp is not one of whole milliseconds")
+    change = 100.0 * (parameters.gain - 1.0)
+    mean = np.full((len(stamps_ns), 1), change - 0.25 * change**3)
+    return fl.Estimates(stamps_ns, mean, np.ones((len(stamps_ns), 1, 1)))
+
+
+BENDS = fl.batch(
+    "an estimate that bends",
+    parameters=GainParameters,
+    streams={"seen": VECTOR},
+    components={"x_m": "linear"},
+    solve=fl.each_run(bends),
+)
+
+
+def test_a_copy_that_fails_and_a_change_that_bends() -> None:
+    """The half does more than half; a quarter half as much as that."""
+    [stressed] = fl.stress(line([0.1, 0.2, 0.3, 0.4]), {"own": {"kind": BENDS}}).stressed
+    assert stressed.verdict("parameters") == "sensitive"
+    assert stressed.tried["parameters"].largest / stressed.halves["parameters"].largest < 1.7
+    assert 1.9 < stressed.ratio("parameters") < 2.1
+    assert stressed.worst == stressed.verdict("stamps") == "discontinuous or chaotic"
+    said = "stamps moved by up to 1 us: the copy fails at 4.000 s: a stamp is not one of whole"
+    assert said in stressed.sentences[0]
+    odd = line([0.1, 0.2])
+    seen = odd.streams[1]
+    late = replace(seen, publish_time_ns=seen.publish_time_ns + 1)
+    with pytest.raises(BadInput, match="a stamp is not one of whole milliseconds"):
+        fl.stress(fl.Recording([odd.streams[0], late], epoch_ns=EPOCH_NS), {"own": {"kind": BENDS}})
+
+
+def test_other_samples_are_no_noise_per_prediction() -> None:
+    [stressed] = fl.stress(
+        line(list(np.linspace(0.0, 2.0, 6))), {"own": fl.modelled(LINE, "particles:50")}
+    ).stressed
+    said = " ".join(stressed.sentences)
+    assert "an ulp of the inputs changes the covariance: other samples are drawn" in said
+    assert "noise per prediction" not in said
+
+
+def test_parameters_of_smoothers_are_changed() -> None:
+    """Of those that their method shares with another one, and refuses, it is changed without them."""
+    [stressed] = fl.stress(line([0.1, 0.2, 0.3]), {"own": fl.modelled(LINE, "smoother:ekf")}).stressed
+    assert stressed.tried["parameters"].why == ""
+    assert stressed.tried["parameters"].largest > 0.0
+
+
+def test_without_covariances_metres_are_told() -> None:
+    def estimate(x_m: float) -> fl.Stream:
+        metadata = {"components": "x_m", "kinds": "linear"}
+        return fl.make_stream(
+            "/estimates/own/state",
+            fl.schemas.GAUSSIAN_ESTIMATE,
+            [EPOCH_NS],
+            metadata=metadata,
+            mean=[[x_m]],
+            covariance=[[0.0]],
+        )
+
+    one, other = ({"own": estimate(x_m)} for x_m in (0.0, 0.5))
+    [parting] = partings(one, other, 0)
+    tried = Tried("start", parting)
+    assert (tried.far, tried.largest, tried.size) == ("at most 0.5 m", 0.0, 0.5)
