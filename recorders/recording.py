@@ -21,10 +21,13 @@ SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
 
 
 def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
-    """Stamps in ns of times in s since the epoch of simulations, of the same shape.
+    """Compute the stamps of times since the epoch of simulations.
 
     Args:
         elapsed_s: of any shape, in s.
+
+    Returns:
+        The stamps, of the same shape, in ns.
 
     Raises BadInput where a stamp would be beyond what a log can hold.
     """

@@ -65,7 +65,7 @@ class Trajectory:
         return len(self.position_m)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Trajectory":
-        """Return the poses of these rows."""
+        """Return the poses of `rows`."""
         return Trajectory(
             self.name,
             self.position_m[rows],
@@ -109,6 +109,9 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
     Args:
         path: the file; lines that are empty or begin with # are passed over.
         format: one of `Format`; by default the content tells.
+
+    Returns:
+        The poses in the order of time; `notes` of them say what was mended.
 
     Raises BadInput that names the line where the file holds no trajectory.
     """

@@ -125,6 +125,9 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
         path: an MCAP file.
         recover: read what is whole of a log that was cut off or damaged; a warning says what is missing.
 
+    Returns:
+        The log, which maps every topic to its stream.
+
     Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
 
     >>> from pipeline.api.api import record, write

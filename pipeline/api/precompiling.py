@@ -63,7 +63,9 @@ def precompile(
         workers: processes, as many as there are cores by default; a script guards its own work with `if
             __name__ == "__main__":`, as they import it.
 
-    Returns a row for every model, method and scenario; of scenarios with the same sensors, the first.
+    Returns:
+        A row for every model, method and scenario; of scenarios with the same sensors, the first.
+
     Raises BadInput for an unknown name, a method that cannot estimate a model, or a cache where nothing
     would be kept.
     """

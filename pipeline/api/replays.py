@@ -77,6 +77,9 @@ def replay(
             replayed: `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
         metrics: which ones; none stands for all.
 
+    Returns:
+        The estimates of every run, and as tables their metrics, errors and innovations.
+
     Raises BadInput where no run can be replayed by one of the estimators.
 
     >>> from pipeline.api.api import record
@@ -213,7 +216,7 @@ class Replay:
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
-        """RMSE and NEES over time, of the first case (`robot1`, say) where none is named.
+        """Draw RMSE and NEES over time of a `case` such as `robot1`, by default of the first.
 
         Raises BadInput where there is no such case, or nothing was judged.
         """
@@ -258,7 +261,7 @@ class Replay:
             judge_logs([self.estimates[run]], [log], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write metrics, tables and figures as a result folder, for `fuselog report` and others.
+        """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """

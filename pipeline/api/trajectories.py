@@ -115,7 +115,7 @@ class Evaluation:
         return error_along_path(self.compared)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write metrics, tables and figures as a result folder, for `fuselog report` and others.
+        """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -179,6 +179,9 @@ def evaluate(
         time_offset_s: added to the estimate's stamps; "estimate" finds it.
         format: of the estimate's file: "tum", "kitti", "euroc"; by default its content tells.
         truth_format: of the truth's.
+
+    Returns:
+        Both trajectories and their errors, absolute (APE) and relative (RPE), in m and degrees.
 
     Raises BadInput where a file holds no trajectory, or the two cannot be compared.
 

@@ -44,6 +44,9 @@ def calibrate(
         next_motion: also say which manoeuvre to record next, of a robot with wheels and fixes.
         options: as for `tune`, but for `free` and `by`.
 
+    Returns:
+        The parameters with 95 % intervals, and the logs replayed with the values before and after.
+
     Raises BadInput where the model marks none, nothing in the logs depends on what it marks, or a next
     motion is asked of logs without wheels and fixes.
     """

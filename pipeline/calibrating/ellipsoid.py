@@ -154,7 +154,7 @@ class Ellipsoid:
         return Chart(title=f"{self.topic}.{self.field}", panels=[panel])
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write the table and the figure as a result folder.
+        """Write the table and the figure to the result folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -184,6 +184,9 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
         field: which, as `/imu.magnetic_field_ut`.
         length: of the vector, in the field's unit; by default gravity's of a specific force, else what
             makes the mean of the scales one.
+
+    Returns:
+        Offset (3,) and matrix (3, 3) with 95 % intervals, and how well they fit.
 
     Raises BadInput where a log has no such field, or too few readings.
     """

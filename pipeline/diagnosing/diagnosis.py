@@ -150,7 +150,7 @@ class Diagnosis:
         return marks_of(self.sentences, self.label, [*self.replay.estimates[0].topics], first_ns)
 
     def view(self, save: str | Path) -> None:
-        """Write the timeline of the replay, the sentences among its events, to an .rrd file.
+        """Write the timeline of the replay, the sentences among its events, to the .rrd file `save`.
 
         Raises BadInput where the file cannot be written.
         """
@@ -166,7 +166,7 @@ class Diagnosis:
             judge_logs(estimates, [log], {}, gap_limit_s=self.replay.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write sentences, tables, figures, metrics and a timeline as a result folder.
+        """Write sentences, tables, figures, metrics and a timeline to the result folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -216,6 +216,9 @@ def diagnose(
             an estimates log one of its labels, by default its only one.
         set: parameters of the estimator, and how topics are altered; see `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Returns:
+        At most five sentences on what is wrong, and tables of the evidence.
 
     Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
     no innovations.

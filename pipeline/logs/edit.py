@@ -59,6 +59,9 @@ def cut(
             keep at most, as "5Hz"; messages of one stamp stay together.
         recover: read what is whole of a log that was cut off or damaged.
 
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+
     Raises BadInput where a name or pattern is of no topic, nothing is in the span, or something else is
     in the place of the output.
 
@@ -128,6 +131,9 @@ def merge(
             The sensors' own clock readings stay as they are.
         recover: read what is whole of logs that were cut off or damaged.
 
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+
     Raises BadInput where two logs have a topic in common, an offset is of no log or takes stamps out of
     range, or something else is in the place of the output.
 
@@ -191,6 +197,9 @@ def relabel(
         components: new names by old ones, such as "x_m": "east_m", of every topic that has them.
         recover: read what is whole of a log that was cut off or damaged.
 
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+
     Raises BadInput where there is no such topic or component, two would have one name, or something else
     is in the place of the output.
     """
@@ -236,6 +245,9 @@ def constrain(
         unit: the topic of the inertial samples; the only one unless given.
         settings: of `ConstraintParameters`, such as {"rolling_hz": 10}.
         recover: read what is whole of a log that was cut off or damaged.
+
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
 
     Raises BadInput where it is not clear which unit is meant, the log has such a topic, nothing is asked
     for, or something else is in the place of the output.

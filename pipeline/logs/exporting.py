@@ -63,6 +63,9 @@ def export(
         topics: which; none stands for all that fit.
         recover: read what is whole of a log that was cut off or damaged.
 
+    Returns:
+        The files that were written, by what is in them, and sentences on what is not.
+
     Raises BadInput where a topic is not there or does not fit, or the place is taken.
     """
     if to not in get_args(To):

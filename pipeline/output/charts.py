@@ -129,7 +129,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """Return the colour of every label; charts that begin with the same labels agree on theirs."""
+        """Return the colour of every label; charts with the same labels `first` agree on theirs."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
@@ -162,6 +162,9 @@ def curve(
         y: (n,), its values at x.
         style: how it is drawn.
         reference: whether it is what others are compared with.
+
+    Returns:
+        The series, for `Panel.series`.
     """
     return Series(label=label, x=_places(x), y=_numbers(y), style=style, reference=reference)
 
@@ -182,6 +185,9 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
         low: (n,), its lower end at x.
         high: (n,), its upper end at x.
         reference: whether it is what others are compared with.
+
+    Returns:
+        The band, for `Panel.bands`.
     """
     return Band(label=label, x=_places(x), low=_numbers(low), high=_numbers(high), reference=reference)
 

@@ -66,6 +66,9 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
         holds: whether what was measured confirms the claim.
         why: as in `Claim`.
 
+    Returns:
+        The claim with its verdict, "confirmed" or "refuted".
+
     >>> judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict
     'confirmed'
     """

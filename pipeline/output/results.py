@@ -44,14 +44,21 @@ MetricValue = float | list[float] | list[float | None] | None
 
 @dataclass
 class Outcome:
-    """Holds what a study found. Metric keys are `estimator.quantity_unit[.case]`.
+    """Holds what a study found.
 
-    `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one lies with
-    95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
-    a hash of the data that went in, `parameters` are those of all estimators, defaults included,
-    `alarms` what makes the metrics doubtful, `causes` why an estimator is inconsistent, where it was
-    diagnosed, `stress` what changes do that should not matter, where it was stressed, `timings` the
-    seconds and messages of each estimator.
+    Attributes:
+        metrics: by `estimator.quantity_unit[.case]`.
+        claims: the statements of the paper, with our verdicts.
+        tables: by name.
+        figures: charts, or pictures of another kind, by name.
+        input_sha256: a hash of the data that went in.
+        parameters: those of all estimators, defaults included.
+        bounds: where a metric lies with 95 % if all is well.
+        intervals: where the true metric lies with 95 %, by the spread over runs.
+        alarms: what makes the metrics doubtful.
+        causes: why an estimator is inconsistent, where it was diagnosed.
+        stress: what changes do that should not matter, where it was stressed.
+        timings: the seconds and messages of each estimator.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -68,7 +75,7 @@ class Outcome:
     timings: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
-        """Keep a metric with its 95 % interval."""
+        """Keep the metric `key`: its `value`, and its 95 % interval from `low` to `high`."""
         self.metrics[key], self.intervals[key] = float(value), (float(low), float(high))
 
 

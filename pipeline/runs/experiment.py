@@ -160,11 +160,14 @@ class Setting:
 
 @dataclass(frozen=True)
 class Study:
-    """Does an experiment's work: a registered study.
+    """Describes a registered study, which does an experiment's work.
 
-    `run` writes its logs and timeline into the setting's folder, and returns what it found. Where it
-    replays by `pipeline.runs.campaigns` alone, `is_campaign` says so: others may work on parts of the
-    runs.
+    Attributes:
+        summary: what it does, in a line.
+        run: (experiment, setting) -> what it found; logs and timeline go to the setting's folder.
+        options: the type of the experiment's `options`.
+        is_campaign: whether it replays by `pipeline.runs.campaigns` alone, so that others may work on
+            parts of the runs.
     """
 
     summary: str
@@ -241,10 +244,7 @@ def read_experiment(name: str) -> Stated:
 
 
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
-    """The experiment that replays logs through estimators as they are.
-
-    Raises BadInput where no estimator is named.
-    """
+    """Return the experiment that replays logs; raises BadInput where no estimator is named."""
     if not labels:
         raise BadInput(f"{logs[0]}: name the estimators to replay it with, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"

@@ -44,6 +44,9 @@ def noise(
             deg/s/sqrt(Hz)"}`.
         taus: also say the Allan deviation at these times, in s.
 
+    Returns:
+        The noise of every column, with 95 % intervals: its terms, and its Allan deviations.
+
     Raises BadInput where a unit moves, the log is too short, a column is constant, stamps go back, too
     many messages are lost, a time is beyond the log's third, or a unit is another quantity's.
     """

@@ -172,7 +172,7 @@ class SensorNoise:
         return Chart(title=title, panels=panels, columns=min(3, len(panels)))
 
     def draw(self, rrd: Path) -> None:
-        """Write the curves to an .rrd file for the viewer."""
+        """Write the curves to the file `rrd` for the viewer."""
         from replay.timeline.drawing.canvas import MUTED, PALETTE
         from replay.timeline.drawing.curves import CurvePanel, save_curves
         from replay.timeline.drawing.plane import Stroke
@@ -196,7 +196,7 @@ class SensorNoise:
         save_curves(f"noise of {self.name}", panels, rrd)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write tables, the curves as figure and timeline, and the numbers as other programs read them.
+        """Write tables, curves, and the numbers as other programs read them to the folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """

@@ -256,7 +256,7 @@ class Stress:
         return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
 
     def draw(self, save: str | Path) -> None:
-        """Write the timeline of the first run, an .rrd file: copies fan out from the estimates.
+        """Write the timeline of the first run to the .rrd file `save`: copies fan out from estimates.
 
         Raises BadInput where the file cannot be written.
         """

@@ -317,7 +317,7 @@ class Tuning:
         return tomli_w.dumps({self.label: values})
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write settings.toml, tables, figures, metrics and a timeline as a result folder.
+        """Write settings.toml, tables, figures, metrics and timeline to the result folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """

@@ -92,6 +92,9 @@ def tune(
         executor: as for `run`.
         on_best: is told of the best values again and again.
 
+    Returns:
+        The parameters with 95 % intervals, and the logs replayed with the values before and after.
+
     Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
     Raises BadInput where there is nothing to search, or no log can be replayed at the start.
 

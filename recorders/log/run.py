@@ -48,7 +48,10 @@ class RunMetadata:
 
     @classmethod
     def from_record(cls, record: dict[str, str], path: object) -> "RunMetadata":
-        """Read the MCAP metadata record back; raises BadInput where damaged or of another format."""
+        """Read the MCAP metadata `record` of the file `path` back.
+
+        Raises BadInput where it is damaged or of another format.
+        """
         try:
             written_in = _stated({"format": "1", **record}, "format", int)
             check_format(path, written_in, FORMAT)

@@ -65,7 +65,7 @@ class Stream:
         return [name for name in self.metadata.get("components", "").split(",") if name]
 
     def times(self, clock: Clock) -> NDArray[np.int64]:
-        """The stamps (n,) of one of the two clocks, in ns."""
+        """Return the stamps (n,) of `clock`, "publish_time" or "log_time", in ns."""
         return self.publish_time_ns if clock == "publish_time" else self.log_time_ns
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> "Stream":
@@ -145,6 +145,9 @@ def make_stream(
         sensor_time_ns: (n,), the stamp by the clock of the sensor.
         metadata: what the channel states, as text.
         columns: by field, (n,), or (n, width) for a vector.
+
+    Returns:
+        The stream, with its messages in the order given.
 
     >>> from recorders.log import schemas
     >>> make_stream("/gyro", schemas.RANGE, [0, 10], target_id=[1, 1], range_m=[5.0])

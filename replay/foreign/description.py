@@ -34,6 +34,8 @@ class ForeignParameters(Parameters):
 
 
 class _Part(BaseModel):
+    """Refuses unknown names, NaN and infinity in a part of a description."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
@@ -223,4 +225,6 @@ _TAKEN = {"kind", "path", "command", "in_process", "topics", "truth", "model_con
 
 
 class _Described(Parameters):
+    """Holds what a program answers when it is asked to describe itself."""
+
     description: Description

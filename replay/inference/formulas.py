@@ -29,6 +29,9 @@ def formulas(model: str | Model) -> str:
     Args:
         model: a registered one's name (`models` has them), or a model.
 
+    Returns:
+        The text, a paragraph for each function.
+
     Raises BadInput for an unknown name, or a function that cannot be traced.
 
     >>> print(formulas("robot").partition("v3")[0].strip())

@@ -51,6 +51,8 @@ _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
 
 class _Timings(Parameters):
+    """Holds what timings.json says: by estimator, its seconds and messages."""
+
     of: dict[str, dict[str, float]]
 
 

@@ -66,7 +66,7 @@ class Options(Parameters):
 
 
 class Waves(NamedTuple):
-    """sin(K x + phases): vectors K (m, n), phases (m,)."""
+    """Describes the function sin(K x + phases): vectors K (m, n), phases (m,)."""
 
     vectors: Floats
     phases: Floats

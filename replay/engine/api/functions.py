@@ -93,6 +93,9 @@ def recursive(
         allocates: whether `follow` makes arrays, see
             `replay.engine.compiling.compile.compile_over_runs`.
 
+    Returns:
+        The estimator, which `replay` takes.
+
     The shortest range so far, of everything that was seen:
 
     >>> class Shortest(NamedTuple):
@@ -107,7 +110,6 @@ def recursive(
     >>> nearest = recursive(
     ...     "shortest range so far",
     ...     streams={"/range": schemas.RANGE},
-    ...     static={},
     ...     components={"range_m": "linear"},
     ...     start=start,
     ...     follow=follow,
@@ -232,12 +234,26 @@ def batch(
 ) -> Estimator[ParametersType]:
     """Make an estimator that solves whole streams.
 
-    Args as for `recursive`, and:
+    Args:
+        summary: what it is, in one line.
+        parameters: their type; without one there are none.
+        streams: the topics of measurements, within the span that is replayed, with their schemas.
+        static: the topics that are read whole, such as a map or a prior.
+        find: as for `recursive`.
+        requirements: as for `recursive`.
+        variant: as for `recursive`.
+        components: the estimate's components by name, with their kinds.
+        truth: the topic with the truth of what is estimated.
+        measured: the components of the innovations, where `solve` gives them.
+        optional: which of `streams` and `static` a log may lack.
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
         solve: solve(given) gets the streams and static topics of all runs, by the names asked for;
             `each_run` makes it of a function of one run. Where the outputs are other than Gaussian
             estimates there are no `components`, and it returns the output streams, whose topics are
             /estimates/ + `Given.name` and more.
+
+    Returns:
+        The estimator, which `replay` takes.
 
     The mean of all ranges:
 
@@ -248,7 +264,6 @@ def batch(
     >>> average = batch(
     ...     "mean range",
     ...     streams={"/range": schemas.RANGE},
-    ...     static={},
     ...     components={"range_m": "linear"},
     ...     solve=each_run(mean_range),
     ... )
@@ -290,13 +305,16 @@ def batch(
 def each_run(
     solve: Callable[[OneRun, ParametersType], Estimates],
 ) -> Callable[[Given[ParametersType]], Solved]:
-    """Solve run by run, for `batch`: solve(streams, parameters) gets a run's streams by name.
+    """Make a function that solves run by run, for `batch`, of one that solves a run.
 
-    They know more of the run: `OneRun.prior`, `stated` and a `generator`. Where `solve` raises, that
-    run has failed; where all do, it is the input that is bad.
+    Where `solve` raises, that run has failed; where all do, it is the input that is bad.
 
     Args:
-        solve: (streams, parameters) -> the estimates of a run.
+        solve: (streams, parameters) -> the estimates of a run. The streams go by name, and know more
+            of the run: `OneRun.prior`, `stated` and a `generator`.
+
+    Returns:
+        The function, for the argument `solve` of `batch`.
     """
 
     def solve_all(given: Given[ParametersType]) -> Solved:

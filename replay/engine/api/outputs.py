@@ -79,9 +79,13 @@ class Diagnostics(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Holds innovations of a batch's measurements: stamps (n,), (n, m) with covariances (n, m, m).
+    """Holds innovations of a batch's measurements.
 
-    `target` (n,) is what each was about; 0 unless given.
+    Attributes:
+        time_ns: (n,), the stamps.
+        innovation: (n, m), measured minus predicted.
+        covariance: (n, m, m), those of the innovations.
+        target: (n,), what each was about; 0 unless given.
     """
 
     time_ns: Integers

@@ -38,7 +38,7 @@ class Vectors(NamedTuple):
     sigma: str = ""
 
     def complaint(self, topic: str) -> str:
-        """Explain why a message was not used; "" where there is no covariance that could be missing."""
+        """Say why messages of `topic` were not used; "" where no covariance could be missing."""
         mend = f"; give --set {self.sigma}=..." if self.sigma else ""
         return f"topic {topic}: {self.covariance} is missing{mend}" if self.covariance else ""
 

@@ -1,7 +1,6 @@
 """Checks that a model is what it declares, by trying its functions: for the tests of its author.
 
-`check_model` tries a model's functions at random states: derivatives, what is declared linear or an
-angle, numbers of components, variances. What it finds is one sentence with the function's file and line.
+What `check_model` finds at random states is one sentence with the function's file and line.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,13 +70,16 @@ def check_model(
     states: ArrayLike | None = None,
     seed: int = 0,
 ) -> "Checked":
-    """Check all functions of a model against what it declares; returns what was checked, in sentences.
+    """Check all functions of a model against what it declares.
 
     Args:
         model: the model.
         parameters: their values; one that is neither given nor has a default is 1.
         states: (n, components) at which to try; random ones of order one unless given.
         seed: of the random states, controls and points of a map.
+
+    Returns:
+        Sentences on what was checked, and on what was not.
 
     Raises AssertionError, with one sentence, where a function cannot be traced, its derivatives differ
     from central differences or from those written by hand, a number of components is wrong, what is

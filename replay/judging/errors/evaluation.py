@@ -59,8 +59,8 @@ class Errors:
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
-        components: names of the d components of the tangent space; kinds: "linear", "angle" or
-            "rotation" (about an axis of the body) each.
+        components: names of the d components of the tangent space.
+        kinds: "linear", "angle" or "rotation" (about an axis of the body) each.
         run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
         elapsed_s: (n,) time since the run's epoch.
         error: (n, d) estimate - truth.

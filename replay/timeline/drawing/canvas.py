@@ -76,11 +76,11 @@ class Scene:
         return sorted(found, key=_natural) or [""]
 
     def colour(self, estimator: str) -> Colour:
-        """Return the one colour of an estimator, everywhere."""
+        """Return the one colour that `estimator` has everywhere."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
 
     def outputs_of(self, case: str, schema: Schema) -> list[tuple[str, Stream]]:
-        """Return the non-empty output streams of a case that have this schema, with their estimators."""
+        """Return the non-empty output streams of `case` with this `schema`, and their estimators."""
         return [
             (split_topic(topic)[0], stream)
             for topic, stream in self.outputs.items()
@@ -90,16 +90,16 @@ class Scene:
         ]
 
     def errors_of(self, case: str) -> list[Errors]:
-        """Return the non-empty errors of a case."""
+        """Return the non-empty errors of `case`."""
         return [errors for errors in self.errors if errors.case == case and len(errors.error)]
 
     def truths_of(self, case: str) -> list[Stream]:
-        """Return the non-empty truth streams of a case."""
+        """Return the non-empty truth streams of `case`."""
         truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
         return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
-        """Return the run's sensor topics below a case, and those that are below none; see `unread`."""
+        """Return the run's sensor topics below `case`, and those below none; see `unread`."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
         return [
@@ -120,7 +120,7 @@ class Scene:
         return found
 
     def read(self, topic: str) -> Stream:
-        """Read one of the run's topics, whole."""
+        """Read all of the run's topic `topic`."""
         return self.source.read([topic])[topic]
 
     @property
@@ -191,7 +191,13 @@ class Canvas:
     dates: Dates | None = None
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
-        """Send the rows of one entity, all at once."""
+        """Send all rows of an entity at once.
+
+        Args:
+            entity: the path.
+            time_ns: (n,), the stamps.
+            columns: of Rerun, with n rows.
+        """
         if len(time_ns) == 0 or self.is_still:
             return
         step = np.searchsorted(self.steps_ns, time_ns, side="right") - 1
@@ -204,7 +210,7 @@ class Canvas:
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
     def fix(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log what holds at all times, such as a style."""
+        """Log `what` holds of `entity` at all times, such as a style."""
         self.recording.log(escaped(entity), *what, static=True, strict=True)
 
 
