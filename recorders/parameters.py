@@ -20,7 +20,7 @@ _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers tha
 
 
 class Parameters(BaseModel):
-    """Base of all parameter types: immutable, no unknown names, no NaN and no infinity.
+    """Is the base of all parameter types: immutable, no unknown names, no NaN and no infinity.
 
     A default is of the declared type as what is given is: `sigma_m: float = 1` is 1.0.
 

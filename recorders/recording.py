@@ -63,7 +63,7 @@ def named_generator(
 
 @dataclass(frozen=True)
 class Recording:
-    """Streams in memory, before they are a log: one for every topic.
+    """Holds streams in memory, before they are a log: one for every topic.
 
     Attributes:
         streams: one for every topic.
@@ -85,7 +85,7 @@ class Recording:
 
 @dataclass
 class Blocks:
-    """Streams that come block by block, so that they may be more than memory holds.
+    """Yields streams block by block, so that they may be more than memory holds.
 
     Attributes:
         blocks: the streams of each; a topic may come again in every block.

@@ -29,7 +29,7 @@ FARTHEST_M = 1e100
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of a body along its way, in the order of time.
+    """Holds poses of a body along its way, in the order of time.
 
     Attributes:
         name: what to call it in a message.
@@ -76,7 +76,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """What a line holds: a word for it, how many numbers at least and at most, and which is the time."""
+    """Describes what a line holds: a word for it, its least and most numbers, and which is the time."""
 
     columns: str
     least: int

@@ -44,7 +44,7 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*
 
 
 class _Setting(NamedTuple):
-    """One setting of a topic: as it was written, and its parts."""
+    """Holds one setting of a topic: as it was written, and its parts."""
 
     key: str
     what: str

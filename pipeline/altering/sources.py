@@ -95,7 +95,7 @@ def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @dataclass(frozen=True, repr=False)
 class AlteredRecording(MemorySource):
-    """A recording in memory whose streams are altered; `before` is what it was."""
+    """Represents a recording in memory whose streams are altered; `before` is what it was."""
 
     before: MemorySource = field(kw_only=True)
     alterations: Settings = field(kw_only=True)
@@ -120,7 +120,7 @@ def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
 
 @dataclass(frozen=True, repr=False)
 class AlteredLog(LogSource):
-    """A log file whose topics are altered as they are read."""
+    """Represents a log file whose topics are altered as they are read."""
 
     alterations: Settings = field(default_factory=dict)
 

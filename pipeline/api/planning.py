@@ -30,7 +30,7 @@ Named = str | Estimator[Any] | Mapping[str, Kind]
 
 @dataclass(frozen=True)
 class Plan:
-    """A replay that can begin.
+    """Holds a replay that can begin.
 
     Attributes:
         sources: the spans of the runs.

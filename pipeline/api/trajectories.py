@@ -201,7 +201,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class ComparedLogs:
-    """The estimates of logs as trajectories.
+    """Holds the estimates of logs as trajectories, compared with the truth.
 
     Attributes:
         estimates: of every run, aligned with its truth.

@@ -68,7 +68,7 @@ MOTIONS: dict[str, Motion] = {
 
 
 class Steps(NamedTuple):
-    """The times between messages of wheels, fixes and compass, in s."""
+    """States the times between messages of wheels, fixes and compass, in s."""
 
     odometry_s: float = 0.1
     fix_s: float = 0.5
@@ -79,7 +79,7 @@ STEPS = Steps()
 
 
 class Measured(NamedTuple):
-    """What the car's log has, each with its stamps: odometry (n, 2), fixes (m, 2), compass."""
+    """Holds what the car's log has, each with its stamps: odometry (n, 2), fixes (m, 2), compass."""
 
     odometry_s: Floats
     odometry: Floats

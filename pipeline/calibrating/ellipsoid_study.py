@@ -34,7 +34,7 @@ STEP_S, HELD_S, MOVED_S, POSITIONS = 0.02, 2.0, 1.0, 40
 
 
 class EllipsoidOptions(Parameters):
-    """Which units are calibrated.
+    """States which units are calibrated.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.

@@ -25,7 +25,7 @@ NOISE = {"forward_noise_density": 0.05 * TRUTH[0], "turn_noise_density": 0.01 * 
 
 
 class CalibrationOptions(Parameters):
-    """Which cars are calibrated.
+    """States which cars are calibrated.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.

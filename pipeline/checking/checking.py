@@ -23,7 +23,7 @@ Runs = Mapping[str, LogSource | MemorySource]
 
 @dataclass(frozen=True)
 class Checked:
-    """A replay against its golden.
+    """Holds how a replay compares with its golden.
 
     Attributes:
         fields: how many fields of the golden's streams and metrics were compared, by run and topic.

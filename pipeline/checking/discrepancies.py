@@ -26,7 +26,7 @@ from replay.judging.errors.evaluation import split_topic
 
 
 class Discrepancy(NamedTuple):
-    """A part of a replay that is not the golden's.
+    """Describes a part of a replay that is not the golden's.
 
     Attributes:
         run: whose.

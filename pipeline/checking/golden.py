@@ -35,7 +35,7 @@ Outputs = Mapping[str, Stream]
 
 
 class Tolerance(NamedTuple):
-    """A difference that is allowed: how large relative to a column's size, and why."""
+    """States by how much a column may differ, relative to its size, and why."""
 
     relative: float
     reason: str = ""

@@ -52,7 +52,7 @@ class _Part(BaseModel):
 
 
 class _Column(_Part):
-    """Some rows of a column, and over all rows how many are missing, their sum and that of squares."""
+    """Holds some rows of a column, and over all rows how many are missing, their sums and squares."""
 
     kept: Numbers
     missing: Numbers

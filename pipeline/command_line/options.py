@@ -24,7 +24,7 @@ class Output(click.Path):
 
 
 class OutputFile(Output):
-    """A file to write: a new one, or a regular one that is replaced; never a device or a folder."""
+    """Accepts a file to write: a new one, or a regular one to replace; never a device or a folder."""
 
     def __init__(self, suffix: str) -> None:
         super().__init__(suffix, dir_okay=False)
@@ -38,7 +38,7 @@ class OutputFile(Output):
 
 
 class Seconds(click.ParamType):
-    """A time in seconds that fits the stamps of a log."""
+    """Reads a time in seconds that fits the stamps of a log."""
 
     name = "seconds"
 
@@ -56,7 +56,7 @@ class Seconds(click.ParamType):
 
 
 class TimeOffset(Seconds):
-    """A time in seconds, or the word that asks to find it."""
+    """Reads a time in seconds, or the word that asks to find it."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """The number or the word."""
@@ -64,7 +64,7 @@ class TimeOffset(Seconds):
 
 
 class Place(click.ParamType):
-    """A place on the earth: latitude and longitude in deg, and perhaps the height in m."""
+    """Reads a place on the earth: latitude and longitude in deg, and perhaps the height in m."""
 
     name = "place"
 

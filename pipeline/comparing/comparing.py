@@ -51,7 +51,7 @@ SPANS = 32
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Differences:
-    """Estimators compared: the first of each group with every other one.
+    """Holds how estimators differ: the first of each group against every other one.
 
     Attributes:
         groups: the candidates.

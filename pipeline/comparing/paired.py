@@ -14,7 +14,7 @@ DECIDED = ("worse", "better", "higher", "lower")
 
 
 class Paired(NamedTuple):
-    """A metric of two candidates.
+    """Holds a metric of two candidates, run by run, with the verdict on it.
 
     Attributes:
         first, second: the candidates' names.

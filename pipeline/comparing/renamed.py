@@ -10,7 +10,7 @@ from replay.engine.streams.sources import Source
 
 @dataclass(frozen=True)
 class Renamed:
-    """The estimates of one label alone, under another name: a source that is read as it is needed."""
+    """Represents the estimates of one label under another name, as a source that is read when needed."""
 
     estimates: Source
     label: str

@@ -49,7 +49,7 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
     begun: list[Any] = []
 
     class Listening(Filter):
-        """A filter that keeps both."""
+        """Filters, and keeps what it is handed and what it gives."""
 
         def filtered(self, state: Any, events: Any) -> Any:
             found = super().filtered(state, events)

@@ -30,7 +30,7 @@ LEADING = 10  # of the likeliest faults: each is tried beside all others
 
 
 class Told(NamedTuple):
-    """A number that is told: the component or parameter it is of, and its 95 % interval."""
+    """Holds a number of a cause: the component or parameter it is of, and its 95 % interval."""
 
     part: str
     value: float
@@ -39,7 +39,7 @@ class Told(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """A hypothesis with the number that gains most.
+    """Holds a hypothesis with the number that gains most.
 
     Attributes:
         hypothesis: what may be wrong.
@@ -88,7 +88,7 @@ class Cause(NamedTuple):
 
 
 class Tried(NamedTuple):
-    """A hypothesis that was tried on the log as it is, and the greatest gain that was found."""
+    """Holds a hypothesis that was tried on the log as it is, and the greatest gain that was found."""
 
     hypothesis: Hypothesis
     at: Peak
@@ -198,7 +198,7 @@ def _likeliest(
 
 
 class _Supposed(NamedTuple):
-    """A fault with a number."""
+    """Holds a fault with a number."""
 
     of: Hypothesis
     value: Number

@@ -334,7 +334,7 @@ def _of_recorded(
 
 
 class _Followed(NamedTuple):
-    """A log that an estimator can follow, how it did, what had to be mended first, and a note on it."""
+    """Holds a log that an estimator can follow, how it did, what was mended first, and a note on it."""
 
     source: LogSource | MemorySource
     done: Replay

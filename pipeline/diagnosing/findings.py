@@ -41,7 +41,7 @@ FLOOR_STEP = 1e-4  # relative, from the least variance to the next
 
 
 class Finding(NamedTuple):
-    """Something unusual: its kind, a topic, a sentence with its evidence, when it began, its mend."""
+    """Describes something unusual: its kind, topic, a sentence with evidence, its begin, its mend."""
 
     kind: Kind
     topic: str

@@ -40,7 +40,7 @@ LEAST_SCORED = 0.5  # of the measurements: a trial that scores fewer is of anoth
 
 
 class Trial(NamedTuple):
-    """A run as it may be, and the estimator's settings as they may be.
+    """Holds a run as it may be, and the estimator's settings as they may be.
 
     `stretched` is by topic the logarithm of how many times larger the volumes are in which a message's
     measurement lies, compared with the log's: a density of numbers in other units is another one.
@@ -52,7 +52,7 @@ class Trial(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """The part of a trial that a filter can score.
+    """Holds the part of a trial that a filter can score.
 
     Attributes:
         source: its messages.
@@ -71,7 +71,7 @@ class Scored(NamedTuple):
 
 @dataclass
 class Likelihood:
-    """The log-likelihood of trials that have the measurements of one run.
+    """Computes the log-likelihood of trials that have the measurements of one run.
 
     Trials of equal settings are replayed together, as the runs of an ensemble.
 

@@ -22,7 +22,7 @@ MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
 
 
 class Outputs(Mapping[str, Stream]):
-    """The outputs of a replay that have a schema, by topic: each is read anew when it is asked for.
+    """Maps topics to the outputs of a replay that have a schema: each is read anew when asked for.
 
     Of a long log they are much.
     """
@@ -68,7 +68,7 @@ def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -
 
 
 class Portion(NamedTuple):
-    """What the estimator reads of a log, in memory; `end_ns` is where it ends, None for all of it."""
+    """Holds what the estimator reads of a log, in memory, until `end_ns`; None stands for all of it."""
 
     source: MemorySource
     end_ns: int | None

@@ -30,7 +30,7 @@ NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
 
 
 class Peak(NamedTuple):
-    """The value at which the gain of a fault is greatest, and that gain.
+    """Holds the value at which the gain of a fault is greatest, and that gain.
 
     `is_special` says that the value was not searched: it is one of the fault's special ones.
     """

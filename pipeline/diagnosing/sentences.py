@@ -27,7 +27,7 @@ Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over th
 
 
 class Sentence(NamedTuple):
-    """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
+    """Says what is wrong, and what to try; `topic` is the topic or parameter that it is of.
 
     `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
     and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.

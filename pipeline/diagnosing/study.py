@@ -45,7 +45,7 @@ CLEAN_RUN = "none"
 
 
 class Options(Parameters):
-    """What is diagnosed beside the scenarios.
+    """States what is diagnosed beside the scenarios.
 
     Attributes:
         battery_seed: the first seed of the battery, see `pipeline.diagnosing.battery.battery`.
@@ -57,7 +57,7 @@ class Options(Parameters):
 
 
 class Fault(NamedTuple):
-    """A fault, and what a diagnosis should say.
+    """Describes a fault, and what a diagnosis should say.
 
     Attributes:
         kind, topic: what is named; any topic where that is empty.
@@ -80,7 +80,7 @@ class Fault(NamedTuple):
 
 
 class Scenario(NamedTuple):
-    """What is recorded, the estimator, and the faults by name."""
+    """States what is recorded, the estimator, and the faults by name."""
 
     recorder: str
     parameters: Mapping[str, Any]

@@ -22,14 +22,14 @@ LINES = 400  # a curve has no more points than these, so that it follows the sli
 
 
 class Path(NamedTuple):
-    """Positions in the plane (n, 2), at times (n,) since the epoch."""
+    """Holds positions in the plane (n, 2), at times (n,) since the epoch."""
 
     time_s: Floats
     points: Floats
 
 
 class Nis(NamedTuple):
-    """Mean NIS per measured component of each span of time (n,), and where 95 % of these lie."""
+    """Holds the mean NIS per component of each span of time (n,), and where 95 % of these lie."""
 
     time_s: Floats
     mean: Floats
@@ -44,7 +44,7 @@ class Nis(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """What is drawn of one thing that is estimated, such as `robot1`.
+    """Holds the curves of one thing that is estimated, such as `robot1`.
 
     Attributes:
         name: of it; may be empty.

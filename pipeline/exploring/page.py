@@ -44,7 +44,7 @@ SLOW_S = 1.0  # a replay that takes longer is said to
 
 
 class Page:
-    """One page that looks at a session.
+    """Builds one page that looks at a session.
 
     Attributes:
         session: what it looks at.

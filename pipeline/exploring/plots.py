@@ -42,7 +42,7 @@ Data = Mapping[str, Any]
 
 @dataclass
 class Plot:
-    """A figure with what changes in it.
+    """Holds a figure with what changes in it.
 
     Attributes:
         figure: as Bokeh draws it.

@@ -37,7 +37,7 @@ MOST = 2  # filters side by side
 
 @dataclass(frozen=True)
 class Played:
-    """One filter's replay with some settings.
+    """Holds one filter's replay with some settings.
 
     Attributes:
         label: the filter's.

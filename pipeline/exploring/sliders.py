@@ -29,7 +29,7 @@ MOTION, GATE = "motion", "gate"
 
 
 class Slider(NamedTuple):
-    """A parameter that can be dragged.
+    """Describes a parameter that can be dragged.
 
     Attributes:
         name: of the parameter.

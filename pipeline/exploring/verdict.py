@@ -14,7 +14,7 @@ Level = Literal["good", "doubtful", "failed"]
 
 
 class Verdict(NamedTuple):
-    """A judgement in words.
+    """States a judgement in words.
 
     Attributes:
         level: how bad it is.

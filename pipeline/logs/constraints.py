@@ -13,7 +13,7 @@ from recorders.parameters import Parameters
 
 
 class ConstraintParameters(Parameters):
-    """What is told of a body, and how it is known that it stands.
+    """States how often constraints on a body are told, and how it is known that it stands.
 
     Attributes:
         standing_hz: how many times a second it is told whether the body stands; 0 leaves it out.

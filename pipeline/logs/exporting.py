@@ -36,7 +36,7 @@ Write = Callable[[Stream], None]
 
 
 class Exported(NamedTuple):
-    """The files that were written, with the topics in them, and sentences on what is not in them."""
+    """Holds the files that were written, by topic, and sentences on what is not in them."""
 
     files: dict[str, Path]
     notes: list[str]
@@ -64,7 +64,7 @@ def export(
         recover: read what is whole of a log that was cut off or damaged.
 
     Returns:
-        The files that were written, by what is in them, and sentences on what is not.
+        The files that were written, by topic, and sentences on what is not in them.
 
     Raises BadInput where a topic is not there or does not fit, or the place is taken.
     """

@@ -23,7 +23,7 @@ UNKNOWN = "unknown"
 
 
 class Changed(NamedTuple):
-    """The log that was written, how many messages each topic has there, and what else is to be said."""
+    """Holds the log that was written, how many messages each topic has there, and what else to say."""
 
     path: Path
     messages: dict[str, int]

@@ -66,7 +66,7 @@ class Drawn(Parameters):
 
 
 class Series(Drawn):
-    """Values y over x."""
+    """Holds values y over x."""
 
     y: Numbers
     style: Style = "line"
@@ -78,7 +78,7 @@ class Series(Drawn):
 
 
 class Band(Drawn):
-    """A range over x, such as where a value lies with 95 % if all is well."""
+    """Holds a range over x, such as where a value lies with 95 % if all is well."""
 
     low: Numbers
     high: Numbers
@@ -95,7 +95,7 @@ def _check_lengths(*columns: Sequence[Any]) -> None:
 
 
 class Panel(Parameters):
-    """Series and bands over two axes; a `plane` has one scale on both.
+    """Draws series and bands over two axes; a `plane` has one scale on both.
 
     Attributes:
         x, y: the axes.
@@ -114,7 +114,7 @@ class Panel(Parameters):
 
 
 class Chart(Parameters):
-    """Panels in rows of so many columns, with one legend unless their titles say what is drawn.
+    """Arranges panels in rows, with one legend unless their titles say what is drawn.
 
     Attributes:
         panels: row by row.

@@ -85,7 +85,7 @@ def known(claim: Claim) -> Claim:
 
 
 class StatedClaim(Parameters):
-    """A claim as an experiment's file says it.
+    """States a claim as an experiment's file has it.
 
     In texts, `{EXPRESSION:FORMAT}` is a number; everywhere `$NAME` is what `each` says.
 

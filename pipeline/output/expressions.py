@@ -36,7 +36,7 @@ from recorders.errors import BadInput, choices
 
 
 class NoMetric(Exception):
-    """A metric that an expression names is not in the result."""
+    """Says that a metric which an expression names is not in the result."""
 
 
 class Values(NamedTuple):

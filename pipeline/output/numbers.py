@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 
 
 class Number(NamedTuple):
-    """A number and where it lies with 95 %; the ends are the number itself where it has no interval."""
+    """Holds a number and where it lies with 95 %; without interval both ends are the number itself."""
 
     value: float
     low: float

@@ -22,7 +22,7 @@ CHANGES, CHANGED_BY = "changes", "changed by"
 
 
 class Kind(NamedTuple):
-    """A kind of file that a command writes: its suffix, what it is, and how it is known."""
+    """Describes a kind of file that a command writes: its suffix, what it is, and how it is known."""
 
     suffix: str
     what: str

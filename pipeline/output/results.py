@@ -135,7 +135,7 @@ def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> d
 
 
 class Measured(NamedTuple):
-    """A metric's value or what is said of it, and where it lies with 95 % if all is well."""
+    """Holds a metric's value, or the word for it, and where it lies with 95 % if all is well."""
 
     value: MetricValue | str = None
     bounds: Bounds | None = None
@@ -151,7 +151,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one case, by quantity and then by estimator; all estimators in one order."""
+    """Holds the metrics of one case, by quantity and then estimator; all estimators in one order."""
 
     case: str
     estimators: list[str]

@@ -13,7 +13,7 @@ MISSING, MINUS, TIMES = "\u2013", "\u2212", "\u00d7"
 
 
 class Quantity(NamedTuple):
-    """A quantity in words.
+    """Names a quantity in words.
 
     Attributes:
         name: what a person calls it.

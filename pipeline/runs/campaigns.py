@@ -39,7 +39,7 @@ _LOG = logging.getLogger("fuselog")
 
 @dataclass(frozen=True)
 class Cell:
-    """The runs from `first` to `end` of an experiment.
+    """Holds the runs from `first` to `end` of an experiment.
 
     Attributes:
         experiment: all of it; nothing that decides lies in another file, but for its logs.
@@ -100,7 +100,7 @@ class Cell:
 
 
 class Sent(NamedTuple):
-    """A cell for a machine with other files: logs go there, and what is written comes back, as bytes.
+    """Sends a cell to a machine with other files: logs go there, what is written comes back, as bytes.
 
     Attributes:
         cell: what there is to do.

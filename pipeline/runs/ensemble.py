@@ -49,7 +49,7 @@ def no_progress(items: Iterable[Any], title: object, total: int | None) -> Itera
 
 @dataclass(frozen=True)
 class Part:
-    """Some runs of an ensemble, replayed together.
+    """Holds some runs of an ensemble, replayed together.
 
     Attributes:
         sources: the runs.

@@ -108,7 +108,7 @@ def hash_files(paths: Sequence[Path]) -> str:
 
 
 class ErrorTables:
-    """Every error of every estimate, on request: a Parquet file per estimator and case.
+    """Writes every error of every estimate: a Parquet file per estimator and case.
 
     They are written block by block, as they come; use it as a context.
     """

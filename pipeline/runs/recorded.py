@@ -28,7 +28,7 @@ KEPT_BYTES = 8 * TIME_BINS
 
 @dataclass(frozen=True)
 class Replayed:
-    """An ensemble in memory, what the estimators made of it, and how that compares with the truth."""
+    """Holds an ensemble in memory, what estimators made of it, and how that compares with the truth."""
 
     sources: Sequence[MemorySource]
     outputs: dict[str, Ragged]

@@ -47,7 +47,7 @@ DRAWN = ("position_rmse_m", "orientation_rmse_deg", "nees", "position_nees", "ni
 
 
 class Over(NamedTuple):
-    """A parameter that is swept.
+    """Describes a parameter that is swept.
 
     Attributes:
         key: as `--set` has it.

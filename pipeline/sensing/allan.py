@@ -21,7 +21,7 @@ _A_WINDOW = 1000  # differences a window then, which are as good as all
 
 
 class Curve(NamedTuple):
-    """An Allan deviation: times (n,), deviations (n,), and how many differences (n,) there are."""
+    """Holds an Allan deviation: times (n,), deviations (n,), and how many differences (n,) there are."""
 
     taus_s: Floats
     deviations: Floats

@@ -32,7 +32,7 @@ WORDS = {
 
 
 class Fit(NamedTuple):
-    """The likeliest terms of one kind.
+    """Holds the likeliest terms of one kind.
 
     Attributes:
         free: the names of the terms' numbers.

@@ -19,7 +19,7 @@ Integers = NDArray[np.int64]
 
 
 class Samples(NamedTuple):
-    """Samples of one column, as the likelihood takes them.
+    """Holds the samples of one column, as the likelihood takes them.
 
     Attributes:
         values: (n, 1 + regressors) the samples, then what they may depend on.
@@ -33,7 +33,7 @@ class Samples(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """What the samples say of some terms.
+    """Computes what the samples say of some terms.
 
     Attributes:
         log_likelihood: with these terms.

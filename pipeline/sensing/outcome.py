@@ -32,7 +32,7 @@ _TERMS = {  # what a table says of each number: the name of its field, and its u
 
 
 class Number(NamedTuple):
-    """A number of a noise model and its 95 % interval; of a walk that was not found the value is 0."""
+    """Holds a number of a noise model and its 95 % interval; 0 for a walk that was not found."""
 
     value: float
     low: float

@@ -27,7 +27,7 @@ _DRIFT_SAMPLES = 4096
 
 
 class Grid(NamedTuple):
-    """The stamps of a topic as a grid: its step, and which of its places (n,) the messages have."""
+    """Lays the stamps of a topic on a grid: its step, and which of its places (n,) the messages have."""
 
     step_s: float
     places: Integers
@@ -45,7 +45,7 @@ class Grid(NamedTuple):
 
 
 class Drift(NamedTuple):
-    """What a column drifts by: a rate, and an offset that decays; and what they gain in likelihood."""
+    """Holds what a column drifts by, a rate and an offset that decays, and their gain in likelihood."""
 
     rate: float
     rate_sigma: float

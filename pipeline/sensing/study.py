@@ -32,7 +32,7 @@ QUANTITIES = ("white", "walk", *(f"deviation-{tau_s:g}s" for tau_s in TAUS_S))
 
 
 class NoiseOptions(Parameters):
-    """Which units are looked at.
+    """States which units are looked at.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.

@@ -15,7 +15,7 @@ _DECAYED = 1e-7  # of the variance: what is left of an autocovariance counts by 
 
 
 class Terms(NamedTuple):
-    """The noise of one column; a term that is zero is not there."""
+    """Holds the noise of one column; a term that is zero is not there."""
 
     white: float = 0.0
     walk: float = 0.0

@@ -25,7 +25,7 @@ from replay.foreign.naming import allowed
 
 
 class _Part(NamedTuple):
-    """Runs of an experiment that are stressed together.
+    """Holds runs of an experiment that are stressed together.
 
     Attributes:
         experiment: all of it.

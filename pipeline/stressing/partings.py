@@ -23,7 +23,7 @@ AXES = ("x_m", "y_m", "z_m")
 
 
 class Parting(NamedTuple):
-    """Two replays of one estimate.
+    """Holds how far two replays of one estimate are apart.
 
     Attributes:
         topic: the estimate's.
@@ -134,7 +134,7 @@ def _norm(apart: Floats, is_in: Sequence[bool]) -> Floats:
 
 
 class Undetermined(NamedTuple):
-    """A direction of the state that the measurements do not determine.
+    """Holds a direction of the state that the measurements do not determine.
 
     Attributes:
         components: their names, all of one unit.

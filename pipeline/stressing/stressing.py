@@ -132,7 +132,7 @@ def _in_memory(source: LogSource | MemorySource) -> MemorySource:
 
 @dataclass(frozen=True)
 class _Replayed:
-    """Runs and copies that one estimator replayed.
+    """Holds runs and copies that one estimator replayed.
 
     Attributes:
         sources: runs and copies.

@@ -29,7 +29,7 @@ SHRINKS = 1.5  # of a sigma: noise per prediction does not shrink with the shift
 
 
 class Tried(NamedTuple):
-    """One change to one run, as replayed.
+    """Holds what one change did to one run.
 
     Attributes:
         name: a key of `CHANGES`.
@@ -60,7 +60,7 @@ class Tried(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stressed:
-    """One estimator over one run, stressed.
+    """Holds what all changes did to one run, by one estimator.
 
     Attributes:
         source: the run.
@@ -234,7 +234,7 @@ def _largest(values: Any) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stress:
-    """Estimators over runs, stressed: one of `Stressed` for each run and estimator.
+    """Holds what changes did to runs, by estimators: one of `Stressed` for each run and estimator.
 
     Attributes:
         stressed: one for each run and estimator.

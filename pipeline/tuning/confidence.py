@@ -160,7 +160,7 @@ def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
 
 
 class Profile(NamedTuple):
-    """The cost along one parameter, all others following at their best to second order.
+    """Holds the cost along one parameter, all others at their best to second order.
 
     Attributes:
         name: of the parameter.

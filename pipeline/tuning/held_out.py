@@ -20,7 +20,7 @@ from replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
-    """What is searched for, and which vehicles tune and judge it.
+    """States what is searched for, and which vehicles tune and judge it.
 
     Attributes:
         free: names of the parameters that are searched for.

@@ -43,7 +43,7 @@ INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
 class Run(NamedTuple):
-    """A log in memory as it is replayed again and again.
+    """Holds a log in memory as it is replayed again and again.
 
     Attributes:
         ensemble: it alone.
@@ -166,7 +166,7 @@ CRITERIA: dict[By, Criterion] = {
 
 
 class Best(NamedTuple):
-    """The best point (k,) of a search so far, what it costs, and how many points were tried."""
+    """Holds the best point (k,) of a search so far, its cost, and how many points were tried."""
 
     evaluations: int
     point: Floats
@@ -179,7 +179,7 @@ def silent(_: Best) -> None:
 
 @dataclass
 class Objective:
-    """The cost of parameter values over logs.
+    """Computes the cost of parameter values over logs.
 
     Attributes:
         label, settings: the estimator, and its parameters but for those that are searched for.

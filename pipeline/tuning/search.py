@@ -31,7 +31,7 @@ MOST_GRID_POINTS = 10_000
 
 
 class Free(NamedTuple):
-    """A parameter that is searched for: where from, and between what bounds.
+    """Describes a parameter that is searched for: where from, and between what bounds.
 
     Where it is positive, its logarithm is searched for. `is_assumed` says that neither a setting nor the
     log states the start. `useful` is the standard error that a calibration wants; zero of what is none.

@@ -26,7 +26,7 @@ COVERAGE = 0.95
 
 
 class TuningOptions(Parameters):
-    """How long logs are, and what is searched for.
+    """States how long logs are, and what is searched for.
 
     Attributes:
         durations_s: lengths of the logs, in s.

@@ -37,7 +37,7 @@ NO_LATITUDE, NO_LONGITUDE, NO_COURSE, NO_SPEED = 91.0, 181.0, 360.0, 102.3
 
 
 class AisParameters(Parameters):
-    """Where the tangent plane is, and what is reported as unlikely.
+    """States where the tangent plane is, and what is reported as unlikely.
 
     Attributes:
         origin_deg: latitude and longitude of the tangent plane's origin; without one the median of the
@@ -54,7 +54,7 @@ class AisParameters(Parameters):
 
 
 class Reports(NamedTuple):
-    """The rows of a file: stamps in ns, MMSI, degrees, and m/s; NaN where not available."""
+    """Holds the rows of a file: stamps in ns, MMSI, degrees, and m/s; NaN where not available."""
 
     time_ns: NDArray[np.int64]
     mmsi: NDArray[np.int64]

@@ -27,7 +27,7 @@ DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement":
 
 
 class BroadParameters(Parameters):
-    """What is refused, and what is reported.
+    """States what is refused, and what is reported.
 
     Attributes:
         unit_tolerance: how far the length of a true quaternion may be from 1.

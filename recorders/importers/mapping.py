@@ -56,7 +56,7 @@ _IN_BODY = {
 
 
 class Inflation(Parameters):
-    """Where standard deviations are larger than they say.
+    """States where standard deviations are larger than they say.
 
     Attributes:
         where: for each source the values with which they are.
@@ -68,7 +68,7 @@ class Inflation(Parameters):
 
 
 class StreamMapping(Parameters):
-    """What becomes one of fuselog's messages.
+    """States what becomes one of fuselog's messages.
 
     Attributes:
         becomes: name of the message.
@@ -152,7 +152,7 @@ def schema_of(mapping: StreamMapping, where: str) -> Schema:
 
 
 class Mapped(NamedTuple):
-    """Messages (k,) that were made: their columns, of which row (n,) each is, and which are left out."""
+    """Holds messages (k,) that were made: columns, of which row (n,) each is, and which are left out."""
 
     columns: dict[str, NDArray]
     rows: NDArray[np.int64]
@@ -189,7 +189,7 @@ def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: s
 
 
 class _Maker(NamedTuple):
-    """What makes columns of the sources."""
+    """Makes columns of the sources."""
 
     mapping: StreamMapping
     schema: Schema

@@ -36,7 +36,7 @@ AXES = ("x", "y", "z")
 
 
 class SoundRecordingsParameters(Parameters):
-    """What the files do not state: the air, the band that is used, and true positions of sounds.
+    """States what the files do not: the air, the band that is used, and true positions of sounds.
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
@@ -57,7 +57,7 @@ class SoundRecordingsParameters(Parameters):
 
 
 class Recorded(NamedTuple):
-    """A file: its samples, how many a second, and when it began, ns since 1970, or None."""
+    """Holds a file: its samples, how many a second, and when it began, ns since 1970, or None."""
 
     samples: Floats
     rate_hz: int
@@ -74,7 +74,7 @@ class Sound(NamedTuple):
 
 
 class Array(NamedTuple):
-    """The microphones of one table, by file: their places (3,), numbers in the log, and recordings."""
+    """Holds the microphones of one table, by file: places (3,), numbers in the log, and recordings."""
 
     path: Path
     places: dict[str, Floats]

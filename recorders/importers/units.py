@@ -12,7 +12,7 @@ from recorders.errors import BadInput, choices
 
 
 class Unit(NamedTuple):
-    """A size in SI units (angles in rad), and the powers of length, time, angle and flux density."""
+    """Holds a size in SI units (angles in rad), and powers of length, time, angle and flux density."""
 
     size: float
     powers: tuple[int, ...]

@@ -82,7 +82,7 @@ def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 class Ellipse(NamedTuple):
-    """What a field goes along in a turn: its centre (3,), mean radius and ratio of axes."""
+    """Describes what a field goes along in a turn: its centre (3,), mean radius and ratio of axes."""
 
     centre: Floats
     radius: float

@@ -23,7 +23,7 @@ _HEAD = struct.Struct("<BQHIQQ")
 
 
 class Companion(NamedTuple):
-    """A message, its topic, the topic of the stream that it accompanies, and its two clocks."""
+    """Holds a message, its topic, the topic of the stream that it accompanies, and its two clocks."""
 
     topic: str
     of: str
@@ -33,7 +33,7 @@ class Companion(NamedTuple):
 
 
 class Numbered(NamedTuple):
-    """A companion with its channel and its number there."""
+    """Holds a companion with its channel and its number there."""
 
     channel_id: int
     sequence: int

@@ -33,7 +33,7 @@ _WIRE_TYPES = {"time_ns": 1, "identifier": 5, "real": 1, "vector": 2}
 
 @dataclass(frozen=True)
 class Layout:
-    """The byte layout of one schema with given vector widths, its constant bytes told apart.
+    """Describes the bytes of one schema with given vector widths, its constant bytes told apart.
 
     An empty vector is absent from the wire, as proto3 has it, and so from `dtype`.
     """

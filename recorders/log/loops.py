@@ -44,7 +44,7 @@ class Scan(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """The bytes that all records of one layout share: words at `places` within its `size` bytes."""
+    """Holds the bytes that all records of a layout share: words at `places` within its `size` bytes."""
 
     size: int
     places: NDArray[np.int64]

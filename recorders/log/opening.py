@@ -35,7 +35,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Log:
-    """An opened log: what it holds, not the messages themselves."""
+    """Represents an opened log: what it holds, not the messages themselves."""
 
     path: Path
     container: Container

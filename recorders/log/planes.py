@@ -32,7 +32,7 @@ _PLANAR = {each.full_name for each in (POSITION_FIX, VELOCITY_FIX, POSE, COURSE_
 
 
 class Origin(NamedTuple):
-    """Where a plane touches: latitude and longitude (deg), height above the ellipsoid (m)."""
+    """States where a plane touches: latitude and longitude (deg), height above the ellipsoid (m)."""
 
     latitude_deg: float
     longitude_deg: float

@@ -24,14 +24,14 @@ _ALWAYS = Span(-1, 1 << 64)
 
 
 class _Window(NamedTuple):
-    """The stamps that are asked for, and of which clock."""
+    """Holds the stamps that are asked for, and of which clock."""
 
     clock: Clock
     span: Span
 
 
 class _Ranked(NamedTuple):
-    """A region, and its rank in the file."""
+    """Holds a region, and its rank in the file."""
 
     rank: int
     region: Region

@@ -58,7 +58,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Schema:
-    """A message type: its protobuf name without the package, what it says, and its fields.
+    """Describes a message type: its protobuf name without the package, what it says, and its fields.
 
     Attributes:
         name: the name of its protobuf message, without the package.

@@ -17,7 +17,7 @@ SHOT_COMPONENTS = ("x_m", "y_m", "trajectory_rad")
 
 
 class Medium(NamedTuple):
-    """The air, and the bullet's constant speed in multiples of that of sound."""
+    """Describes the air, and the bullet's constant speed in multiples of that of sound."""
 
     speed_of_sound_mps: float = 342.0
     mach_number: float = 2.0
@@ -29,7 +29,7 @@ class Medium(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard deviations of what a sensor measures; `position_m` is that of its GPS, per axis."""
+    """Holds standard deviations of what a sensor measures; `position_m` is its GPS's, per axis."""
 
     muzzle_blast_rad: float
     shockwave_rad: float

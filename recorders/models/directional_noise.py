@@ -77,7 +77,7 @@ def sample_projected_gaussian(
 
 
 class DirectionalNoise(Parameters):
-    """A distribution of unit vectors, along the components of a complex number or quaternion.
+    """Describes a distribution of unit vectors, along the components of a complex number or quaternion.
 
     Attributes:
         distribution: of which kind it is; samples of a Gaussian are scaled to unit length.

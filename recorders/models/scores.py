@@ -21,7 +21,7 @@ Name = Annotated[str, Field(pattern=r"^[^/,\s]+$")]
 
 
 class Matcher(Parameters):
-    """A matcher of biometric samples.
+    """Describes a matcher of biometric samples.
 
     Attributes:
         name: its name.
@@ -37,7 +37,7 @@ class Matcher(Parameters):
 
 
 class Comparisons(NamedTuple):
-    """All comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
+    """Holds all comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
 
     Distances are negated: greater is more alike. `failed` marks the failures to enrol; `arrival_ns`
     (users,) says when each probe came.

@@ -19,7 +19,7 @@ FEWEST = 20  # messages, below which nothing is said of a topic
 
 @dataclass(frozen=True)
 class Series:
-    """One quantity of a topic over time.
+    """Holds one quantity of a topic over time.
 
     Attributes:
         topic, field: where it stands.
@@ -54,7 +54,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Fixes(Series):
-    """Places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
+    """Holds places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
 
     `is_flat` says that they are metres and not latitudes, so that they may have a scale.
     """

@@ -23,7 +23,7 @@ Surety = Literal["fact", "likely", "hint"]  # counted in the log; far from chanc
 
 
 class Finding(NamedTuple):
-    """A fault that no filter is needed to see.
+    """Describes a fault that no filter is needed to see.
 
     Attributes:
         cause: what kind of fault it is.

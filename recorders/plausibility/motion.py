@@ -32,7 +32,7 @@ ALIKE, PLAIN = 0.8, 0.95  # correlations; the latter where the course need not b
 
 
 class Slope(NamedTuple):
-    """What one topic says of windows, as a multiple of what another says.
+    """States what one topic says of windows, as a multiple of what another says.
 
     Attributes:
         value: the multiple, by least squares through zero.
@@ -72,7 +72,7 @@ def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 class Lag(NamedTuple):
-    """One topic beside another that it was compared with, which is later by the lag."""
+    """Holds one topic beside another that it was compared with, which is later by the lag."""
 
     source: str
     against: str
@@ -80,7 +80,7 @@ class Lag(NamedTuple):
 
 
 class Motion:
-    """A body, and what comparing its topics in pairs tells."""
+    """Holds a body, and what comparing its topics in pairs tells."""
 
     def __init__(self, body: Body) -> None:
         self.body = body
@@ -265,7 +265,7 @@ def heading_at(orientation: Series, times_s: Floats) -> Floats:
 
 
 class Forces(NamedTuple):
-    """By what angle (rad) horizontal forces are to be turned to be those of the course.
+    """States by what angle (rad) horizontal forces are to be turned to be those of the course.
 
     `fit` is how well they then do, up to 1, and `mirrored` how well their mirror image would.
     """

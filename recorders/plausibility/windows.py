@@ -16,7 +16,7 @@ MOST = 2000  # windows; of more every second, third, ... is taken
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows (k,) from one stamp to a later one, and what was measured in each."""
+    """Holds windows (k,) from one stamp to a later one, and what was measured in each."""
 
     begin_s: Floats
     end_s: Floats

@@ -30,7 +30,7 @@ Place = tuple[float, float]
 
 
 class AcousticParameters(Parameters):
-    """Shooter, sensors and air.
+    """A shooter fires, and sensors hear the shot through the air.
 
     Attributes:
         shooter_position_m: where the shooter stands (x, y).

@@ -72,7 +72,7 @@ LOWEST = 0.1
 
 
 class BiometricScoresParameters(Parameters):
-    """Users and the special ones among them, whose numbers are those of the real 517.
+    """States how many users and special ones among them there are: by default as of the real 517.
 
     Attributes:
         users: number of users.

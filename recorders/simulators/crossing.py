@@ -25,7 +25,7 @@ STRAIGHT_S, TURN_RAD = 15.0, np.pi / 2
 
 
 class CrossingParameters(Parameters):
-    """Five targets in a square, and the radar in its middle that scans it.
+    """Five targets move in a square, which a radar in its middle scans.
 
     Attributes:
         duration_s: length of the run.

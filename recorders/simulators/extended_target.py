@@ -22,7 +22,7 @@ Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 
 
 class ExtendedTargetParameters(Parameters):
-    """A rectangle, the points that are measured of it, and what a filter assumes.
+    """States a rectangle, the points that are measured of it, and what a filter assumes.
 
     Attributes:
         points: number of points, one per time step.

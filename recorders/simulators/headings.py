@@ -19,7 +19,7 @@ HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
 
 
 class HeadingsParameters(Parameters):
-    """Two headings that turn each other.
+    """Two headings turn each other.
 
     Attributes:
         steps: number of time steps.

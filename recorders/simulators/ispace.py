@@ -24,7 +24,7 @@ Index = Annotated[int, Field(ge=1)]
 
 
 class Node(Parameters):
-    """The sensor of a node.
+    """States what the sensor of a node is like.
 
     Attributes:
         components: those of the state that it measures.
@@ -49,7 +49,7 @@ ROOM = (
 
 
 class NodeOutage(Parameters):
-    """A span in which a node neither measures nor sends nor receives.
+    """During this span a node neither measures nor sends nor receives.
 
     Attributes:
         node: number of the node, from 1.
@@ -63,7 +63,7 @@ class NodeOutage(Parameters):
 
 
 class IspaceParameters(Parameters):
-    """A room with sensor nodes, the links between them, and the target that moves there.
+    """Sensor nodes in a room, with links between them, follow a target that moves there.
 
     Attributes:
         steps: number of time steps.

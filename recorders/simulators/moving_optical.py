@@ -38,7 +38,7 @@ FIRST_S = 0.5  # before the first sighting, and so before any clock that is off
 
 
 class MovingOpticalParameters(Parameters):
-    """Sensors on aircraft, targets, and the errors of attitudes and clocks.
+    """Sensors on aircraft see targets; their attitudes and clocks err.
 
     Attributes:
         duration_s: length of the run.
@@ -79,7 +79,7 @@ class MovingOpticalParameters(Parameters):
 
 
 class Course(NamedTuple):
-    """The truth at some times (n,): targets (n, targets, 6) and biases (n, sensors, 3)."""
+    """Holds the truth at some times (n,): targets (n, targets, 6) and biases (n, sensors, 3)."""
 
     times_s: Floats
     targets: Floats

@@ -25,7 +25,7 @@ GRID_S = 0.05  # between the knots of the path
 
 
 class Path(NamedTuple):
-    """The way of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
+    """Holds the way of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
 
     position: BSpline
     attitude: BSpline

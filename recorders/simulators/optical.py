@@ -26,7 +26,7 @@ Triples = Annotated[list[Triple], Field(min_length=1)]
 
 
 class OpticalParameters(Parameters):
-    """Sensors, targets and what is seen.
+    """States sensors, targets and what is seen.
 
     Attributes:
         sensor_position_m: where the sensors are (x, y, z).

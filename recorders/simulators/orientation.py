@@ -20,7 +20,7 @@ from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 
 class AxisParameters(Parameters):
-    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode.
+    """Describes the paper's two-dimensional evaluation, (54)-(56); truth starts off the prior's mode.
 
     Attributes:
         steps: number of time steps.
@@ -56,7 +56,7 @@ class AxisParameters(Parameters):
 
 
 class OrientationParameters(AxisParameters):
-    """The paper's four-dimensional evaluation: (61)-(65)."""
+    """Describes the paper's four-dimensional evaluation, (61)-(65)."""
 
     start: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
     prior: DirectionalNoise = DirectionalNoise(diagonal=(-1.0, -1.0, -1.0, 0.0))

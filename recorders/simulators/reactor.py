@@ -20,7 +20,7 @@ Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
 
 
 class ReactorParameters(Parameters):
-    """Partial pressures of a gas reaction, in the paper's units.
+    """States partial pressures of a gas reaction, in the paper's units.
 
     Attributes:
         steps: number of time steps.

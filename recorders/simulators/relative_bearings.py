@@ -21,7 +21,7 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 
 
 class RelativeBearingsParameters(Parameters):
-    """The scene of section V of the paper (without noise, its first pairs), or random scenes.
+    """Chooses the scene of section V of the paper (without noise, its first pairs), or random scenes.
 
     Attributes:
         scene: which of the two.

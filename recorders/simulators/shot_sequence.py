@@ -37,7 +37,7 @@ PATH_S = 0.1
 
 
 class ShotSequenceParameters(AcousticParameters):
-    """The scenario of a shot, and how the shooter moves and sensors err.
+    """States the scenario of a shot, and how the shooter moves and sensors err.
 
     The shooter begins near `shooter_position_m`, aiming near `trajectory_deg`.
 

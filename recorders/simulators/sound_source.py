@@ -23,7 +23,7 @@ Point = tuple[float, float, float]
 
 
 class SoundSourceParameters(Parameters):
-    """Microphones and a sound.
+    """Microphones record a sound.
 
     Attributes:
         microphones_m: where the microphones are (x, y, z).

@@ -39,7 +39,7 @@ POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Delayed(Parameters):
-    """How late messages arrive.
+    """States how late messages arrive.
 
     Attributes:
         latency_s: least time from measurement to arrival.
@@ -51,7 +51,7 @@ class Delayed(Parameters):
 
 
 class Fixes(Delayed):
-    """The position fixes of the vehicles.
+    """Vehicles get position fixes.
 
     Attributes:
         rate_hz: fixes per second of each vehicle.
@@ -65,7 +65,7 @@ class Fixes(Delayed):
 
 
 class Scans(Delayed):
-    """Unordered scans.
+    """Detections come in unordered scans.
 
     Attributes:
         detection_probability: probability that a scan detects a vehicle.
@@ -77,7 +77,7 @@ class Scans(Delayed):
 
 
 class Infrastructure(Scans):
-    """The sensor by the road.
+    """A sensor by the road sees the vehicles.
 
     Attributes:
         rate_hz: scans per second; 0 has it never report.
@@ -91,7 +91,7 @@ class Infrastructure(Scans):
 
 
 class VehiclesParameters(Parameters):
-    """Vehicles in the plane, and who detects them.
+    """Vehicles drive in the plane, and sensors detect them.
 
     Attributes:
         duration_s: length of the run.
@@ -163,7 +163,7 @@ class Drive(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Unordered scans: how many detections each has, and all of them (n, 2), scan after scan."""
+    """Holds unordered scans: how many detections each has, and all of them (n, 2), scan after scan."""
 
     counts: Integers
     places: Floats

@@ -19,7 +19,7 @@ from replay.distributions.batches import flatten
 
 
 class Bingham(NamedTuple):
-    """Bingham distributions with any batch axes.
+    """Represents Bingham distributions with any batch axes.
 
     Attributes:
         axes: M (..., d, d), orthogonal, principal axes in columns, the mode last.

@@ -26,7 +26,7 @@ _NODES = 2.0 * np.pi / 1024 * np.arange(1024)
 
 
 class WrappedMixture(NamedTuple):
-    """Wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of the angles unwrapped."""
+    """Holds wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of angles unwrapped."""
 
     weights: Floats
     mean: Floats
@@ -38,7 +38,7 @@ class WrappedMixture(NamedTuple):
 
 
 class VonMisesMixture(NamedTuple):
-    """Bivariate von Mises densities of one kind.
+    """Represents bivariate von Mises densities of one kind.
 
     exp(k1 cos a + k2 cos b + k3 sin a sin b) over its integral, a and b the deviations from the mean
     (Singh, Hnizdo, Demchuk, "Probabilistic model for two dependent circular variables", 2002), or with

@@ -22,7 +22,7 @@ _product_mixture = compiled(kernels.product_mixture, allocates=False)
 
 
 class WrappedNormal(NamedTuple):
-    """Wrapped normals: mean (..., 2) in [-pi, pi), covariance (..., 2, 2) of the angles unwrapped."""
+    """Holds wrapped normals: mean (..., 2) in [-pi, pi), covariance (..., 2, 2) of angles unwrapped."""
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -43,7 +43,7 @@ class CircularMoments(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Weighted samples: positions (..., n, 2), weights (..., n) with sum 1."""
+    """Holds weighted samples: positions (..., n, 2), weights (..., n) with sum 1."""
 
     positions: NDArray[np.float64]
     weights: NDArray[np.float64]

@@ -28,7 +28,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 class Mixture(NamedTuple):
-    """A wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
+    """Holds a wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
 
     mean: NDArray[np.float64]
     weights: NDArray[np.float64]

@@ -18,7 +18,7 @@ MOST_COMPONENTS = 1000  # of a state: its covariance has a million numbers
 
 
 class ForeignParameters(Parameters):
-    """How a foreign filter is run; beside these it has the parameters of its description.
+    """States how a foreign filter is run; beside these it has the parameters of its description.
 
     Attributes:
         time_limit_s: a run fails where one message takes longer.

@@ -65,7 +65,7 @@ WEAK = 10.0  # priors
 
 
 class ObservabilityParameters(MethodParameters):
-    """Windows and scales of the Gramian.
+    """States windows and scales of the Gramian.
 
     Attributes:
         window_s: length of a window; without one, the whole run.
@@ -274,7 +274,7 @@ class Observability(IteratedSmoother):
 
 
 class Spectrum(NamedTuple):
-    """Eigenvalues of a scaled Gramian, ascending (t,), its rank, and the least one's direction (t,)."""
+    """Holds a scaled Gramian's eigenvalues, ascending (t,), rank, and the least's direction (t,)."""
 
     eigenvalues: Floats
     rank: int

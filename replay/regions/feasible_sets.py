@@ -17,7 +17,7 @@ from replay.engine.arrays import Floats, Integers
 
 
 class Pairs(NamedTuple):
-    """Relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), one bound.
+    """Holds relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), bound.
 
     angle = bearing of first - bearing of second, wrong by at most `bound_rad`.
     """
@@ -29,14 +29,14 @@ class Pairs(NamedTuple):
 
 
 class Arena(NamedTuple):
-    """The rectangle that the robot is known to be in."""
+    """Bounds the rectangle that the robot is known to be in."""
 
     low: Floats
     high: Floats
 
 
 class Arcs(NamedTuple):
-    """The border of a set as arcs with the set on the left; a set without border is empty.
+    """Holds a set's border as arcs with the set on the left; a set without border is empty.
 
     Each begins at `start` (m, 2) in direction `heading_rad` (m,) and runs `length` (m,) at a constant
     `curvature` (m,), negative where the set is outside the circle.

@@ -36,7 +36,7 @@ L8_MOST_GROWTH = 3.0
 
 
 class Headings(NamedTuple):
-    """An interval of headings; all of them where the half width is pi."""
+    """Holds an interval of headings; all of them where the half width is pi."""
 
     middle_rad: float
     half_rad: float
@@ -46,7 +46,7 @@ ALL_HEADINGS = Headings(0.0, np.pi)
 
 
 class Odometry(NamedTuple):
-    """Poses (n, 3) that the odometry alone leads to, and the velocities (n, 2) from their stamps on."""
+    """Holds poses (n, 3) that odometry alone leads to, and velocities (n, 2) from their stamps on."""
 
     time_ns: Integers
     pose: Floats
@@ -60,7 +60,7 @@ class Odometry(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """The largest error of odometry over a span: `offset` + `rate` times its length in s."""
+    """Bounds the error of odometry over a span: `offset` + `rate` times its length in s."""
 
     offset: float
     rate: float

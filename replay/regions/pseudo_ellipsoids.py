@@ -27,7 +27,7 @@ ROUNDING = 1e-11
 
 
 class PseudoEllipsoid(NamedTuple):
-    """The set T'A T - 2 b'T + c <= 0 of monomials T (order,) of the positions (x - origin) / scale.
+    """Represents the set T'A T - 2 b'T + c <= 0 of monomials T (order,) of (x - origin) / scale.
 
     Zero information, the prior of V, is all zeros; a huge covariance would only lose digits.
     """
@@ -40,7 +40,7 @@ class PseudoEllipsoid(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
+    """Holds nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
 
     x: Floats
     y: Floats
@@ -48,7 +48,7 @@ class Grid(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """A set's border as closed polygons (n, 2), holes the other way round, and the area inside."""
+    """Holds a set's border as closed polygons (n, 2), holes the other way round, and the area inside."""
 
     rings: list[Floats]
     area_m2: float

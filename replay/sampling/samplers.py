@@ -20,7 +20,7 @@ Shape = tuple[int, ...]
 
 
 class Samples(NamedTuple):
-    """Points (..., L, N) and their weights (..., L), which sum to 1 and may be negative."""
+    """Holds points (..., L, N) and their weights (..., L), which sum to 1 and may be negative."""
 
     points: Array
     weights: Array
@@ -28,7 +28,7 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampling at one dimension.
+    """Draws by a sampling at one dimension.
 
     `draw(generator, batch)` gives points (*batch, count, dimension) and weights (*batch, count). Unless
     `redrawn`, they are read-only views of one set and the generator is not used. Batches drawn one after

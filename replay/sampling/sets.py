@@ -21,7 +21,7 @@ _UNUSED = np.random.default_rng(0)  # for sets that are not drawn
 
 
 class SampleSets(NamedTuple):
-    """Points (sets, L, N) and weights (sets, L); use number u takes the set (u - first) * stride."""
+    """Holds points (sets, L, N), weights (sets, L); use number u takes the set (u - first) * stride."""
 
     points: Array
     weights: Array

@@ -14,7 +14,7 @@ Board = rrb.Container | rrb.View
 
 
 class Fan(NamedTuple):
-    """How far one copy is from its estimate.
+    """States how far one copy is from its estimate.
 
     Attributes:
         estimate: what it is a copy of; those of one estimate share a plot.

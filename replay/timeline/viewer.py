@@ -36,7 +36,7 @@ _PICTURES = 7
 
 
 class Listener(NamedTuple):
-    """A running Rerun process and the address that it receives at."""
+    """Represents a running Rerun process and the address that it receives at."""
 
     url: str
     process: subprocess.Popen[bytes]

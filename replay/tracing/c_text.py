@@ -124,7 +124,7 @@ DOUBLE, SINGLE = Precision(), Precision("float", "f")
 
 
 class _Text(NamedTuple):
-    """An expression, and how tightly its last operation binds."""
+    """Holds an expression, and how tightly its last operation binds."""
 
     text: str
     binds: int

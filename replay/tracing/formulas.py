@@ -47,7 +47,7 @@ _KNOWN: dict[float, tuple[str, int]] = {
 
 
 class _Text(NamedTuple):
-    """A formula, and how tightly its last operation binds."""
+    """Holds a formula, and how tightly its last operation binds."""
 
     text: str
     binds: int

@@ -38,7 +38,7 @@ _NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
 
 
 class Shape(NamedTuple):
-    """An array of these sizes, which the function reads and changes."""
+    """Describes an array of these sizes, which the function reads and changes."""
 
     sizes: tuple[int, ...]
 
@@ -59,7 +59,7 @@ class Result(NamedTuple):
 
 
 class TracedFunction:
-    """A function of a model, with its graph."""
+    """Represents a function of a model, with its graph."""
 
     def __init__(self, function: Callable[..., Any], arguments: Sequence[Argument]) -> None:
         self.function = function
@@ -112,7 +112,7 @@ class TracedFunction:
 
 
 class Derivative:
-    """The values of a traced function and chosen derivatives, as one function that returns a tuple.
+    """Represents a function that gives the values of a traced function and chosen derivatives.
 
     Args:
         function: the function.

@@ -41,7 +41,7 @@ _COMMUTATIVE = (operator.add, operator.mul)
 
 
 class Node:
-    """A number or a truth: an operation, what it is applied to, and a constant that goes with it."""
+    """Represents a number or a truth: an operation, what it is applied to, and its constant."""
 
     __slots__ = ("arguments", "is_truth", "number", "operation", "value")
 
@@ -65,7 +65,7 @@ class Node:
 
 
 class Graph:
-    """The nodes of one function, in the order in which they can be computed."""
+    """Holds the nodes of one function, in the order in which they can be computed."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []

@@ -9,7 +9,7 @@ from replay.tracing.traced import Trace, Traced
 
 
 class Parameters:
-    """The parameters of a function that is traced."""
+    """Holds the parameters of a function that is traced."""
 
     def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
         self.trace, self._argument, self._names = trace, argument, names

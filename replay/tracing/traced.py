@@ -48,7 +48,7 @@ def too_many_ways() -> CannotTrace:
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
-    """A number of a graph that grows as it is used."""
+    """Represents a number of a graph that grows as it is used."""
 
     __slots__ = ("node", "trace")
 

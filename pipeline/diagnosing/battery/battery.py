@@ -31,7 +31,7 @@ UNIT_RUNS = 5  # of each fault of the unit, for one of each cell: they cost a te
 
 
 class Right(NamedTuple):
-    """What a diagnosis should name: kind, topic, component, and the number if it has one."""
+    """States what a diagnosis should name: kind, topic, component, and the number if it has one."""
 
     kind: Kind
     topic: str
@@ -111,7 +111,7 @@ PAIRS = (
 
 
 class Cell(NamedTuple):
-    """A fault, and what the log has beside wheels and fixes."""
+    """Describes a planted fault, and what the log has beside wheels and fixes."""
 
     fault: str
     has_compass: bool

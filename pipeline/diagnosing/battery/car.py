@@ -23,7 +23,7 @@ START_SIGMAS = np.array([1.0, 1.0, 0.1])  # of a prior, in m and rad
 
 
 class Truth(NamedTuple):
-    """How the car drives: speeds and turn rates (n,) that hold a step each, poses (n + 1, 3) between."""
+    """Describes how the car drives: speeds, turn rates (n,) of each step, poses (n + 1, 3) between."""
 
     step_s: float
     speed_mps: Floats
@@ -40,7 +40,7 @@ class Truth(NamedTuple):
 
 
 class Car(NamedTuple):
-    """What a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
+    """Holds what a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
 
     seed: int
     truth: Truth
@@ -220,7 +220,7 @@ def car(seed: int, stated: float = 1.0) -> MemorySource:
 
 
 class Unit(NamedTuple):
-    """An inertial unit on the car, and velocities (m, 2) east and north of a receiver."""
+    """Describes an inertial unit on the car, and velocities (m, 2) east and north of a receiver."""
 
     sample_s: Floats
     force_mps2: Floats

@@ -36,7 +36,7 @@ PROBED = 64  # messages, by which is found what is read
 
 
 class Entry(NamedTuple):
-    """One number of a topic's messages that is read.
+    """Describes one number of a topic's messages that is read.
 
     Attributes:
         field, place: where it stands; a heading is of the field `quaternion`.
@@ -147,7 +147,7 @@ def of_components(
 
 
 class _Own(NamedTuple):
-    """The parameters that a number of a topic has: what is added to it, and what it is multiplied by.
+    """Names the parameters that a number of a topic has: its bias, and its factor.
 
     `bias_sign` is by what a bias of the number is multiplied for the parameter's, whose value is
     `bias_value`.

@@ -44,7 +44,7 @@ BY_CHANCE = float(chi2.isf(0.001, PARTS - 1)) / (PARTS - 1)  # an inflation in 1
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One way in which a log or its settings may be wrong.
+    """Describes one way in which a log or its settings may be wrong.
 
     Attributes:
         kind: what those that cannot be told apart have in common.

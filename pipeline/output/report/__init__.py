@@ -58,7 +58,7 @@ class _Timings(Parameters):
 
 @dataclass(frozen=True)
 class Shown:
-    """A figure of the page, a chart or a picture, and what it says to who cannot see it."""
+    """Holds a figure of the page, a chart or a picture, and its words for those who cannot see it."""
 
     name: str
     caption: str

@@ -38,7 +38,7 @@ State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
 
 
 class Spread(NamedTuple):
-    """A value, and where it lies with 95 % over other runs; NaN where too few runs tell."""
+    """Holds a value, and where it lies with 95 % over other runs; NaN where too few runs tell."""
 
     value: float
     low: float = math.nan
@@ -52,7 +52,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class Consistency:
-    """A mean of normalised squares, NEES or NIS.
+    """Holds a mean of normalised squares, NEES or NIS.
 
     Attributes:
         name: which of the two.
@@ -128,7 +128,7 @@ class Evidence:
 
 
 class Pair(NamedTuple):
-    """How much more of a quantity an estimator has than another one; NaN where no interval is known."""
+    """States how much more of a quantity an estimator has than another; NaN where that is unknown."""
 
     first: str
     second: str
@@ -139,7 +139,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """What a result knows of all its estimators.
+    """Holds what a result knows of all its estimators.
 
     Attributes:
         tables: its metrics by case.

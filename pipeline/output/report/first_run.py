@@ -27,7 +27,7 @@ GAP_LIMIT_S = 0.2
 
 @dataclass(frozen=True)
 class Followed:
-    """What an estimator said of a place over time, beside the truth.
+    """Holds what an estimator said of a place over time, beside the truth.
 
     Attributes:
         time_s: (n,) since the first.
@@ -57,7 +57,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class FirstRun:
-    """The first run of a result: its log, what was estimated, and of the first case how well."""
+    """Holds the first run of a result: its log, what was estimated, and of the first case how well."""
 
     source: Source
     output: Source

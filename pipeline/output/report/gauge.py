@@ -11,7 +11,7 @@ GAUGE_ENDS = (1 / 3, 10.0)
 
 
 class Gauge(NamedTuple):
-    """Where a mean of squares lies, in percent of a scale from too careful to too sure.
+    """Shows where a mean of squares lies, in percent of a scale from too careful to too sure.
 
     Attributes:
         honest: what counts as consistent: where 95 % of such estimators lie, and what is off by little.

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 
 class Term(NamedTuple):
-    """An entry: the word, what it means, and a page about it."""
+    """Explains a word: what it means, and a page about it."""
 
     name: str
     meaning: str

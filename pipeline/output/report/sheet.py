@@ -31,7 +31,7 @@ GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
 
 
 class Cell(NamedTuple):
-    """A number of a table, what stands small beside it, and if it is the best or out of bounds."""
+    """Holds a number of a table, what stands small beside it, and if it is the best or out of bounds."""
 
     text: str
     small: str = ""
@@ -40,7 +40,7 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """A quantity of all estimators; `key` is what the result calls it."""
+    """Holds a quantity of all estimators; `key` is what the result calls it."""
 
     key: str
     name: str
@@ -52,7 +52,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table: its groups of rows, and those that stand folded below."""
+    """Holds a table: its groups of rows, and those that stand folded below."""
 
     title: str
     columns: list[str]

@@ -36,7 +36,7 @@ Look = Literal["broken", "careful", "best", "fair"]
 
 @dataclass(frozen=True)
 class Card:
-    """What is said of one estimator: how good it is, if it can be believed, why not, what it costs."""
+    """Says of one estimator how good it is, if it can be believed, why not, and what it costs."""
 
     estimator: str
     look: Look
@@ -56,7 +56,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Story:
-    """What a page says of a result, first of all.
+    """Says what a page says of a result, first of all.
 
     Attributes:
         verdict: what to do, the most important sentence first.

@@ -25,7 +25,7 @@ Tables = Mapping[str, pd.DataFrame]
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep's result, and what of it the sentences are made of.
+    """Holds a sweep's result, and what the sentences are made of.
 
     Attributes:
         result: what was swept.

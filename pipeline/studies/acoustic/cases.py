@@ -32,7 +32,7 @@ Place = tuple[float, float]
 
 
 class Maps(Parameters):
-    """Figures 22 and 23.
+    """Describes figures 22 and 23.
 
     Attributes:
         scenario: scenario with the sensors.
@@ -50,7 +50,7 @@ class Maps(Parameters):
 
 
 class AcousticOptions(Parameters):
-    """The paper's scenarios, how noisy they are, and the maps.
+    """States the paper's scenarios, how noisy they are, and the maps.
 
     Attributes:
         scenarios: the paper's three scenarios, as files.
@@ -75,7 +75,7 @@ class AcousticOptions(Parameters):
 
 @dataclass(frozen=True)
 class Mode:
-    """What one estimator made of a case.
+    """Holds what one estimator made of a case.
 
     Attributes:
         components: names of the n parameters.
@@ -140,7 +140,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Case:
-    """One scenario at one multiple of the angular noise, and its modes by the estimators' labels."""
+    """Holds one scenario at one multiple of the angular noise, and its modes by estimators' labels."""
 
     number: int
     multiplier: float

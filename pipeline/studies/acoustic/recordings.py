@@ -25,7 +25,7 @@ from replay.judging.errors.evaluation import Errors
 
 
 class Published(Parameters):
-    """Differences that were published of a sound.
+    """States the differences that were published of a sound.
 
     Attributes:
         delay_s: how much later than the first microphone the others heard it, in their numbers' order.
@@ -35,7 +35,7 @@ class Published(Parameters):
 
 
 class Simulated(Parameters):
-    """Simulated recordings of the scenario `sound-source`.
+    """Describes simulated recordings of the scenario `sound-source`.
 
     Attributes:
         runs: number of runs at each noise.
@@ -51,7 +51,7 @@ class Simulated(Parameters):
 
 
 class Options(Parameters):
-    """What is known of sounds, and what is simulated.
+    """States what is known of sounds, and what is simulated.
 
     Attributes:
         published: differences that were published, by the name of a sound.

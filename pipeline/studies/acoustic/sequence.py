@@ -26,7 +26,7 @@ SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 
 
 class Options(Parameters):
-    """The cases.
+    """States the cases.
 
     Attributes:
         cases: what differs in the scenario, by the name of a case; the first has no faults.

@@ -55,7 +55,7 @@ TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
 
 
 class BiometricsOptions(Parameters):
-    """How often what is random is repeated.
+    """States how often what is random is repeated.
 
     Attributes:
         seeds: how often the cross validations are repeated.

@@ -52,7 +52,7 @@ IMPOSTORS = 100_000  # so many that their tail is that of all
 
 
 class Options(Parameters):
-    """What is stated, and how it is tried.
+    """States the tests' rates of error, and how they are tried.
 
     Attributes:
         rates: pairs of stated rates of false accepts and false rejects.
@@ -80,7 +80,7 @@ class Options(Parameters):
 
 
 class Drawn(NamedTuple):
-    """A matcher's ratios (users, users) by probe and gallery entry, and a replicate's users (n,)."""
+    """Holds a matcher's ratios (users, users) by probe and gallery entry, a replicate's users (n,)."""
 
     ratios: Floats
     users: Integers

@@ -12,7 +12,7 @@ DRIFT_SIGMA = 1.0
 
 
 class Labelled(NamedTuple):
-    """Probes of a matcher: its ratio (n,), and whether the other matchers say that it is the person."""
+    """Holds probes of a matcher: its ratio (n,), and whether the other matchers say it is the person."""
 
     ratio: Floats
     is_genuine: Booleans

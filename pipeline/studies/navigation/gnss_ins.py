@@ -48,7 +48,7 @@ RUNS_AT_ONCE = 2  # in memory, with their estimates
 
 
 class GnssInsOptions(Parameters):
-    """The protocol of the outages.
+    """States the protocol of the outages.
 
     Attributes:
         filter: label of the filter that is compared.
@@ -74,7 +74,7 @@ class GnssInsOptions(Parameters):
 
 
 class Innovations(NamedTuple):
-    """Of one kind of measurement, where the fix was good: mean NIS, the share above 95 %, by axis."""
+    """Holds NIS of one kind of measurement where the fix was good: mean, share above 95 %, by axis."""
 
     nis: float
     share_above: float

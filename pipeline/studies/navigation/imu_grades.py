@@ -23,7 +23,7 @@ from replay.judging.errors.evaluation import Errors
 
 
 class Options(Parameters):
-    """The grades.
+    """States the grades.
 
     Attributes:
         grades: parameters of the scenario's inertial unit, by grade.
@@ -33,7 +33,7 @@ class Options(Parameters):
 
 
 class Span(NamedTuple):
-    """An outage, in s since a run's epoch."""
+    """Holds an outage, in s since a run's epoch."""
 
     begin_s: float
     end_s: float

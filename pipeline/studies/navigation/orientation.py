@@ -39,7 +39,7 @@ AS_RECORDED, WITH_MAGNET = "all", "magnet-added"
 
 
 class OrientationOptions(Parameters):
-    """The magnet that is added, and what counts as a disturbance.
+    """States the magnet that is added, and what counts as a disturbance.
 
     Attributes:
         magnet_ut: field of the magnet in the unit's axes (x, y, z).
@@ -55,7 +55,7 @@ class OrientationOptions(Parameters):
 
 
 class ErrorAngles(NamedTuple):
-    """Errors (n,) in rad."""
+    """Holds errors (n,) in rad."""
 
     total: Floats
     heading: Floats

@@ -27,7 +27,7 @@ _GAP_S = 1.0
 
 
 class Rows(NamedTuple):
-    """What the receiver wrote, a row for every fix; the plane is that of east and north.
+    """Holds what the receiver wrote, a row for every fix; the plane is that of east and north.
 
     Attributes:
         time_ns: (n,), as it is written.
@@ -46,7 +46,7 @@ class Rows(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A span (s since the first row) whose rows, by their numbers, are withheld."""
+    """Holds a span (s since the first row) whose rows, by their numbers, are withheld."""
 
     length_s: float
     start_s: float

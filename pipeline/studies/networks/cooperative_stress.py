@@ -34,7 +34,7 @@ SEED = 1
 
 
 class CooperativeStressOptions(Parameters):
-    """What the robots are put under.
+    """States what the robots are put under.
 
     Attributes:
         intervals_s: least times between two meetings of two robots at which they share, in s.

@@ -33,7 +33,7 @@ CI = "ci-trace"
 
 
 class NetworkOptions(Parameters):
-    """What the study looks at besides the experiment's own runs.
+    """States what the study looks at besides the experiment's own runs.
 
     Attributes:
         settle_s: errors count from so long after the beginning on.

@@ -30,7 +30,7 @@ INTERVAL, NEWS = "at most once in an interval", "when it has news"
 
 
 class StressOptions(Parameters):
-    """What the network is put under.
+    """States what the network is put under.
 
     Attributes:
         settle_s: errors count from so long after the beginning on.

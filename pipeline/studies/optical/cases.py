@@ -29,7 +29,7 @@ ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"
 
 
 class Condition(Parameters):
-    """Biases and noise.
+    """Describes biases and noise.
 
     Attributes:
         bias_deg: multiple of the biases of the scenario files, which have 1 deg.
@@ -41,7 +41,7 @@ class Condition(Parameters):
 
 
 class Printed(Parameters):
-    """What the paper prints; rows are scenarios, columns targets or biases.
+    """Holds what the paper prints; rows are scenarios, columns targets or biases.
 
     Attributes:
         table_of_sensors: number of the table of the sensors' positions.
@@ -71,7 +71,7 @@ class Printed(Parameters):
 
 
 class LosOptions(Parameters):
-    """Scenarios and conditions.
+    """States scenarios and conditions.
 
     Attributes:
         scenarios: scenario files, in the paper's order.
@@ -94,7 +94,7 @@ class LosOptions(Parameters):
 
 @dataclass(frozen=True)
 class Case:
-    """One scenario under one condition.
+    """Holds one scenario under one condition.
 
     Attributes:
         number: of the scenario, from 1.

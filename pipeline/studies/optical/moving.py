@@ -32,7 +32,7 @@ ALIGNED_S, LAST_S = 10.0, 10.0
 
 
 class Options(Parameters):
-    """Cases, and how observability is told.
+    """States the cases, and how observability is told.
 
     Attributes:
         cases: what differs in the scenario, by the name of a case.

@@ -22,7 +22,7 @@ from replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """Delays that the data do not state.
+    """States delays that the data do not.
 
     Attributes:
         range_delay_s: ranges are taken to be older than stamped by so much, beside an estimator's own
@@ -33,7 +33,7 @@ class RangingOptions(Parameters):
 
 
 class Recording(NamedTuple):
-    """One recording: its name, where it lies, and the files beside that which belong to it."""
+    """Names one recording, its place, and the files beside it that belong to it."""
 
     name: str
     path: Path
@@ -41,7 +41,7 @@ class Recording(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """A recording with the outputs of every estimator, by the last parts of their topics."""
+    """Holds a recording with the outputs of every estimator, by the last parts of their topics."""
 
     recording: Recording
     source: MemorySource
@@ -83,7 +83,7 @@ def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -
 
 
 class Reference(NamedTuple):
-    """The truth: stamps in order (n,), and its components (n, d); those of angles do not wrap."""
+    """Holds the truth: stamps in order (n,), and components (n, d); those of angles do not wrap."""
 
     time_ns: Integers
     state: Floats

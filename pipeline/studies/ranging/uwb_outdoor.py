@@ -34,7 +34,7 @@ PUBLISHED = ("LS", "ESKF")
 
 
 class Place(Parameters):
-    """Where a window begins or ends: a part of the plane.
+    """Bounds a part of the plane, where a window begins or ends.
 
     Attributes:
         x_above_m: least x; None for any.
@@ -57,7 +57,7 @@ class Place(Parameters):
 
 
 class Window(Parameters):
-    """The part of a path that is scored.
+    """Describes the part of a path that is scored.
 
     Attributes:
         begin: where it begins: the first time that the path is there.
@@ -69,7 +69,7 @@ class Window(Parameters):
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """Windows, and what errors are held to.
+    """States the windows, and what errors are held to.
 
     Attributes:
         windows: the part of a path that is scored, by the name of a folder that a recording lies in;

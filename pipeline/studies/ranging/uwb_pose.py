@@ -31,7 +31,7 @@ from replay.engine.arrays import Floats, Integers
 
 
 class UwbPoseOptions(RangingOptions):
-    """When scoring begins, and how truth is mounted.
+    """States when scoring begins, and how truth is mounted.
 
     Attributes:
         skip_s: scoring begins so long after the first estimate.

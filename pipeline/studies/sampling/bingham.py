@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 
 
 class BinghamOptions(Parameters):
-    """Which estimator is judged beside the others.
+    """Names the estimator that is judged beside the others.
 
     Attributes:
         estimator: label of the estimator that is judged.

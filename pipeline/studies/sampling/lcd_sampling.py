@@ -30,7 +30,7 @@ Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 
 
 class LcdOptions(Parameters):
-    """The sets to optimise, and samplings to draw.
+    """States the sets to optimise, and samplings to draw.
 
     Attributes:
         sizes: dimension and count of each set to optimise.

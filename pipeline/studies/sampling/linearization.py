@@ -26,7 +26,7 @@ REFERENCE = "analytic"
 
 
 class Options(Parameters):
-    """What is averaged over.
+    """States what is averaged over.
 
     Attributes:
         data_seeds: number of seeds of the data to average over.
@@ -38,7 +38,7 @@ class Options(Parameters):
 
 
 class Track(NamedTuple):
-    """One filter's estimates of an ensemble; NaN from where a run failed."""
+    """Holds one filter's estimates of an ensemble; NaN from where a run failed."""
 
     mean: Floats
     """(runs, steps, n)"""
@@ -52,7 +52,7 @@ class Track(NamedTuple):
 
 
 class Ensemble(NamedTuple):
-    """The runs of one seed: their truth (runs, steps, n) after the start, and every filter's track."""
+    """Holds the runs of one seed: truth (runs, steps, n) after the start, and each filter's track."""
 
     sources: list[MemorySource]
     truth: Floats

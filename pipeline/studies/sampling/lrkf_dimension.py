@@ -36,7 +36,7 @@ X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
 class Drive(Parameters):
-    """What is recorded; estimates are judged by their positions.
+    """States what is recorded; estimates are judged by their positions.
 
     Attributes:
         scenario: name of the scenario.
@@ -48,7 +48,7 @@ class Drive(Parameters):
 
 
 class Options(Parameters):
-    """Functions of several dimensions, and drives.
+    """States functions of several dimensions, and drives.
 
     Attributes:
         dimensions: dimensions of the state.
@@ -73,7 +73,7 @@ class Waves(NamedTuple):
 
 
 class Moments(NamedTuple):
-    """Of what a function gives: mean (m,), covariance (m, m), covariance of x with it (n, m)."""
+    """Holds of what a function gives the mean (m,), covariance (m, m), and that of x with it (n, m)."""
 
     mean: Floats
     covariance: Floats

@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 
 class PropagationOptions(Parameters):
-    """Figure 3's sweep.
+    """States figure 3's sweep.
 
     Attributes:
         sigma_rad: standard deviations of the two angles, in rad.
@@ -54,7 +54,7 @@ class PropagationOptions(Parameters):
 
 
 class MomentErrors(NamedTuple):
-    """Errors of mean and covariance, entrywise means, (correlations,); random: (runs, correlations)."""
+    """Holds errors of mean and covariance, means over entries, ([runs,] correlations)."""
 
     mean: Floats
     covariance: Floats
@@ -184,7 +184,7 @@ def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart
 
 
 class FilterOptions(Parameters):
-    """Cases, and the filter on a grid.
+    """States the cases, and the filter on a grid.
 
     Attributes:
         cases: what differs in the scenario's parameters, by the name of a case.

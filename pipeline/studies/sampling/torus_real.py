@@ -64,7 +64,7 @@ SIMPLER = {
 
 
 class Options(Parameters):
-    """How dihedrals and wind are judged.
+    """States how dihedrals and wind are judged.
 
     Attributes:
         folds: number of parts in which dihedrals are held out.
@@ -82,7 +82,7 @@ class Options(Parameters):
 
 
 class Prediction(NamedTuple):
-    """What was said of every hour but the first: log density of what came, and its circular distance."""
+    """Holds for every hour but the first the log density of what came, and its circular distance."""
 
     log_density: Floats
     error_rad: Floats

@@ -30,7 +30,7 @@ SPAN_STEP_S = 0.5
 
 
 class BoundOptions(Parameters):
-    """How bounds follow from errors.
+    """States how bounds follow from errors.
 
     Attributes:
         margin: odometry's bound is its largest error times this.
@@ -44,7 +44,7 @@ class BoundOptions(Parameters):
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """Errors of one robot: bearings and their differences (n,); odometry, largest by span (spans, 2)."""
+    """Holds one robot's errors: bearings and differences (n,); odometry, largest by span (spans, 2)."""
 
     bearing_rad: Floats
     relative_rad: Floats

@@ -14,7 +14,7 @@ from recorders.parameters import Parameters
 
 
 class ConsistencyOptions(Parameters):
-    """When estimators count.
+    """States when estimators count.
 
     Attributes:
         aligned_s: estimators count from then on, since a run's epoch.

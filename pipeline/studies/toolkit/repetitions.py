@@ -44,7 +44,7 @@ def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
 
 
 class Interval(NamedTuple):
-    """The mean of independent values, and where it lies with 95 %."""
+    """Holds the mean of independent values, and where it lies with 95 %."""
 
     mean: float
     low: float

@@ -28,7 +28,7 @@ from replay.judging.tracks.tracks import (
 
 
 class AisOptions(Parameters):
-    """How tracks are counted.
+    """States how tracks are counted.
 
     Attributes:
         live_s: a track is called live for so long after a report.

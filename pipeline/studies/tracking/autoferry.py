@@ -33,7 +33,7 @@ from replay.judging.tracks.errors import Judged, instants_of, tracks_at
 
 
 class AutoferryOptions(Parameters):
-    """What is compared, and late scans.
+    """States what is compared, and which ways to treat late scans are tried.
 
     Attributes:
         compared: pairs of estimators whose figures are compared, the first with the second.

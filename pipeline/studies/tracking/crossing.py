@@ -21,7 +21,7 @@ from replay.judging.tracks.errors import instants_of
 
 
 class CrossingOptions(Parameters):
-    """The cases, and what is compared.
+    """States the cases, and what is compared.
 
     Attributes:
         clutter_per_scan: mean numbers of false detections in a scan.

@@ -27,7 +27,7 @@ TRACK_BYTES = NUMBER_BYTES * (4 + 10)
 
 
 class VehiclesOptions(Parameters):
-    """The cases, and what they are compared with.
+    """States the cases, and what they are compared with.
 
     Attributes:
         cases: what differs in the scenario's parameters, by the name of a case.
@@ -43,7 +43,7 @@ class VehiclesOptions(Parameters):
 
 
 class Scores(NamedTuple):
-    """Total errors (20) of every run, with fixed labels and with the best ones, (runs,).
+    """Holds total errors (20) of every run, with fixed labels and with the best ones, (runs,).
 
     By step the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps); `failed` counts runs that
     did not reach the end. Sets have no labels: NaN.
@@ -63,7 +63,7 @@ class Scores(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One case: its runs, every estimator's scores by label, and what each sends per step in bytes."""
+    """Holds one case: its runs, each estimator's scores by label, and bytes that each sends per step."""
 
     name: str
     sources: Sequence[MemorySource]

@@ -29,7 +29,7 @@ _BLOCK_BYTES = 1 << 24
 
 @dataclass
 class _Pending:
-    """Messages of one size that wait to be read together: their bytes (n, size), rows and stamps."""
+    """Holds messages of one size that wait to be read together: bytes (n, size), rows and stamps."""
 
     raw: list[NDArray[np.uint8]] = field(default_factory=list)
     rows: list[NDArray[np.int64]] = field(default_factory=list)
@@ -37,7 +37,7 @@ class _Pending:
 
 
 class _Import:
-    """The import of one bag: what is chosen of it, what waits to be read, and what is to be told."""
+    """Imports one bag: keeps what is chosen of it, what waits to be read, and what is to be told."""
 
     def __init__(self, bag: Bag, parameters: RosParameters) -> None:
         self.path, self._bag, self._parameters = bag.path, bag, parameters

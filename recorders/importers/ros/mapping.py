@@ -41,7 +41,7 @@ class MessageMapping(StreamMapping):
 
 
 class Mapping(Parameters):
-    """The mappings of a file.
+    """Holds the mappings of a file.
 
     Attributes:
         messages: what becomes of messages, by the name of their type, such as

@@ -20,7 +20,7 @@ Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
 
 
 class Sent(NamedTuple):
-    """Messages (n,) of a topic: their places in it, and their stamps; None where there is no header."""
+    """Holds messages (n,) of a topic: their places in it, and their stamps; None without a header."""
 
     topic: str
     rows: NDArray[np.int64]
@@ -29,7 +29,7 @@ class Sent(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Some messages of a stream, which are one of its parts of a block."""
+    """Holds some messages of a stream, which are one of its parts of a block."""
 
     rows: NDArray[np.int64]
     publish_time_ns: NDArray[np.int64]
@@ -40,7 +40,7 @@ class _Piece(NamedTuple):
 
 @dataclass
 class _Written:
-    """What a stream keeps from its first block to its last."""
+    """Holds what a stream keeps from its first block to its last."""
 
     schema: Schema
     metadata: dict[str, str]

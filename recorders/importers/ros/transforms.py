@@ -23,7 +23,7 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class Transforms:
-    """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
+    """Holds poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
 
     `rows` says of which message of its topic each is.
     """
@@ -91,7 +91,7 @@ def join(parts: Sequence[Transforms]) -> Transforms:
 
 
 class Chain:
-    """A pair of frames, and the transforms that lead from one to the other.
+    """Holds a pair of frames, and the transforms that lead from one to the other.
 
     Args:
         pair: parent and child.

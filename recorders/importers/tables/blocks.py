@@ -36,7 +36,7 @@ def lines_of(file: BinaryIO) -> Iterator[bytes]:
 
 
 class Utf8(io.RawIOBase):
-    """A text's blocks for Arrow, whose handler of rows takes no other bytes than UTF-8."""
+    """Gives a text's blocks to Arrow, whose handler of rows takes no other bytes than UTF-8."""
 
     def __init__(self, blocks: Iterator[bytes]) -> None:
         self._blocks, self._rest = blocks, b""

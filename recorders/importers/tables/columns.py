@@ -13,7 +13,7 @@ from recorders.importers.units import unit
 
 
 class GuessedColumn(NamedTuple):
-    """A column: its name, that without its unit in lower case, the unit, and its numbers (rows,)."""
+    """Holds a column: its name, that without its unit in lower case, the unit, its numbers (rows,)."""
 
     name: str
     plain: str
@@ -22,7 +22,7 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """The columns that no stream has yet, how topics begin, and whether the file's name says truth.
+    """Holds the columns without a stream yet, how topics begin, whether the file's name says truth.
 
     `places` are all columns, by which courses are told, and `made` lines of the table itself.
     """
@@ -145,7 +145,7 @@ def underlined(name: str) -> str:
 
 
 class Direction(NamedTuple):
-    """What a heading is in, whether it is clockwise from north, and why."""
+    """States what a heading is in, whether it is clockwise from north, and why."""
 
     unit: str
     is_compass: bool

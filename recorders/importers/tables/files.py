@@ -48,7 +48,7 @@ DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowEx
 
 @dataclass
 class Table:
-    """A file's table: its columns, what gives its rows, what was left out of them, and was mended."""
+    """Reads a file's table: holds its columns, what was left out of its rows, and what was mended."""
 
     path: Path
     columns: list[str]

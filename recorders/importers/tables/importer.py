@@ -29,7 +29,7 @@ from recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """The mapping, and what differs between recordings.
+    """States the mapping, and what differs between recordings.
 
     Attributes:
         mapping: the mapping, by its name (walk) or file (own.toml).

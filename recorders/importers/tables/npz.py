@@ -16,7 +16,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 class _Array(NamedTuple):
-    """An array of an archive.
+    """Describes an array of an archive.
 
     Attributes:
         member: its name in the archive.
@@ -38,14 +38,14 @@ class _Array(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """A column: of which array, and which one of it."""
+    """Describes a column: of which array, and which one of it."""
 
     array: _Array
     number: int
 
 
 class Columns(NamedTuple):
-    """The columns of an archive, and what reads some of them by their names, block by block."""
+    """Reads columns of an archive by their names, block by block."""
 
     names: list[str]
     read: Callable[[Collection[str]], Iterator[dict[str, NDArray]]]

@@ -26,7 +26,7 @@ ReadCounts = Counter[tuple[str, str]]
 
 
 class Rows:
-    """A file that is being imported: its next batch lies ready, and what is left out is counted.
+    """Imports a file: its next batch lies ready, and what is left out is counted.
 
     `generator` makes the noise that the mapping asks for. Raises BadInput where the file cannot be read,
     or lacks a column that its mapping names.

@@ -40,7 +40,7 @@ NOT_A_TIME = np.iinfo(np.int64).min
 
 
 class TimeMapping(Parameters):
-    """Where a row's time stands.
+    """States where a row's time stands.
 
     Attributes:
         column: one column, or several whose texts belong together, such as date and time.
@@ -260,7 +260,7 @@ def _from_zone(local_ns: Stamps, zone: float | ZoneInfo) -> Stamps:
 
 
 class Counter(NamedTuple):
-    """A file's own counter, in ns: where it begins, when that was, and what one ns of its own takes.
+    """Describes a file's own counter, in ns: where it begins, when that was, what one ns of it takes.
 
     `cut_ns` is the last reading where its line was cut off within it, else NOT_A_TIME.
     """

@@ -34,7 +34,7 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 
 
 class _Sensor(NamedTuple):
-    """The innovations of a sensor: their fields, and what we call them; with the sign that is ours.
+    """Names the innovations of a sensor: their fields, what we call them, and the sign that is ours.
 
     `bits` are by component those of the filter's status that say that it is in use: one of them is set;
     none where no bit says it.
@@ -110,7 +110,7 @@ _FIELDS = tuple(dict.fromkeys(name for sensor in _SENSORS.values() for name in s
 
 
 class _Table(NamedTuple):
-    """Rows (n,) of numbers (n, k) by their key in us, with their stamps."""
+    """Holds rows (n,) of numbers (n, k) by their key in us, with their stamps."""
 
     key_us: NDArray[np.int64]
     time_us: NDArray[np.int64]

@@ -26,7 +26,7 @@ class UlogParameters(Parameters):
 
 
 class _Surroundings(NamedTuple):
-    """The origin of the filter's plane on the earth; None where the log states none."""
+    """Holds the origin of the filter's plane on the earth; None where the log states none."""
 
     origin: Origin | None
 
@@ -53,7 +53,7 @@ def _surroundings(path: Path) -> _Surroundings:
 
 
 class _Import:
-    """The import of one file: its streams, block after block, and what is to be told."""
+    """Imports one file: makes its streams, block after block, and keeps what is to be told."""
 
     def __init__(self, file: UlogFile, origin: Origin | None) -> None:
         self._file, self._origin = file, origin

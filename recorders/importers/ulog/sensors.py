@@ -21,7 +21,7 @@ _INVALID_US = 2**31 - 1
 
 @dataclass(frozen=True)
 class Part:
-    """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
+    """Holds messages (n,) of a stream: when they were measured and logged, in us, and their columns.
 
     Rows where a required number is not finite are left out by whoever makes the stream; `left_out`
     counts others by reason.
@@ -45,7 +45,7 @@ class Part:
 
 
 class Fields(NamedTuple):
-    """The fields of a topic's rows, as numbers."""
+    """Holds the fields of a topic's rows, as numbers."""
 
     rows: Rows
 

@@ -60,11 +60,11 @@ _RECORDS: dict[int, Any] = {
 
 
 class Damaged(ValueError):
-    """A part of a file that cannot be read; says which and why."""
+    """Says which part of a file cannot be read, and why."""
 
 
 class Span(NamedTuple):
-    """Spans from the first to the last time, both included."""
+    """Holds spans from the first to the last time, both included."""
 
     first_ns: int
     last_ns: int
@@ -79,7 +79,7 @@ class Span(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """An opened region: its bytes, where in them the messages of each channel start, what it declares.
+    """Holds an opened region: its bytes, where each channel's messages start, what it declares.
 
     `spans` is empty where there are no messages.
     """
@@ -181,7 +181,7 @@ def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
 
 
 class _Whole(io.BytesIO):
-    """Bytes that never read short, as mcap's records would let pass."""
+    """Reads bytes, and raises where mcap's records would let a short read pass."""
 
     def read(self, size: int | None = -1) -> bytes:
         found = super().read(size)

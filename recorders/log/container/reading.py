@@ -78,7 +78,7 @@ class Container:
 
 
 class _Place(NamedTuple):
-    """One record, bytes that are lost, or a run of loose records.
+    """Holds one record, bytes that are lost, or a run of loose records.
 
     A run is as if it were one message, or one schema where it has declarations alone.
     """
@@ -94,14 +94,14 @@ class _Place(NamedTuple):
 
 
 class _Summary(NamedTuple):
-    """The records of the summary, and where it begins; None where that is not known."""
+    """Holds the records of the summary, and where it begins; None where that is not known."""
 
     records: Sequence[Any] = ()
     start: int | None = None
 
 
 class _Index(NamedTuple):
-    """What a summary says of the chunks, by their place in the file, and of the messages, by channel."""
+    """Holds what a summary says of the chunks, by their place, and of the messages, by channel."""
 
     chunks: dict[int, records.ChunkIndex]
     message_counts: Counter[int]
@@ -116,7 +116,7 @@ class _Index(NamedTuple):
 
 
 class NotMcap(BadInput):
-    """A file of some other kind, which some commands take in another way."""
+    """Says that a file is of some other kind, which some commands take in another way."""
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:

@@ -22,7 +22,7 @@ MOST_WAITING = 1 << 18
 
 
 class _Messages(NamedTuple):
-    """Messages (n,): of which run, when, the place in its file, the number of the topic."""
+    """Holds messages (n,): of which run, when, the place in its file, the number of the topic."""
 
     run: Integers
     time_ns: Integers
@@ -32,7 +32,7 @@ class _Messages(NamedTuple):
 
 @dataclass
 class Attribution:
-    """Innovations by topic, for one estimator.
+    """Counts innovations by topic, for one estimator.
 
     Attributes:
         used, gated: how many were taken, and how many refused, by topic.

@@ -14,7 +14,7 @@ Integers = NDArray[np.int64]
 
 
 class Coverage:
-    """At what intervals a case's estimates come, run by run, in bins of factors of two.
+    """Counts the intervals between a case's estimates, run by run, in bins of factors of two.
 
     Intervals much longer than the usual one, and than a second, are gaps. The last block is counted
     when somebody asks.

@@ -62,7 +62,7 @@ class Row(NamedTuple):
 
 @dataclass
 class Usage:
-    """Counts of one bound estimator, over all runs.
+    """Counts what became of the measurements of one bound estimator, over all runs.
 
     Attributes:
         name: the bound estimator's.

@@ -44,7 +44,7 @@ class Vectors(NamedTuple):
 
 
 class Fixes(NamedTuple):
-    """Measured vectors (n, d), their covariances (n, d, d) and what is missing (n,) of the latter.
+    """Holds measured vectors (n, d), their covariances (n, d, d), and what is missing (n,) of these.
 
     A covariance that the log lacks (NaN, or a variance of zero) is that of the given sigma, and missing
     where none is given. Components of the vector that are NaN need none.

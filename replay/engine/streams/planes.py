@@ -36,7 +36,7 @@ _STATES = {schemas.TRUTH_STATE.full_name: "state", schemas.GAUSSIAN_ESTIMATE.ful
 
 
 class Movement(NamedTuple):
-    """The transform p -> scale rotation p + translation_m from one frame to another."""
+    """Holds the transform p -> scale rotation p + translation_m from one frame to another."""
 
     rotation: Floats = np.eye(3)
     translation_m: Floats = np.zeros(3)

@@ -44,7 +44,7 @@ LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
 
 
 class Subsets(Parameters):
-    """What is fused.
+    """States what is fused.
 
     Attributes:
         subsets: names of the subsets of matchers to fuse; without any, all there are.
@@ -54,7 +54,7 @@ class Subsets(Parameters):
 
 
 class RuleParameters(Subsets):
-    """How scores are normalised and fused.
+    """States how scores are normalised and fused.
 
     Attributes:
         normalisation: how scores are normalised, over all comparisons or, column-min-max, per gallery
@@ -67,7 +67,7 @@ class RuleParameters(Subsets):
 
 
 class LearnerParameters(Subsets):
-    """What a fusion learns from, and what it judges.
+    """States what a fusion learns from, and what it judges.
 
     Attributes:
         seed: seed of folds and impostors.
@@ -87,7 +87,7 @@ class LearnerParameters(Subsets):
 
 
 class ClassifierParameters(LearnerParameters):
-    """A classifier of scikit-learn.
+    """Chooses a classifier of scikit-learn.
 
     Attributes:
         classifier: which one.
@@ -101,7 +101,7 @@ class ClassifierParameters(LearnerParameters):
 
 
 class MixtureParameters(LearnerParameters):
-    """HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
+    """Chooses HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
 
     Attributes:
         topology: how states follow one another; joint is one state, with all scores as its vector.

@@ -17,7 +17,7 @@ UNEVEN = 1e-9  # far more than rounding, and far less than scores say
 
 
 class MixtureHmm(NamedTuple):
-    """A model of s states with g components of m dimensions.
+    """Holds a model of s states with g components of m dimensions.
 
     `initial` (s,), `transition` (s, s), `weights` (s, g), `means` (s, g, m), `covariances`
     (s, g, m, m).

@@ -32,7 +32,7 @@ from replay.engine.compiling.compile import compile_over_runs
 
 
 class Steps(NamedTuple):
-    """The steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
+    """Holds the steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
 
     A row is a prediction with a known increment u, then an update with a measurement z; a row of NaN
     in either leaves that half of the step out.
@@ -65,21 +65,21 @@ def _unit_or_nan(x: NDArray, what: str) -> Floats:
 
 
 class BinghamNoise(NamedTuple):
-    """System noise w and measurement noise v, without batch axes, with modes at or near the identity."""
+    """Holds system noise w and measurement noise v, no batch axes, modes at or near the identity."""
 
     system: Bingham
     measurement: Bingham
 
 
 class Gaussian(NamedTuple):
-    """Gaussian states: mean (..., d) and covariance (..., d, d)."""
+    """Holds Gaussian states: mean (..., d) and covariance (..., d, d)."""
 
     mean: Floats
     covariance: Floats
 
 
 class GaussianNoise(NamedTuple):
-    """Covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
+    """Holds covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
 
     system: Floats
     measurement: Floats

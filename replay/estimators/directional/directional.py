@@ -48,7 +48,7 @@ Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
-    """Distributions of prior and noises; one that is none is what the log's channel states.
+    """States distributions of prior and noises; one that is none is what the log's channel states.
 
     Attributes:
         prior: distribution of the orientation at the start.
@@ -62,7 +62,7 @@ class BinghamParameters(Parameters):
 
 
 class KalmanParameters(BinghamParameters):
-    """How noise is added.
+    """States how noise is added.
 
     Attributes:
         rotated: whether the noise is turned into the state's frame; the paper adds it as it is.
@@ -72,7 +72,7 @@ class KalmanParameters(BinghamParameters):
 
 
 class HeadingsFilterParameters(Parameters):
-    """The model of the scenario `headings`; a number that is none is what the log's channel states.
+    """States the model of `headings`; a number that is none is what the log's channel states.
 
     Attributes:
         coupling_rad: per step the first heading turns by this times the cosine of the second, the second
@@ -95,7 +95,7 @@ class HeadingsFilterParameters(Parameters):
 
 
 class TorusParameters(HeadingsFilterParameters):
-    """The samples of the filter.
+    """States the samples of the filter.
 
     Attributes:
         central_weight: weight of the central one of the five samples (w5 in the paper).
@@ -105,7 +105,7 @@ class TorusParameters(HeadingsFilterParameters):
 
 
 class UnscentedTorusParameters(HeadingsFilterParameters):
-    """How angles are compared.
+    """States how angles are compared.
 
     Attributes:
         wrapped: whether the innovation is taken the short way round; else all is merely modulo 2 pi.
@@ -115,7 +115,7 @@ class UnscentedTorusParameters(HeadingsFilterParameters):
 
 
 class Distributions(NamedTuple):
-    """The prior and both noises."""
+    """Holds the prior and both noises."""
 
     prior: DirectionalNoise
     system: DirectionalNoise

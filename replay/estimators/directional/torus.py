@@ -42,7 +42,7 @@ _VAGUE = 1e18
 
 
 class HeadingModel(NamedTuple):
-    """The system and its noise.
+    """Describes the system and its noise.
 
     Attributes:
         coupling_rad: c in the motion.

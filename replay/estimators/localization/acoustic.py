@@ -155,7 +155,7 @@ def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linear
 
 
 class _Geometry(NamedTuple):
-    """How the shooter stands to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
+    """Holds how the shooter stands to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
 
     azimuth_rad: Floats
     range_m: Floats

@@ -25,7 +25,7 @@ from replay.estimators.localization.solutions import (
 
 
 class ShooterParameters(Parameters):
-    """What the sensors send, and what is estimated.
+    """States what the sensors send, and what is estimated.
 
     Attributes:
         mode: what the sensors send to the fusion centre.

@@ -74,7 +74,7 @@ SENTENCES = {
 
 
 class Bound(NamedTuple):
-    """The CRLB of each run: covariance (runs, n, n) and rank (runs,).
+    """Holds the CRLB of each run: covariance (runs, n, n) and rank (runs,).
 
     A parameter that takes part in an unobservable direction has infinite variance and no covariances.
     """
@@ -84,7 +84,7 @@ class Bound(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Estimates (runs, n), the CRLB at them, and how each run ended; `cost` is half of chi-square."""
+    """Holds estimates (runs, n), the CRLB at them, and how each run ended; `cost` is half chi-square."""
 
     parameters: Floats
     covariance: Floats
@@ -100,7 +100,7 @@ class Solution(NamedTuple):
 
 
 class _Whitened(NamedTuple):
-    """A linearization in standard deviations, and the whitener that made it so."""
+    """Holds a linearization in standard deviations, and the whitener that made it so."""
 
     residual: Floats
     jacobian: Floats

@@ -34,11 +34,11 @@ NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/att
 
 
 class PositionsParameters(Parameters):
-    """There are none: all biases are taken as zero."""
+    """There are no parameters: all biases are taken as zero."""
 
 
 class BiasesParameters(Parameters):
-    """What is known of the biases.
+    """States what is known of the biases.
 
     Attributes:
         known_bias_deg: biases that are known, in deg, such as `sensor_2_roll = 0`; all others are
@@ -49,7 +49,7 @@ class BiasesParameters(Parameters):
 
 
 class Sightings(NamedTuple):
-    """Batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
+    """Holds batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
 
     batches: Batches
     targets: list[int]

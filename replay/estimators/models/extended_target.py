@@ -22,7 +22,7 @@ STATES = 4
 
 
 class ExtendedTargetParameters(ModelParameters):
-    """Variances that are added per step, and that of a point.
+    """States variances that are added per step, and that of a point.
 
     Attributes:
         size_drift_m2: variance that a step adds to half sides.

@@ -27,7 +27,7 @@ LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLA
 
 
 class DeadReckoningParameters(ModelParameters):
-    """What odometry errs by; None takes what the log's channels state.
+    """States what odometry errs by; None takes what the log's channels state.
 
     A noise density is the standard deviation of the readings times the root of the step between them:
     0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).
@@ -50,7 +50,7 @@ class DeadReckoningParameters(ModelParameters):
 
 
 class LocalizationParameters(DeadReckoningParameters):
-    """Noise and bias of the sensors.
+    """States noise and bias of the sensors.
 
     Attributes:
         sigma_heading_rad: standard deviation of a heading, or of a pose's angle, that does not state it.

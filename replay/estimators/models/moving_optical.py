@@ -31,7 +31,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class MovingSightParameters(ModelParameters):
-    """Noise of motion and sights, and the errors of attitudes and clocks.
+    """States noise of motion and sights, and the errors of attitudes and clocks.
 
     Attributes:
         acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).

@@ -29,7 +29,7 @@ _NS = 1e-9
 
 
 class RangingParameters(ModelParameters):
-    """Noise, bias and height of the motion, and how the start is found.
+    """States noise, bias and height of the motion, and how the start is found.
 
     The start is found by least squares in the first ranges, from positions to all sides of the anchors'
     middle.
@@ -58,7 +58,7 @@ class RangingParameters(ModelParameters):
 
 
 class PoseRangingParameters(RangingParameters):
-    """The same, and how the body turns.
+    """States how the body turns, too.
 
     Attributes:
         turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).

@@ -18,7 +18,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class ReactorParameters(ModelParameters):
-    """Time step, and variances per step.
+    """States the time step, and variances per step.
 
     Attributes:
         step_s: length of a time step.

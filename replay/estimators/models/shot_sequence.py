@@ -33,7 +33,7 @@ CUT = 3.0
 
 
 class MovingShooterParameters(ModelParameters):
-    """Noise of motion, sensors and air, and how the start is found.
+    """States noise of motion, sensors and air, and how the start is found.
 
     Attributes:
         acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).

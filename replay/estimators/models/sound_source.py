@@ -31,7 +31,7 @@ WIDER = 100.0  # of the standard deviations of what is found: a start that is wo
 
 
 class SoundSourceParameters(ModelParameters):
-    """The air and the start.
+    """States the air and the start.
 
     The start is found by least squares; its standard deviation is a hundred times what these say, so
     that it counts little beside the differences.

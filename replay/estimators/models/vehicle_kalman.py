@@ -23,7 +23,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class VehicleParameters(ModelParameters):
-    """How the vehicle moves, and the rates of change between its modes.
+    """States how the vehicle moves, and the rates of change between its modes.
 
     Attributes:
         turn_rate_radps: turn rate that the vehicle keeps.

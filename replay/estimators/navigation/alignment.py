@@ -43,7 +43,7 @@ SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and a
 
 
 class AlignmentParameters(ModelParameters):
-    """How the unit is mounted and delayed, and how the state at the start is found.
+    """States how the unit is mounted and delayed, and how the state at the start is found.
 
     Tilt comes from the first samples. The body is assumed to rest until a margin before it first moves.
     The heading is the course at the first speed that is high enough, less the turn of the gyro until

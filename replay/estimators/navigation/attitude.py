@@ -35,7 +35,7 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 
 
 class AttitudeParameters(ModelParameters):
-    """Noise of the unit and of the body's motion, and the uncertainty at the start.
+    """States noise of the unit and of the body's motion, and the uncertainty at the start.
 
     That the velocity is about zero and the field about constant is used once a second, since their
     errors last about as long.

@@ -42,7 +42,7 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 
 
 class NavigationParameters(AlignmentParameters):
-    """Noise of the inertial unit and the other sensors, where they are mounted, and gaps.
+    """States noise of the inertial unit and other sensors, where they are mounted, and gaps.
 
     The biases are those of the body's axes. Gravity and the rotation of the earth are those of the
     plane's origin. If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes

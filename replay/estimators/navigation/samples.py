@@ -20,7 +20,7 @@ NS = 1e-9
 
 
 class ImuSamples(NamedTuple):
-    """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
+    """Holds a unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
 
     time_ns: Integers
     force: Floats
@@ -28,7 +28,7 @@ class ImuSamples(NamedTuple):
 
 
 class GnssMotion(NamedTuple):
-    """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
+    """Holds a receiver's velocities (n, 3), covariances (n, 3, 3), and when they were of (n,)."""
 
     topic: str
     time_ns: Integers

@@ -51,7 +51,7 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 
 
 class CooperativeParameters(Parameters):
-    """How robots use their sightings of each other, and which of them use landmarks.
+    """States how robots use their sightings of each other, and which of them use landmarks.
 
     Noise that is none is what the channels state.
 

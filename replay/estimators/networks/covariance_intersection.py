@@ -35,7 +35,7 @@ CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(
 
 
 class Fusions(NamedTuple):
-    """Mean (..., n), covariance (..., n, n), the weights (..., K) and their certificate `gap` (...,).
+    """Holds mean (..., n), covariance (..., n, n), weights (..., K) and their certificate `gap` (...,).
 
     By the conditions of Karush, Kuhn and Tucker no weights better the criterion (the trace's logarithm,
     or the determinant's divided by n) by more than the gap; it is 0 where a rule optimises nothing. A

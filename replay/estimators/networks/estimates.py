@@ -13,7 +13,7 @@ GOLDEN = 0.6180339887498949
 
 
 class Estimate(NamedTuple):
-    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others.
+    """Holds means (..., n), covariances (..., n, n), and the parts of these independent of all others.
 
     Only split CI looks at the parts.
     """

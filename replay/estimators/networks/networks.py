@@ -54,7 +54,7 @@ FAILURES = ("a covariance is singular or no longer finite",)
 
 
 class NetworkParameters(Parameters):
-    """The fusion rule, what nodes send, and a node that sends false estimates.
+    """States the fusion rule, what nodes send, and a node that sends false estimates.
 
     Attributes:
         rule: the fusion rule; "alone" fuses nothing, "centralised" is one filter with all sensors and no

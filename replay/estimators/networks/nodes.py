@@ -20,7 +20,7 @@ from replay.inference.run.loops import over_stamps
 
 
 class Activities(NamedTuple):
-    """Every moment of every node at which it measures, sends or receives, by run, time and node.
+    """Holds each moment of a node at which it measures, sends or receives, by run, time and node.
 
     Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
     measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
@@ -37,7 +37,7 @@ class Activities(NamedTuple):
 
 
 class Sensing(NamedTuple):
-    """Measurements in the order of their activities: (k, n), NaN where a component is not measured.
+    """Holds measurements in the order of their activities: (k, n), NaN where not measured.
 
     `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
     """

@@ -27,7 +27,7 @@ HALF = np.sqrt(0.5)
 
 
 class AssumedParameters(Parameters):
-    """What is assumed, since the method estimates no covariance.
+    """States what is assumed, since the method estimates no covariance.
 
     Attributes:
         sigma_deg: standard deviation about each axis that is stated.
@@ -42,7 +42,7 @@ class AssumedParameters(Parameters):
 
 
 class MadgwickParameters(AssumedParameters):
-    """The gain; the default is the author's for such a unit.
+    """States the gain; the default is the author's for such a unit.
 
     Attributes:
         gain: gain of the gradient's direction, in rad/s.
@@ -52,7 +52,7 @@ class MadgwickParameters(AssumedParameters):
 
 
 class MahonyParameters(AssumedParameters):
-    """The gains.
+    """States the gains.
 
     Attributes:
         gain: gain of the correction, in 1/s.
@@ -64,7 +64,7 @@ class MahonyParameters(AssumedParameters):
 
 
 class VqfParameters(AssumedParameters):
-    """The time constants.
+    """States the time constants.
 
     Attributes:
         inclination_s: time constant of the correction of inclination.

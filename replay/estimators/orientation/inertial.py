@@ -58,7 +58,7 @@ class InertialModel(NamedTuple):
 
 
 class InertialSamples(NamedTuple):
-    """The samples of many runs end to end, in time order: run r owns offsets[r]:offsets[r + 1].
+    """Holds the samples of many runs in time order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).

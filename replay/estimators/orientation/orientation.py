@@ -35,7 +35,7 @@ Advance = Callable[
 
 
 class InertialParameters(Parameters):
-    """Noise and averaging of inertial samples, the same for all logs.
+    """States noise and averaging of inertial samples, the same for all logs.
 
     Attributes:
         rest_s: the body rests for so long first.
@@ -64,7 +64,7 @@ class InertialParameters(Parameters):
 
 
 class GyroParameters(InertialParameters):
-    """How the gyro's bias is treated.
+    """States how the gyro's bias is treated.
 
     Attributes:
         unbiased: whether the gyro's mean over the rest is subtracted.

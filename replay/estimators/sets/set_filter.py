@@ -78,7 +78,7 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
 class SetFilterParameters(SetParameters):
-    """Bounds of the errors; those that are none are what the channels state.
+    """States bounds of the errors; those that are none are what the channels state.
 
     Over a span of T s the position of the odometry is off by at most `position_error_m` + T
     `position_error_mps`, seen from the pose at the beginning, and its heading by at most
@@ -106,7 +106,7 @@ class SetFilterParameters(SetParameters):
 
 
 class SetStep(NamedTuple):
-    """The estimate at one frame.
+    """Holds the estimate at one frame.
 
     Attributes:
         time_ns: of the frame.

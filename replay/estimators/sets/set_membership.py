@@ -33,7 +33,7 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
 
 class SetParameters(Parameters):
-    """The form of the sets, and the bounds they come from; a bound that is none is the log's.
+    """States the form of the sets, and the bounds they come from; a bound that is none is the log's.
 
     Bearings of one stamp give all their pairs.
 

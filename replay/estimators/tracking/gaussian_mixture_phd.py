@@ -47,7 +47,7 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 class PhdParameters(Parameters):
-    """Motion, births and detections of targets; what is none is what the scans' channel states.
+    """States motion, births and detections of targets; what is none is what the scans' channel states.
 
     Attributes:
         sensor: the sensor to use, such as `network`; without one each sensor has a filter of its own.

@@ -58,7 +58,7 @@ class Mixture(NamedTuple):
 
 
 class Scans(NamedTuple):
-    """Scans of all runs in time order; scan s has the detections first[s]:end[s] of `place` (n, 2)."""
+    """Holds scans of all runs in time order; scan s has detections first[s]:end[s] of `place` (n, 2)."""
 
     offsets: Integers
     time_ns: Integers

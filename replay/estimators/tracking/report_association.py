@@ -38,7 +38,7 @@ class ReportSettings(NamedTuple):
 
 @varying(2)
 class Tracks(NamedTuple):
-    """The tracks of all runs: first axis run, second a place for each track, of which `used` are taken.
+    """Holds the tracks of all runs: axes run and a place for each track, of which `used` are taken.
 
     Attributes:
         used: (runs,); met: (runs,) how many there ever were, which numbers them.
@@ -65,7 +65,7 @@ class Tracks(NamedTuple):
 
 
 class Reports(NamedTuple):
-    """The reports of all runs in time order; velocity (n, 2) with its own variance (n,) besides.
+    """Holds the reports of all runs in time order; velocity (n, 2) with its own variance (n,) besides.
 
     The variance is large where course or speed is not known.
     """

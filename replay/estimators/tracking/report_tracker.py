@@ -48,7 +48,7 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """What is assumed of vessels and their receivers; the same for all.
+    """States what is assumed of vessels and their receivers; the same for all.
 
     There are several levels of noise, the smallest first, which each track weighs.
 

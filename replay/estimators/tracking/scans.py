@@ -19,7 +19,7 @@ ORIGIN = "origin"
 
 
 class SensorTopics(NamedTuple):
-    """The sensors of a log: kind, scans, detections, and the topic of each one's own position or ""."""
+    """Names a log's sensors: kind, scans, detections, and each one's topic of own positions or ""."""
 
     kinds: tuple[int, ...]
     scans: tuple[str, ...]
@@ -33,7 +33,7 @@ class SensorTopics(NamedTuple):
 
 
 class Fix(NamedTuple):
-    """A sensor's own position (2,)."""
+    """Holds a sensor's own position (2,)."""
 
     time_ns: int
     place: Floats

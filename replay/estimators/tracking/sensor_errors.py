@@ -25,7 +25,7 @@ BY_SORT = ("registration", "correlated")
 
 
 class Errors(NamedTuple):
-    """The errors of sensors, the registration errors first.
+    """Describes the errors of sensors, the registration errors first.
 
     Attributes:
         names: of the components.

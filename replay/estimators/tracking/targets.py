@@ -28,7 +28,7 @@ POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 
 
 class TargetParameters(ModelParameters):
-    """How targets move that keep their velocity.
+    """States how targets move that keep their velocity.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration, in m^2/s^3.

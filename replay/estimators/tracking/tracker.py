@@ -55,7 +55,7 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class TrackerParameters(Parameters):
-    """How targets move, how tracks begin and end, and what sensors are like.
+    """States how targets move, how tracks begin and end, and what sensors are like.
 
     What is none is what the channel of a sensor's scans states; a value given here holds for all
     sensors.

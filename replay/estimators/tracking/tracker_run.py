@@ -18,7 +18,7 @@ from replay.inference.association.tracks import Tracks, no_tracks
 
 
 class TrackerSetup(NamedTuple):
-    """A tracker as it is bound to a log: its name, the sensors, their settings, room for tracks."""
+    """Holds a tracker as bound to a log: its name, the sensors, their settings, room for tracks."""
 
     name: str
     found: SensorTopics

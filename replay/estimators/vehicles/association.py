@@ -42,7 +42,7 @@ class Scanning(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """Maps of all runs, sorted by run: the detection of every vehicle (h, vehicles), or MISSED.
+    """Holds maps of all runs, sorted by run: each vehicle's detection (h, vehicles), or MISSED.
 
     `log_weight` (h,) is what scanning alone says, without the likelihood of the places.
     """

@@ -51,7 +51,7 @@ def follow_axis(
 
 
 class Bounds(NamedTuple):
-    """Total errors in m of settled filters, by what is made of the infrastructure sensor.
+    """Holds total errors in m of settled filters, by what is made of the infrastructure sensor.
 
     Each measured combination of the positions is known as with all fixes, the others by own fixes alone.
     """

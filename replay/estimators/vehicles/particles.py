@@ -64,7 +64,7 @@ _choose = compiled(choose_systematically, allocates=False)
 
 
 class ParticlesParameters(Parameters):
-    """The method and its random numbers, which depend on `seed` and on the run's first fixes.
+    """States the method and its random numbers, which depend on `seed` and on the run's first fixes.
 
     Attributes:
         method: what particles are of, and their number, as in associations-60; -topology adds the
@@ -77,7 +77,7 @@ class ParticlesParameters(Parameters):
 
 
 class Cloud(NamedTuple):
-    """The particles of all runs.
+    """Holds the particles of all runs.
 
     Each is a Gaussian of all vehicles (runs * particles, n): of a bootstrap filter its mean alone, the
     covariances are empty. Log weights are (runs, particles). Generators are made when a run's first

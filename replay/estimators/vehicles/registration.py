@@ -26,7 +26,7 @@ LEAST_SPREAD = 5.0
 
 
 class Registration(NamedTuple):
-    """Sensor poses (runs, 3), the detection of every vehicle, and whether both can be believed."""
+    """Holds sensor poses (runs, 3), the detection of every vehicle, and whether both can be believed."""
 
     pose: Floats
     detection: Integers

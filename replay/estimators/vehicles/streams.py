@@ -52,7 +52,7 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """The method, and what it may assume.
+    """States the method, and what it may assume.
 
     Attributes:
         method: `FIXES` or `FIXES-SENSOR`: how fixes are used, and what of the roadside sensor is, as in
@@ -102,7 +102,7 @@ class Frames(NamedTuple):
 
 
 class VehiclesResults(NamedTuple):
-    """Means (runs, frames, n) and covariances after every frame, and maps where single ones are used.
+    """Holds means (runs, frames, n), covariances after every frame, and maps where single ones are used.
 
     `associated` has arrays (runs, frames, vehicles, ...); NaN innovations where nothing was associated.
     """

@@ -20,7 +20,7 @@ Numbers = NDArray  # real or complex
 
 
 class Pseudo(NamedTuple):
-    """A pseudo-measurement at p: what is expected (..., n), its Jacobian by p, a factor W of its noise.
+    """Holds a pseudo-measurement at p: expectation (..., n), Jacobian by p, a factor W of its noise.
 
     The Jacobian is (..., n, n), W (..., n, terms).
     """

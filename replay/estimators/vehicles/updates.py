@@ -59,7 +59,7 @@ SENSOR = {
 
 
 class Setup(NamedTuple):
-    """A bound method: what it is told. `numbers` are the vehicles', as in the names of their topics."""
+    """Holds what a bound method is told; `numbers` are the vehicles', as in their topics' names."""
 
     name: str
     numbers: tuple[int, ...]
@@ -119,7 +119,7 @@ def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) ->
 
 
 class Associated(NamedTuple):
-    """A single map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
+    """Holds one map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
 
     detection: Integers
     innovation: Floats

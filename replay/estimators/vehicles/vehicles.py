@@ -23,7 +23,7 @@ TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
 
 
 class Joint(NamedTuple):
-    """Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
+    """Holds Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
 
     mean: Floats
     covariance: Floats
@@ -111,7 +111,7 @@ def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joi
 
 
 class Weighed(NamedTuple):
-    """Hypotheses with their scores: log weight and likelihood of the innovations, zero where missed.
+    """Holds hypotheses with scores: log weight and likelihood of the innovations, zero where missed.
 
     `group` (h,) says which row of the gains a hypothesis has; those of a run that miss the same vehicles
     share one. `group_run` is the run of each row.
@@ -215,7 +215,7 @@ def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats
 
 
 class Scalar(NamedTuple):
-    """A linearised scalar measurement: rows (runs, 1, n), innovations (runs,) with their variances.
+    """Holds a linearised scalar measurement: rows (runs, 1, n), innovations (runs,), their variances.
 
     `noise` (runs,) is the measurement's part of the variance.
     """

@@ -136,7 +136,7 @@ def check_model(
 
 
 class Checked(tuple[str, ...]):
-    """Sentences on what was checked; a notebook shows them line by line."""
+    """Holds sentences on what was checked; a notebook shows them line by line."""
 
     def __repr__(self) -> str:
         return "\n".join(self)

@@ -32,7 +32,7 @@ from replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_
 
 
 class BoundParameters(MethodParameters):
-    """Whose bound it is, and how truth is read.
+    """States whose bound it is, and how truth is read.
 
     Attributes:
         of: whether the bound of filters or that of smoothers.

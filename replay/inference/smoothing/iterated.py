@@ -40,7 +40,7 @@ from replay.inference.smoothing.smoothers import Smoother, SmootherParameters
 
 
 class IteratedParameters(SmootherParameters):
-    """Options of smoother:iterated: the start of the search, its damping, and the loss of outliers.
+    """Defines options of smoother:iterated: where the search starts, its damping, the loss of outliers.
 
     Attributes:
         start: where the search starts: smoother (the extended filter, smoothed once), motion (the

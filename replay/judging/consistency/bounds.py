@@ -34,7 +34,7 @@ MOST_BYTES = 1 << 28  # of the sums
 
 
 class Products(NamedTuple):
-    """F'Q^-1F, F'Q^-1, Q^-1 and H'R^-1H of steps, or their means: (steps, t, t) each."""
+    """Holds F'Q^-1F, F'Q^-1, Q^-1 and H'R^-1H of steps, or their means: (steps, t, t) each."""
 
     before: Floats
     across: Floats
@@ -44,7 +44,7 @@ class Products(NamedTuple):
 
 @dataclass
 class Bounds:
-    """Sums over the runs of one stream of steps.
+    """Sums what the bound is made of over the runs of one stream of steps.
 
     Attributes:
         components: names and kinds of the tangent space.

@@ -19,7 +19,7 @@ EACH, FEWEST, MOST = 64, 8, 256
 
 
 class Conditioning(NamedTuple):
-    """What samples of a topic's covariances are like.
+    """States what samples of a topic's covariances are like.
 
     Attributes:
         sampled: how many were looked at.

@@ -19,7 +19,7 @@ Booleans = NDArray[np.bool_]
 
 
 class Rates(NamedTuple):
-    """Rates of error of a test: of accepting an impostor, and of rejecting the person."""
+    """States a test's rates of error: of accepting an impostor, and of rejecting the person."""
 
     false_accept: float
     false_reject: float

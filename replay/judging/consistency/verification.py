@@ -20,7 +20,7 @@ FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)
 
 
 class Roc(NamedTuple):
-    """Rates (n,) at falling thresholds, from nothing accepted to everything."""
+    """Holds rates (n,) at falling thresholds, from nothing accepted to everything."""
 
     threshold: Floats
     false_accept: Floats
@@ -28,7 +28,7 @@ class Roc(NamedTuple):
 
 
 class Fused(NamedTuple):
-    """Fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
+    """Holds fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
 
     `fold` (users,) is that of the cross validation, `threshold` what the fusion decides by; None where
     it has none. `is_ratio`: the scores are log-likelihood ratios.

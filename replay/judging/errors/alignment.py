@@ -31,7 +31,7 @@ LEAST_COSINE = 1 - 1e-12
 
 
 class Alignment(Movement):
-    """The transform p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
+    """Holds p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
 
 
 def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
@@ -117,7 +117,7 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
 
 @dataclass(frozen=True, repr=False)
 class AlignedEstimates(LogSource):
-    """A log whose estimates of some topics are in the truth's frame."""
+    """Represents a log whose estimates of some topics are in the truth's frame."""
 
     alignments: Mapping[str, Alignment] = field(default_factory=dict)
 

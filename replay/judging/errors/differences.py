@@ -60,7 +60,7 @@ TARGETS: dict[str, Target] = {
 
 
 class Difference(NamedTuple):
-    """A metric of two estimators over the same runs.
+    """States the difference of a metric of two estimators over the same runs.
 
     Attributes:
         first, second: the means over the runs.

@@ -75,7 +75,7 @@ class Comparison:
 
 
 class Compared(NamedTuple):
-    """An estimated trajectory against the true one, pose by pose.
+    """Holds an estimated trajectory against the true one, pose by pose.
 
     Attributes:
         estimate: the poses that have truth, aligned with it.

@@ -27,7 +27,7 @@ class Doubt(NamedTuple):
 
 
 class Truths:
-    """The truths of one run, for readers that each go through it in time."""
+    """Reads the truths of one run, for readers that each go through it in time."""
 
     def __init__(self, source: Source) -> None:
         self.source = source

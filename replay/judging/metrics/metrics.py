@@ -62,7 +62,7 @@ def rmse_of(component: str) -> str:
 
 @dataclass
 class Consistent:
-    """Sums of NEES: over all, and by step over the runs.
+    """Sums NEES: over all, and by step over the runs.
 
     Attributes:
         count, total: of finite NEES of the state.

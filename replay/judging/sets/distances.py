@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 
 
 class Gospa(NamedTuple):
-    """GOSPA and what it is made of: total**order = localisation + missed + false."""
+    """Holds GOSPA and what it is made of: total**order = localisation + missed + false."""
 
     total: float
     localisation: float
@@ -78,7 +78,7 @@ def gospa_pairs(
 
 
 class _Costs(NamedTuple):
-    """Sizes of the sets, and the best pairs: cut-off distances to the power of the order, and who."""
+    """Holds the sizes of the sets, and the best pairs: who, and distances to the power of the order."""
 
     estimates: int
     truths: int

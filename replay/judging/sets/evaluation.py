@@ -23,7 +23,7 @@ PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 @dataclass(frozen=True)
 class JudgedSets:
-    """The sets of one estimator and case, a row per frame.
+    """Holds the sets of one estimator and case, a row per frame.
 
     `inside` says whether the truth is in the set, where it is `known`, `in_arena` whether it is where
     the robot was taken to be, and `bound_holds` whether all relative bearings of the frame keep their

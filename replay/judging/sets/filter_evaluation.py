@@ -26,7 +26,7 @@ POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 
 @dataclass(frozen=True)
 class JudgedFilter:
-    """The sets of one robot over time, a row per frame of all runs.
+    """Holds the sets of one robot over time, a row per frame of all runs.
 
     Attributes:
         sets: area, and whether the truth is inside.

@@ -26,7 +26,7 @@ THRESHOLDS = np.arange(1, 20) / 20.0
 
 
 class TrajectoryGospa(NamedTuple):
-    """Trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
+    """Holds trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
 
     total: float
     localisation: float
@@ -36,7 +36,7 @@ class TrajectoryGospa(NamedTuple):
 
 
 class Hota(NamedTuple):
-    """HOTA and what it is made of, (thresholds,): hota**2 = detection * association."""
+    """Holds HOTA and what it is made of, (thresholds,): hota**2 = detection * association."""
 
     hota: Floats
     detection: Floats

@@ -29,14 +29,14 @@ NONE = -1
 
 
 class TracksAt(NamedTuple):
-    """The tracks at one instant: their numbers (n,), and where they are (n, 2)."""
+    """Holds the tracks at one instant: their numbers (n,), and where they are (n, 2)."""
 
     number: Integers
     place: Floats
 
 
 class TrackErrors(NamedTuple):
-    """Tracks of one run, judged at k instants; distances in m, GOSPA's parts in m^2.
+    """Holds tracks of one run, judged at k instants; distances in m, GOSPA's parts in m^2.
 
     Attributes:
         gospa_all: (k,), of all tracks.
@@ -59,7 +59,7 @@ class TrackErrors(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The instants (k,) at which the tracks of a run are judged, and the truths (targets, k, 2) then."""
+    """Holds the instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2)."""
 
     time_ns: Integers
     truths: Floats

@@ -146,7 +146,7 @@ def _natural(name: str) -> list[tuple[str, int]]:
 
 @dataclass(frozen=True)
 class Dates:
-    """Two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
+    """Holds two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
 
     Between two stamps the difference is linear, and before the first and after the last it stays.
     """

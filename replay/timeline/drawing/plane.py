@@ -111,7 +111,7 @@ def draw_scans(
 
 
 class Cloud(NamedTuple):
-    """The particles of an estimator that are drawn.
+    """Holds the particles of an estimator that are drawn.
 
     Attributes:
         estimator: whose they are.

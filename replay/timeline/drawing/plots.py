@@ -48,7 +48,7 @@ POINTS: Style = partial(rr.SeriesPoints, marker_sizes=[1.5])
 
 
 class Squares(NamedTuple):
-    """Chi-square values of an estimator and their degrees of freedom; `of` is what they are of.
+    """Holds chi-square values of an estimator, degrees of freedom; `of` is what they are of.
 
     It is empty where the degrees tell.
     """

@@ -41,7 +41,7 @@ Rows = TypeVar("Rows", Stream, Errors)
 
 
 class Thinned(Generic[Rows]):
-    """The rows of a stream as they come, about `limit` after a while and at most twice as many.
+    """Keeps rows of a stream as they come, about `limit` after a while and at most twice as many.
 
     Time is cut into cells of a power of two of nanoseconds. Of each, what is kept are the rows of the
     last stamp, and of those where one of the curves has its least and its greatest value there, so that
@@ -160,7 +160,7 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
 
 
 class Thin:
-    """The outputs of a run and the errors of its estimates, thinned; the last stamp of an output."""
+    """Thins the outputs of a run and the errors of its estimates; keeps the last stamp of an output."""
 
     def __init__(self, rows: int, errors: int) -> None:
         self._rows, self._errors_rows = rows, errors
@@ -197,7 +197,7 @@ class Thin:
 
 @dataclass(frozen=True)
 class Held:
-    """A source of which some topics are held in memory already, thinned or in part."""
+    """Represents a source of which some topics are held in memory already, thinned or in part."""
 
     of: Source
     streams: Mapping[str, Stream]
@@ -250,7 +250,7 @@ class Held:
 
 
 class Sensed:
-    """The sensor streams and truths of a source, read along with a replay of it.
+    """Reads the sensor streams and truths of a source along with a replay of it.
 
     Maps, and what is said but once, such as where a sensor is mounted, hold for every span of the run.
     """

@@ -45,7 +45,7 @@ AXES: tuple[Colour, Colour, Colour] = ((230, 60, 60), (80, 200, 80), (80, 120, 2
 
 
 class Track(NamedTuple):
-    """States (n, d) of truth or an estimator, with covariances (n, t, t) where it has them."""
+    """Holds states (n, d) of truth or an estimator, with covariances (n, t, t) where it has them."""
 
     name: str
     colour: Colour

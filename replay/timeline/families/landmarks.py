@@ -50,7 +50,7 @@ FRESH_NS = 500_000_000
 
 
 class Track(NamedTuple):
-    """Poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
+    """Holds poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
 
     A heading that is not stated is NaN.
     """

@@ -64,7 +64,7 @@ CELL_M, SHOWN_M = 8.0, 3.8
 
 
 class Vehicles(NamedTuple):
-    """The true places (steps, vehicles, 2) of all vehicles at their common stamps (steps,)."""
+    """Holds the true places (steps, vehicles, 2) of all vehicles at their common stamps (steps,)."""
 
     time_ns: Times
     places: Floats
@@ -80,7 +80,7 @@ class Vehicles(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Places (n, 2) at stamps (n,), sorted."""
+    """Holds places (n, 2) at stamps (n,), sorted."""
 
     time_ns: Times
     places: Floats

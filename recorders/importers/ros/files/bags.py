@@ -21,7 +21,7 @@ _ZSTD = ".zstd"
 
 @dataclass
 class Bag:
-    """The files of one bag, in the order of their splits, and what is known to be missing.
+    """Holds the files of one bag, in the order of their splits, and what is known to be missing.
 
     `stated` is how many messages metadata.yaml says that each topic has; where `is_packed`, every
     message is compressed by itself.

@@ -20,7 +20,7 @@ _LOG_TIME = HEAD_BYTES + 6
 
 
 class McapFile:
-    """An MCAP file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """Reads an MCAP file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

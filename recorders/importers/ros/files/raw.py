@@ -33,7 +33,7 @@ class Connection(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Some messages (n,) of a connection, in file order: where in `data` they are, and their stamps."""
+    """Holds some messages (n,) of a connection, in file order: their place in `data`, and stamps."""
 
     connection: Connection
     data: NDArray[np.uint8]

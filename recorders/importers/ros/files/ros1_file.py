@@ -33,7 +33,7 @@ _DECOMPRESS: dict[bytes, Callable[[bytes], bytes]] = {
 
 
 class _Record(NamedTuple):
-    """A record of the file: its header, and where its data is."""
+    """Holds a record of the file: its header, and where its data is."""
 
     header: dict[str, bytes]
     begin: int
@@ -46,7 +46,7 @@ class _Record(NamedTuple):
 
 
 class _Scanned(NamedTuple):
-    """The records of a chunk (n,): what they are, of which connection, when, and where their data is.
+    """Holds the records of a chunk (n,): what they are, which connection's, when, where their data is.
 
     `end` is where the walk stopped: the chunk's length, or the first record that is not whole.
     """
@@ -61,7 +61,7 @@ class _Scanned(NamedTuple):
 
 
 class Ros1File:
-    """A .bag file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """Reads a .bag file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

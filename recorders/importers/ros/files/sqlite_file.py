@@ -23,7 +23,7 @@ _Row = tuple[int, int, bytes]
 
 
 class SqliteFile:
-    """A .db3 file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """Reads a .db3 file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
