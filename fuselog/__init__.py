@@ -1,4 +1,4 @@
-"""The public interface: what programs, notebooks and plug-ins import; docs/python.md shows how.
+"""Offers the public interface that programs, notebooks and plug-ins import; docs/python.md shows how.
 
 Names are imported when they are first asked for, from the places that the stub beside this file lists:
 `import fuselog` is quick, and editors and type checkers see everything.

@@ -1,4 +1,4 @@
-"""The streams of a sound that microphones heard: differences of its arrivals, and where they are."""
+"""Makes the streams of a sound that microphones heard: differences of arrivals, and their places."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""The one exception for what a user can mend, and how its sentences are worded and shown."""
+"""Defines the one exception for what a user can mend, and how its sentences are worded and shown."""
 
 from collections.abc import Collection
 from itertools import islice

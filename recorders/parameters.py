@@ -1,4 +1,4 @@
-"""Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
+"""Reads parameters of scenarios, estimators, experiments: typed, bounded, refused with a sentence."""
 
 import math
 import re

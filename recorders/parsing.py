@@ -1,4 +1,4 @@
-"""JSON and TOML from outside: parsed, or refused as the one kind of error that says why.
+"""Parses JSON and TOML from outside, or refuses them as the one kind of error that says why.
 
 The parsers of the standard library also raise RecursionError, and accept what is nested so deeply that
 any code that walks it would.

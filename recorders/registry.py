@@ -1,4 +1,4 @@
-"""Recorders, estimators, metrics and studies by name.
+"""Finds recorders, estimators, metrics and studies by name.
 
 All register in one way, ours and third parties' alike: as entry points of an installed distribution
 (groups `fuselog.recorders`, `fuselog.estimators`, `fuselog.metrics`, `fuselog.studies`,

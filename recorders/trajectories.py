@@ -1,4 +1,4 @@
-"""Trajectory files as benchmarks exchange them: TUM, KITTI and EuRoC.
+"""Reads and writes trajectories as benchmarks exchange them: TUM, KITTI and (read only) EuRoC.
 
 A line of a TUM file is time (s), position and quaternion x, y, z, w; of a KITTI file the upper three
 rows of a pose's matrix, without a stamp; of a EuRoC file, with commas, time (ns), position, quaternion

@@ -1,4 +1,4 @@
-"""Faults of logs, put into streams or taken out of them: each is a function of streams and one number.
+"""Puts faults into streams, or takes them out: each is a function of streams and one number.
 
 With the opposite number a fault is undone, but for what is lost. So one set of functions says what a
 diagnosis supposes, and what the experiment puts into logs to be found.

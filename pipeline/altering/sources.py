@@ -1,4 +1,4 @@
-"""Runs with some of their topics altered, as `--set /fix.delay_s=0.3` says; the files stay as they are.
+"""Alters topics of runs, as `--set /fix.delay_s=0.3` says; the files stay as they are.
 
 A log is altered block by block. A topic whose stamps move is read for itself, and merged with the others
 by its new stamps: memory holds a block of each, however far the stamps move.

@@ -1,4 +1,4 @@
-"""Estimates logs judged by the truth of the logs that they are of, as `fuselog evaluate` prints it."""
+"""Judges estimates logs by the truth of the logs that they are of, as `fuselog evaluate` prints it."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext

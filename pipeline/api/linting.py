@@ -1,4 +1,4 @@
-"""Lints a log: what is wrong with it as it is written, before any filter."""
+"""Lints a log: finds what is wrong with it as it is written, before any filter."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

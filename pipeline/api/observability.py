@@ -1,4 +1,4 @@
-"""Observability of logs: a table for Python, and the command that prints it."""
+"""Measures the observability of logs: makes a table for Python, and the command prints it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

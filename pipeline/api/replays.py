@@ -1,4 +1,4 @@
-"""A replay as a function: logs and estimators in, and all that can be asked of what they gave.
+"""Replays as a function: takes logs and estimators, and answers all that can be asked of the result.
 
 The estimates lie in a scratch folder for as long as the replay is referred to: memory holds the metrics'
 sums, and what is asked for.

@@ -1,4 +1,4 @@
-"""Trajectories evaluated: of two files, or of the estimates that logs hold; numbers, tables, figures."""
+"""Evaluates trajectories, of two files or of the estimates that logs hold: numbers, tables, figures."""
 
 import hashlib
 from collections.abc import Mapping, Sequence

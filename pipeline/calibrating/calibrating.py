@@ -1,4 +1,4 @@
-"""Calibration: how sensors are mounted, scaled, biased and delayed, by the search of `tune`.
+"""Calibrates by the search of `tune`: how sensors are mounted, scaled, biased and delayed.
 
 A model says which of its parameters these are, see `replay.inference.model.model.Model`.
 """

@@ -1,4 +1,4 @@
-"""A car whose calibration is to be found: wheels, fixes of an antenna, a compass; each errs.
+"""Simulates a car whose calibration is to be found: wheels, fixes of an antenna, a compass; each errs.
 
 Scales and the bias are of the readings by the motion here; the model's, of the motion by the readings,
 are in `OURS`.

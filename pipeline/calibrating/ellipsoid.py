@@ -1,4 +1,4 @@
-"""The calibration of a magnetometer or an accelerometer by turning it: offsets, scales, cross terms.
+"""Calibrates a magnetometer or an accelerometer by turning it: offsets, scales, cross terms.
 
 The field of the Earth and gravity have one length, whichever way a unit is turned. So corrected readings
 lie on a sphere, and readings on an ellipsoid, see `ellipsoid_fit`.

@@ -1,4 +1,4 @@
-"""The ellipsoid on which readings of a constant vector lie, however the unit is turned.
+"""Fits the ellipsoid on which readings of a constant vector lie, however the unit is turned.
 
 A sensor reads m = A^-1 u + b + n of a vector u of known length, with noise n that is alike in all
 directions. The length tells b and the symmetric A, by maximum likelihood; it does not tell a rotation

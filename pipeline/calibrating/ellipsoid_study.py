@@ -1,4 +1,4 @@
-"""The study of ellipsoids: how often their intervals hold the truth.
+"""Studies ellipsoids: how often their intervals hold the truth.
 
 A magnetometer is turned steadily, an accelerometer put down in many positions; both err by offsets,
 scales and cross terms.

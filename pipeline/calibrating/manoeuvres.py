@@ -1,4 +1,4 @@
-"""Which manoeuvre to record next: what each would add to what logs tell of a calibration.
+"""Says which manoeuvre to record next: what each would add to what logs tell of a calibration.
 
 Wheeled manoeuvres are simulated without noise, with the sensors, steps and noise of the log and the
 values that were found, and asked for their information. Which is best depends on what is wanted: the

@@ -1,4 +1,4 @@
-"""The study of calibration: how often its intervals hold the truth, and what each motion leaves open.
+"""Studies calibration: how often its intervals hold the truth, and what each motion leaves open.
 
 Cars are calibrated one by one, from a start that knows nothing. What a motion determines is asked of a
 log without noise, under a prior so wide that it tells nothing.

@@ -1,4 +1,4 @@
-"""Checking logs and results against a golden: what is replayed, and what is said of it."""
+"""Checks logs and results against a golden: what is replayed, and what is said of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Goldens: small stored replays that later ones are checked against, field by field.
+"""Makes goldens: small stored replays that later ones are checked against, field by field.
 
 A golden is packed JSON: settings, a hash of every input, tolerances, and of every output stream the
 number of rows, the metadata, hashes of both clocks, a checksum of each row, and of every column some

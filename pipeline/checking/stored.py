@@ -1,4 +1,4 @@
-"""Goldens as files: packed JSON, which a reader believes nothing but what it has looked at."""
+"""Reads and writes goldens: packed JSON, of which the reader believes only what it has checked."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""A command's help: its docstring, and below it commands to try."""
+"""Makes a command's help: its docstring, and below it commands to try."""
 
 import inspect
 from collections.abc import Callable

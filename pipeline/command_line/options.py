@@ -1,4 +1,4 @@
-"""Types of options, and the options that several commands have."""
+"""Defines types of options, and the options that several commands have."""
 
 import os
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The command line as a process: its exit code, what stops it, what it says of errors."""
+"""Runs the command line as a process: its exit code, what stops it, what it says of errors."""
 
 import io
 import logging

@@ -1,4 +1,4 @@
-"""The candidates of a comparison: what an estimator gave of every run, wherever that comes from.
+"""Reads the candidates of a comparison: what each gave of every run, wherever that comes from.
 
 A candidate's estimates are in logs, as `fuselog replay` writes them, or are made by a replay from what a
 result says of itself. What comes of a trajectory file is an estimate stream like any other.

@@ -1,4 +1,4 @@
-"""Comparing estimators: paired differences of every metric over the same runs, with a verdict each."""
+"""Compares estimators: paired differences of every metric over the same runs, with a verdict each."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence

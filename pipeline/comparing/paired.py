@@ -1,4 +1,4 @@
-"""A metric of two candidates, and the verdict on it; withheld where stress moves it further."""
+"""Judges a metric of two candidates; the verdict is withheld where stress moves it further."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The estimates of one label as a source of its own, under the name that a comparison has for it."""
+"""Gives the estimates of one label as a source, under the name that a comparison has for it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""A recorded log as a test of a filter in C: what it is handed, and what ours makes of it."""
+"""Makes a recorded log a test of a filter in C: what it is handed, and what ours makes of it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace

@@ -1,4 +1,4 @@
-"""The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
+"""Finds the likeliest causes of an inconsistent filter: the hypotheses that gain most, in turn."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""The study of diagnosing: faults put into logs and settings, and how often a diagnosis names them.
+"""Studies diagnosing: faults put into logs and settings, and how often a diagnosis names them.
 
 Faults that cannot be told apart are one kind: a bearing's bias and its sensor's turned frame; and it is
 only between two frames, or two clocks, that a turn or a drift is seen, so that either may be named. What

@@ -1,4 +1,4 @@
-"""`fuselog explore` as a function: a page on which a filter's parameters are dragged."""
+"""Offers `fuselog explore` as a function: a page on which a filter's parameters are dragged."""
 
 import webbrowser
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""The page's words as HTML: verdicts, numbers, the labels of sliders. All text is escaped."""
+"""Writes the page's words as HTML: verdicts, numbers, labels of sliders. All text is escaped."""
 
 from html import escape
 

@@ -1,4 +1,4 @@
-"""The page: sliders, plots and words, bound to a session. All replays run in the background."""
+"""Builds the page: sliders, plots and words, bound to a session. Replays run in the background."""
 
 from collections.abc import Callable, Mapping
 from functools import partial

@@ -1,4 +1,4 @@
-"""The plots of the page, and what fills them: Bokeh figures over sources that change while one drags."""
+"""Makes the plots of the page, and fills them: Bokeh figures over sources that change with a drag."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""A log in memory and the filters on it: what a change of settings does, without server or browser."""
+"""Keeps a log in memory and the filters on it, without server or browser: replays what changes."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""The page's sliders, buttons and choices, as Bokeh has them."""
+"""Makes the page's sliders, buttons and choices, as Bokeh has them."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any

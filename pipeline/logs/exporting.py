@@ -1,4 +1,4 @@
-"""Logs exported for other tools: estimates and truths as trajectories, any stream as a table.
+"""Exports logs for other tools: estimates and truths as trajectories, any stream as a table.
 
 A log is read once, block by block, so that memory does not grow with it, but for tracks, which are told
 frame by frame. No file is ever replaced.

@@ -1,4 +1,4 @@
-"""Tracks and truths as lines of the MOT Challenge, which TrackEval reads.
+"""Writes tracks and truths as lines of the MOT Challenge, which TrackEval reads.
 
 A frame is every half second from the run's epoch on, the first one has number 1. Tracks are predicted to
 it, truths interpolated. A target has no extent: its box begins where it is, in metres, and has no width

@@ -1,4 +1,4 @@
-"""Charts: figures made of series over axes, described once.
+"""Describes charts once: figures made of series over axes.
 
 A study says what there is to see: series, bands, labels with their units. The result folder keeps that
 as JSON, beside the SVG picture that is drawn of it here; the report draws it for a person to zoom.

@@ -1,4 +1,4 @@
-"""Claims: statements of papers with our verdicts.
+"""Decides claims: statements of papers with our verdicts.
 
 A claim is stated as data, beside an experiment's settings: a sentence, what the paper says, and a
 comparison of metrics that decides it; see `pipeline.output.expressions`.

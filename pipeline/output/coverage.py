@@ -1,4 +1,4 @@
-"""The table `coverage`: what became of every topic of a log; nothing is unused in silence."""
+"""Makes the table `coverage`: what became of every topic of a log; nothing is unused in silence."""
 
 import json
 import math

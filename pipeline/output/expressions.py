@@ -1,4 +1,4 @@
-"""Expressions over the metrics of a result: what claims are decided by, and numbers in their sentences.
+"""Evaluates expressions over a result's metrics, which decide claims and give their numbers.
 
     nees[ekf, robot1]          the metric `ekf.nees.robot1`
     nees[ekf]                  the metric `ekf.nees`

@@ -1,4 +1,4 @@
-"""Numbers with their 95 % intervals, and what expressions do with them.
+"""Computes with numbers and their 95 % intervals, as expressions need it.
 
 What an interval leaves open is neither true nor false. Operations and comparisons on lists are entry by
 entry.

@@ -1,4 +1,4 @@
-"""Quantities and numbers in words: what a person reads where a result has `position_rmse_m`."""
+"""Puts quantities and numbers in words: what a person reads for `position_rmse_m`."""
 
 import math
 import re

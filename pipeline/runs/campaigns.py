@@ -1,4 +1,4 @@
-"""Campaigns: an experiment cut into cells, worked off in any order, merged in the cells' own.
+"""Cuts an experiment into cells, works them off in any order, and merges them in their own.
 
 A cell is a part of the runs. What it gives depends on its description and on the code alone, so that it
 may be worked off anywhere, and once is enough: finished cells are kept until all are done, and the same

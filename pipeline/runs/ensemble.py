@@ -1,4 +1,4 @@
-"""Ensembles: recorded, replayed and judged, in one streamed pass or whole in memory.
+"""Records, replays and judges ensembles, in one streamed pass or whole in memory.
 
 Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """

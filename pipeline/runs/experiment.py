@@ -1,4 +1,4 @@
-"""Experiments: scenario (or real data, or logs) x estimators x metrics, one TOML file each."""
+"""Reads and runs experiments: scenario (or real data, or logs) x estimators x metrics, in TOML."""
 
 import os
 import warnings

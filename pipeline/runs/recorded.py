@@ -1,4 +1,4 @@
-"""Ensembles whole in memory: recorded, replayed and judged at once, where there is room."""
+"""Records, replays and judges ensembles whole in memory, where there is room."""
 
 import time
 from collections.abc import Mapping, Sequence

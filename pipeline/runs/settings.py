@@ -1,4 +1,4 @@
-"""Parameters of estimators as commands take them: by --set, a settings file, options of their own."""
+"""Reads parameters of estimators as commands take them: --set, a settings file, own options."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Sweeps: an experiment at many points of its parameters, a grid or samples."""
+"""Runs sweeps: an experiment at many points of its parameters, a grid or samples."""
 
 import itertools
 import math

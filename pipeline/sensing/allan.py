@@ -1,4 +1,4 @@
-"""The overlapping Allan deviation, and intervals from the degrees of freedom that a model gives it.
+"""Computes the overlapping Allan deviation, and intervals by a model's degrees of freedom.
 
 NIST SP 1065 has the definitions. Degrees of freedom are exact for any sum of Gaussian terms: with M
 second differences of autocovariance g, they are M^2 g_0^2 / sum over |k| < M of (M - |k|) g_k^2.

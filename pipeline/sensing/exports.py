@@ -1,4 +1,4 @@
-"""Noise as the settings of other programs: which number each reads, in which unit.
+"""Writes noise as the settings of other programs: which number each reads, in which unit.
 
 A filter takes the larger of three axes, so that none is stated too small. Continuous densities are N in
 unit/sqrt(Hz) and K in unit/sqrt(s); who wants a standard deviation per step divides by its root.

@@ -1,4 +1,4 @@
-"""Maximum likelihood of a sensor's noise: which terms there are, how large, and how well that is known.
+"""Fits a sensor's noise by maximum likelihood: which terms, how large, how well that is known.
 
 A walk of zero is at the boundary of what may be: with no walk at all its likeliest density is zero in
 two of three recordings, so "none found, and it is less than" is an answer.

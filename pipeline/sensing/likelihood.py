@@ -1,4 +1,4 @@
-"""The likelihood of a sensor's noise: a Kalman filter whose state is the walk, Gauss-Markov and angle.
+"""Computes the likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov and angle.
 
 A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, exactly diffuse at first, the
 Gauss-Markov noise g, errors e of a quantised angle and white v. So the first sample is not counted.

@@ -1,4 +1,4 @@
-"""The noise of a sensor at rest: its terms with intervals, its Allan deviation, and what to be told.
+"""Finds the noise of a sensor at rest: its terms with intervals, its Allan deviation, notes.
 
 Begin here: `noise` goes through the columns of a log's topics, `_analysed` through one column.
 """

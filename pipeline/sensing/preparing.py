@@ -1,4 +1,4 @@
-"""Recordings at rest as noise is read from them: on a grid, still, without the drift of warming up."""
+"""Prepares recordings at rest: on a grid, still, without the drift of warming up."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The study of noise: how often the intervals of a sensor at rest hold the truth.
+"""Studies noise: how often the intervals of a sensor at rest hold the truth.
 
 Each unit is recorded at rest, with white noise and a walk, and looked at as a user's log is: drifts,
 vibration and correlation are looked for, the terms chosen, and intervals given.

@@ -1,4 +1,4 @@
-"""The terms of a sensor's noise, after IEEE Std 952-1997, annex C: their Allan variances add.
+"""Defines the terms of a sensor's noise, by IEEE Std 952-1997, annex C: Allan variances add.
 
 White noise N, random walk K, Gauss-Markov noise of standard deviation s and time T, a quantised angle Q.
 With u the unit of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.

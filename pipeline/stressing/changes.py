@@ -1,4 +1,4 @@
-"""Changes of a run that should not matter: each gives a copy of it, all topics at once by a seed.
+"""Changes a run in ways that should not matter: each copies it, all topics at once by a seed.
 
 Most have a size, 1 or a half of it, so that it is seen whether the difference shrinks with the change.
 """

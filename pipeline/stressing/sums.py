@@ -1,4 +1,4 @@
-"""What changes that should not matter do to an estimator over many runs: counts and means."""
+"""Sums over runs what changes that should not matter do to an estimator: counts and means."""
 
 from collections import Counter
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""What changes that should not matter did to a result: harmless, sensitive, discontinuous or chaotic."""
+"""Judges what such changes did to a result: harmless, sensitive, discontinuous or chaotic."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The study of tuning where the truth of the noise is not known: values are judged on other vehicles.
+"""Studies tuning where the truth of the noise is unknown: other vehicles judge the values.
 
 The log's vehicles are parted: some tune the experiment's one estimator by likelihood, from its settings
 or what the log states; others, held out, are replayed with either values.

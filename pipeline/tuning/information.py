@@ -1,4 +1,4 @@
-"""What the motion in logs tells of a calibration, before any search: the information, and what it lacks.
+"""Measures what the motion in logs tells of a calibration before any search, and what it lacks.
 
 With v the innovations and S their covariances, I = sum dv' S^-1 dv over all measurements, where dv are
 the derivatives by the parameters. In units that are useful for each, a direction whose eigenvalue is

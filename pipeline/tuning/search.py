@@ -1,4 +1,4 @@
-"""The search for the parameters of least cost.
+"""Searches for the parameters of least cost.
 
 It goes over the logarithm of what is positive, a standard deviation say; anything else has a unit of its
 own. Gradient and curvature are central differences, whose points are handed over together.

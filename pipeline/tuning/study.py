@@ -1,4 +1,4 @@
-"""The study of tuning: how well maximum likelihood finds what a scenario was recorded with.
+"""Studies tuning: how well maximum likelihood finds what a scenario was recorded with.
 
 Every run is tuned by itself, at several lengths, from the settings of the experiment's one estimator;
 the tuning is not told what is true. How often 95 % intervals hold the truth, how far values are from

@@ -1,4 +1,4 @@
-"""The search for the parameters of an estimator that explain logs best.
+"""Searches for the parameters of an estimator that explain logs best.
 
 By maximum likelihood: Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012,
 chapter 7.

@@ -1,1 +1,1 @@
-"""Importers of real data, one file or room per source; begin with `mrclam`."""
+"""Imports real data, one file or room per source; begin with `mrclam`."""

@@ -1,4 +1,4 @@
-"""AIS position reports of vessels, as tables with one row per report (CSV, also compressed).
+"""Imports AIS position reports of vessels: tables with one row per report (CSV, also compressed).
 
 The columns are Time, MMSI, Latitude_degrees, Longitude_degrees, COG_degrees and SOG_knots; others are
 not read. Codes for what a transponder does not know are those of ITU-R M.1371-5, table 48. /reports says

@@ -1,4 +1,4 @@
-"""Score matrices of biometric matchers, such as the NIST Biometric Scores Set: one CSV per matcher.
+"""Imports score matrices of biometric matchers, as NIST's Biometric Scores Set: a CSV per matcher.
 
 The first row holds the gallery's user ids, the first column the probes'. Matchers are named in the
 parameters, or in a file `matchers.toml` of the folder:

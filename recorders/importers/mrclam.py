@@ -1,4 +1,4 @@
-"""UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
+"""Imports UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
 
 K. Leung et al., "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 2011. A
 folder holds Barcodes.dat, Landmark_Groundtruth.dat and, per robot, its ground truth, odometry and

@@ -1,4 +1,4 @@
-"""Sounds in synchronised recordings of several microphones, as differences of their arrivals.
+"""Imports sounds in synchronised recordings of microphones, as differences of their arrivals.
 
 A folder as opensoundscape's: WAV files, a table of the microphones' places (CSV with the file first, x,
 y and perhaps z, in m), and tables of detections (CSV with the file first, start_time and end_time in s

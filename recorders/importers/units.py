@@ -1,4 +1,4 @@
-"""Units of what others log, such as deg, km/h or m/s^2, and what they are in fuselog's.
+"""Reads units of what others log, such as deg, km/h or m/s^2, as multiples of fuselog's.
 
 A product of powers of a dozen names is all that logs need, and what a field is in stands in its name
 (`range_m`, `turn_rate_radps`): a library of units would bring thousands more and half a second of start.

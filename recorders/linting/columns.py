@@ -1,4 +1,4 @@
-"""Checks of single columns: values that freeze, are rounded, or end where the sensor's range does."""
+"""Checks single columns: values that freeze, are rounded, or end where the sensor's range does."""
 
 from collections.abc import Iterator, Mapping
 

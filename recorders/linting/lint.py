@@ -1,4 +1,4 @@
-"""The checks of a log in their table, asked portion by portion, so that memory is bounded."""
+"""Asks the checks of a log in their table, portion by portion, so that memory is bounded."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice

@@ -1,4 +1,4 @@
-"""Checks of magnetic fields: their unit, and iron on board, by the circle of a full turn."""
+"""Checks magnetic fields: their unit, and iron on board, by the circle of a full turn."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple

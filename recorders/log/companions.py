@@ -1,4 +1,4 @@
-"""Companions: messages of other makers' schemas beside a log's streams, for viewers alone.
+"""Writes companions: other makers' messages beside a log's streams, for viewers alone.
 
 A companion's channel states in its metadata which stream it accompanies, and is none of the log's
 topics. Its messages have no fixed layout; they are written one by one, into chunks of their own.

@@ -1,4 +1,4 @@
-"""The one byte layout that all messages of a stream share, as a NumPy type.
+"""Describes the one byte layout that all messages of a stream share, as a NumPy type.
 
 A message record of MCAP is opcode, length, channel, sequence, two clocks and the payload; the payload
 is protobuf whose fields all have a fixed width. So a structured array is the bytes of a chunk, and the

@@ -1,4 +1,4 @@
-"""The loops over the bytes of a chunk: find its records, and compare messages with a layout.
+"""Loops over the bytes of a chunk: finds its records, and compares messages with a layout.
 
 The loops see the bytes as 64-bit words, one of which starts at every byte, so that they compare eight
 bytes at a time. numba compiles them, and takes longer to import than plain Python to go through twenty

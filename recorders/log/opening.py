@@ -1,4 +1,4 @@
-"""Opening a log: what it holds, by topic, and what is missing from it."""
+"""Opens a log: says what it holds, by topic, and what is missing from it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

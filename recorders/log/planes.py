@@ -1,4 +1,4 @@
-"""The planes that positions are in: east, north and up of an origin on the earth, as channels state it.
+"""Reads the planes that positions are in: east, north, up of an origin, as channels state it.
 
 A channel that states no origin is in the plane of its log, unless it names a frame of its own.
 """

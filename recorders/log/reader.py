@@ -1,4 +1,4 @@
-"""Reading logs as columns, block by block in time order, with memory bounded by the blocks in hand."""
+"""Reads logs as columns, block by block in time order, with memory bounded by the blocks in hand."""
 
 import sys
 from collections import Counter

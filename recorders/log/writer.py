@@ -1,4 +1,4 @@
-"""Writing streams as a log: whole chunks at a time, and never half a file."""
+"""Writes streams as a log: whole chunks at a time, and never half a file."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

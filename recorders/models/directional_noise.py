@@ -1,4 +1,4 @@
-"""Exact samples of the noise on axes and orientations: Bingham, and Gaussian projected to the sphere."""
+"""Draws exact noise on axes and orientations: Bingham, and Gaussian projected to the sphere."""
 
 from typing import Literal, Self
 

@@ -1,4 +1,4 @@
-"""Places in a local tangent plane (east, north, up) and on the WGS 84 ellipsoid."""
+"""Converts places between a local tangent plane (east, north, up) and the WGS 84 ellipsoid."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray

@@ -1,4 +1,4 @@
-"""Systems of two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
+"""Models two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""Inertial navigation in a local plane of east, north, up: what an inertial unit makes of a motion.
+"""Models inertial navigation in east, north, up: what an inertial unit makes of a motion.
 
 The body's axes are forward, left, up; a unit quaternion w, x, y, z turns its vectors into the plane's.
 Component-first, as in `planar`. Groves, Principles of GNSS, Inertial, and Multisensor Integrated

@@ -1,4 +1,4 @@
-"""Line of sight of an optical sensor whose attitude may be biased.
+"""Models the line of sight of an optical sensor whose attitude may be biased.
 
 Belfadel, Osborne and Bar-Shalom, "Bias Estimation and Observability for Optical Sensor Measurements
 with Targets of Opportunity", JAIF 2014. Component-first: `Components` are a tuple of components or an

@@ -1,4 +1,4 @@
-"""Axes in the plane and orientations in space as unit complex numbers and quaternions, x and -x alike.
+"""Computes with axes and orientations as unit complex numbers and quaternions, x and -x alike.
 
 The algebra of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014,
 section 5.3. Quaternions are (w, x, y, z); all arrays keep their components on the last axis.

@@ -1,4 +1,4 @@
-"""Motion and sensors of a robot in the plane: pose = (x, y, heading), velocity = (forward, turn).
+"""Models a robot in the plane: pose = (x, y, heading), velocity = (forward, turn); its sensors.
 
 Component-first functions: each takes scalars or arrays in every component, so that one source serves
 the simulators (arrays over time) and the estimators (scalars inside a compiled loop).

@@ -1,4 +1,4 @@
-"""A gas that reacts in a closed vessel, 2A -> B, in discrete time.
+"""Models a gas that reacts in a closed vessel, 2A -> B, in discrete time.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 (29) and (30); state = partial pressures (a, b), for which the paper has no unit.

@@ -1,4 +1,4 @@
-"""Biometric matchers and their scores: every probe compared with every gallery entry, as columns.
+"""Describes biometric matchers and their scores: each probe with each gallery entry, as columns.
 
 Probe i and gallery entry i are of the same user. A score stands as the matcher gave it; the stream's
 metadata say which matchers are distances, and what a matcher gives where it could not enrol an image.

@@ -1,4 +1,4 @@
-"""Vehicles in the plane and sensors that see them in a frame of their own; state = (x, vx, y, vy).
+"""Models vehicles and sensors that see them in a frame of their own; state = (x, vx, y, vy).
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016, (12)-(14). Component-first: scalars or arrays.

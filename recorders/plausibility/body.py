@@ -1,4 +1,4 @@
-"""The motion of one body as its topics say it: places, velocities, wheels, turn rates, orientations.
+"""Describes the motion of a body as its topics say it: places, velocities, wheels, turns.
 
 All are columns over time in seconds since the log's first stamp. What holds from one message to the
 next, or lies between two samples, is integrated: a window's distance and turn need no common stamps.

@@ -1,4 +1,4 @@
-"""The checks, in the order in which what they find is named, and what they read of a log.
+"""Lists the checks in the order in which findings are named, and reads what they need of a log.
 
 A check of motion takes a body's topics compared in pairs, one of stamps a topic and all others.
 """

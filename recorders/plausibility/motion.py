@@ -1,4 +1,4 @@
-"""A body's topics, compared in pairs: what lags behind what, and by which factor or angle they differ.
+"""Compares a body's topics in pairs: what lags behind what, by which factor or angle they differ.
 
 Lags come first: what is 18 s late turns the other way.
 """

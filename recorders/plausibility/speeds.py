@@ -1,4 +1,4 @@
-"""Checks of when topics speak, and of how far they say that a body comes."""
+"""Checks when topics speak, and how far they say that a body comes."""
 
 from collections.abc import Iterator
 from itertools import chain

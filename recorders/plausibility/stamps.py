@@ -1,4 +1,4 @@
-"""Checks of stamps, topic by topic: messages that are lost or there twice, clocks that drift."""
+"""Checks stamps, topic by topic: messages that are lost or there twice, clocks that drift."""
 
 from collections.abc import Iterator, Mapping
 

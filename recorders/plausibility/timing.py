@@ -1,4 +1,4 @@
-"""When a topic's account of a motion is most like another's: by its delay, and by its clock's gain."""
+"""Finds when a topic's account of a motion is most like another's: by delay, and clock's gain."""
 
 from collections.abc import Callable
 from typing import NamedTuple

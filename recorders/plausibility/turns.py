@@ -1,4 +1,4 @@
-"""Checks of angles: turn rates, courses and headings, and how an inertial unit is mounted."""
+"""Checks angles: turn rates, courses and headings, and how an inertial unit is mounted."""
 
 from collections.abc import Iterator
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Windows of a motion: how far and by what angle places moved, and a topic's own account of the same."""
+"""Cuts a motion into windows: how far and by what angle places moved, and a topic's account."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""Shots heard by acoustic sensors with position fixes: detections, fixes, truth.
+"""Simulates shots heard by acoustic sensors with position fixes: detections, fixes, truth.
 
 Osborne, Bar-Shalom, George and Kaplan, JAIF 2014. Each shot is heard by each sensor when its muzzle
 blast arrives; the shockwave and its lead over the muzzle blast only where the geometry lets it be heard.

@@ -1,4 +1,4 @@
-"""Targets that cross, go side by side and manoeuvre, seen by a radar in unordered scans with clutter.
+"""Simulates targets that cross, go side by side and manoeuvre, seen by a radar in scans with clutter.
 
 Two targets meet at an angle in the middle of the run, two go side by side, and one turns left and right.
 The whole scene is turned at random, so that no run is like another.

@@ -1,4 +1,4 @@
-"""A rectangle that stands still, of which one noisy surface point is seen per time step.
+"""Simulates a rectangle that stands still, of which one noisy surface point is seen per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B: points are uniform over the surface, their noise is Gaussian.

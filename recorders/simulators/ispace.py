@@ -1,4 +1,4 @@
-"""A room of networked sensor nodes that follow one moving thing: an intelligent space of DIND nodes.
+"""Simulates a room of networked sensor nodes that follow one moving thing: DIND nodes.
 
 Jin, Lee, Hashimoto, DIND networks, sections 3 to 5; the room's numbers are ours, the paper prints none.
 Every node hears the thing with a sensor and at a rate of its own, sends what it knows over directed

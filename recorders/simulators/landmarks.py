@@ -1,4 +1,4 @@
-"""Robots drive among landmarks: odometry, ranges, bearings, relative bearings, fixes, truth.
+"""Simulates robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
 
 Odometry reads the velocity that holds from its stamp to the next; the robot drives that velocity plus
 white noise. Robots are the targets 1, 2, ..., landmarks the numbers after them.

@@ -1,4 +1,4 @@
-"""Parameters of the scenario of robots among landmarks: their drive, sensors and fixes."""
+"""Defines the parameters of robots among landmarks: their drive, sensors and fixes."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""A vehicle that drives straight on, turns, brakes, stands and starts again, and tells where it is.
+"""Simulates a vehicle that drives on, turns, brakes, stands and starts again, and tells its place.
 
 It drives at one speed between manoeuvres; a turn is an arc at that speed, and stops are on the straight.
 How long it drives and stands is drawn anew each time.

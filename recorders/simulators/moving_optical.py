@@ -1,4 +1,4 @@
-"""Optical sensors on aircraft see moving targets: each by its own clock, turned by biases that drift.
+"""Simulates optical sensors on aircraft: each has its own clock, and is turned by biases that drift.
 
 Sensors fly at known poses, straight or weaving, and see the targets in turn, each at times of its own.
 The frame is that of `recorders.models.optical`: y points up, and a sensor looks ahead, along its own z.

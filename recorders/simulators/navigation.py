@@ -1,4 +1,4 @@
-"""A vehicle, a person or a quadrotor that moves with an inertial unit and a GNSS receiver on it.
+"""Simulates a vehicle, a person or a quadrotor with an inertial unit and a GNSS receiver on it.
 
 Its path is a spline through way-points, of which velocity and acceleration are exact, so that the unit
 measures what belongs to the path and not to an integration. It begins at rest. The unit's errors are

@@ -1,4 +1,4 @@
-"""Parameters of the scenario of a body that carries an inertial unit and a GNSS receiver."""
+"""Defines the parameters of a body that carries an inertial unit and a GNSS receiver."""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,4 @@
-"""Axes in the plane and orientations in space that turn at random, and are measured with noise.
+"""Simulates axes in the plane and orientations in space that turn at random, measured with noise.
 
 x+ = x (+) w and z = x (+) v, with Bingham noise or Gaussian noise scaled to unit length; the evaluation
 of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, section 7. The

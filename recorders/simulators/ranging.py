@@ -1,4 +1,4 @@
-"""A trolley in a warehouse whose tags measure ranges to anchors on the walls.
+"""Simulates a trolley in a warehouse whose tags measure ranges to anchors on the walls.
 
 It moves as the model `ranging-pose` says: accelerations are white. Ranges err by white noise, by a
 common bias, by an error of each anchor that lasts for seconds (a first-order Gauss-Markov process, the

@@ -1,4 +1,4 @@
-"""A batch reactor whose total pressure is read once per time step.
+"""Simulates a batch reactor whose total pressure is read once per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A. The prior is the paper's, far from the truth and the same in every run.

@@ -1,4 +1,4 @@
-"""A robot at rest that measures relative bearings to landmarks, with errors that keep a known bound.
+"""Simulates a robot at rest that measures relative bearings, whose errors keep a known bound.
 
 Briechle, Hanebeck (2004), section V, and random scenes. Every look measures all pairs of landmarks, or
 the pairs given.

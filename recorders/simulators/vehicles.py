@@ -1,4 +1,4 @@
-"""Vehicles tell a network where they are, and a sensor by the road sees them, nobody knows from where.
+"""Simulates vehicles that tell a network their places, and a sensor by the road of unknown place.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on

@@ -1,4 +1,4 @@
-"""The Bingham distribution on axes (d = 2) and orientations (d = 4), f(x) = exp(x^T M Z M^T x) / F.
+"""Computes with the Bingham distribution, f(x) = exp(x^T M Z M^T x) / F, on axes and orientations.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
 Degree Symmetry", JAIF 9(2), 2014. Every function takes batch axes first; the numbers come from

@@ -1,4 +1,4 @@
-"""Scalar kernels of the Bingham distribution, d = 2 and 4.
+"""Computes the Bingham distribution by scalar kernels, d = 2 and 4.
 
 The normalisation constant is an inverse Laplace transform at 1, from which the saddlepoint approximation
 of Kume and Wood (Biometrika 92, 2005) starts too:

@@ -1,4 +1,4 @@
-"""The chi-squared distribution, by the names and with the numbers of `scipy.stats.chi2`.
+"""Computes the chi-squared distribution, by names and with numbers of `scipy.stats.chi2`.
 
 Importing scipy.stats takes a quarter of the time that a short command of the command line does, and
 scipy.special half of that, which is why it is imported by what needs it.

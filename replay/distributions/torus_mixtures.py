@@ -1,4 +1,4 @@
-"""Mixtures on the torus, fitted by maximum likelihood: wrapped normals and von Mises densities.
+"""Fits mixtures on the torus by maximum likelihood: wrapped normals and von Mises densities.
 
 Angles (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximisation over components
 and turns; one of bivariate von Mises densities by its gradient, from the mixture of wrapped normals.

@@ -1,4 +1,4 @@
-"""The bivariate wrapped normal distribution on the torus, and its deterministic samples.
+"""Computes with bivariate wrapped normals on the torus, and draws their deterministic samples.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. Angles
 in rad; every function takes batch axes first and is accurate for variances from 1e-6 to where the

@@ -1,4 +1,4 @@
-"""Kernels of the bivariate wrapped normal distribution: fits to samples and products.
+"""Computes bivariate wrapped normals in kernels: fits to samples and products.
 
 Component-first functions run on arrays as well. A covariance is handed on as c11, c12, c22.
 """

@@ -1,1 +1,1 @@
-"""Estimators, one room per family, and models that any method estimates; begin with `models`."""
+"""Holds estimators, one room per family, and models that any method estimates; begin with `models`."""

@@ -1,4 +1,4 @@
-"""Exact sets of robot positions that bounded relative bearings leave: areas, boxes, borders.
+"""Computes exact sets of positions that bounded relative bearings leave: areas, boxes, borders.
 
 Briechle, Hanebeck, Localization of a Mobile Robot Using Relative Bearing Measurements (2004), (2)-(4),
 (20), (21). Everything is an intersection of generalised discs a |x|^2 + b'x + c <= 0: discs, their

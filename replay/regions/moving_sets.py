@@ -1,4 +1,4 @@
-"""Sets of positions and headings that hold a robot for certain, moved by odometry with bounded errors.
+"""Moves sets of positions and headings that hold a robot for certain, by odometry of bounded error.
 
 A position set is a shapely geometry, which may be in several pieces; headings lie in one interval. What
 is computed holds the exact result: disc offsets are polygons around it, and what rounding could lose is

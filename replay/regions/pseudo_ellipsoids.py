@@ -1,4 +1,4 @@
-"""The pseudo-ellipsoid filter: sets of positions that are ellipsoids in a space of monomials.
+"""Filters by pseudo-ellipsoids: position sets that are ellipsoids in a space of monomials.
 
 Briechle, Hanebeck (2004), III and IV. A pair's exact set lies between two circles for each of its two
 generalised discs: in u = (z - centre) / half width it is |u| <= 1, and u is linear in the monomials

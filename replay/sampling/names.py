@@ -1,4 +1,4 @@
-"""The names of samplings, as a command line writes them, and what each name stands for.
+"""Names samplings as a command line writes them, and says what each name stands for.
 
 ukf  ukf:kappa=0              unscented
 gf-25                         25 Gaussian-filter points on each axis

@@ -1,4 +1,4 @@
-"""Sample sets of N(0, I), and the one interface through which a filter takes them.
+"""Makes sample sets of N(0, I), through the one interface that a filter takes.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section I.B; the randomised set is that of Dunik, Straka and Simandl, "The Development of a Randomised

@@ -1,4 +1,4 @@
-"""Sample sets as compiled filters take them: one that serves every step, or a new one for each.
+"""Gives sample sets to compiled filters: one that serves every step, or a new one for each.
 
 A randomised sampling draws from a generator of each run's own, which the run's own data seed: so a run
 gives the same estimates alone and in an ensemble.

@@ -1,4 +1,4 @@
-"""Copies of an estimate that fan out from it: how far each is away, over time, below all else."""
+"""Draws copies of an estimate that fan out from it: how far each is away, over time."""
 
 from collections.abc import Sequence
 from itertools import cycle

@@ -1,4 +1,4 @@
-"""Estimators side by side: a family's scenes once for each, and by how much one is farther off.
+"""Puts estimators side by side: a family's scenes once for each, and by how much one is off more.
 
 The family has drawn everything once: a scene beside the other shows the same entities, but for those of
 the other estimators. So colours, cursor and all else are the same in both.

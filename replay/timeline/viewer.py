@@ -1,4 +1,4 @@
-"""Rerun's viewer, which rerun-sdk brings along: a picture without a screen, and the desktop window.
+"""Starts Rerun's viewer, which rerun-sdk brings along: a picture without a screen, or the window.
 
 It listens on the loopback interface only, reports no usage, reaches no network, and ends with the
 process that started it, however that ends.

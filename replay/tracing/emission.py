@@ -1,4 +1,4 @@
-"""A graph as instructions of a kernel, and as Python."""
+"""Emits a graph as instructions of a kernel, and as Python."""
 
 import operator
 from collections.abc import Sequence

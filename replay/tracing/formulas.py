@@ -1,4 +1,4 @@
-"""A graph as formulas that a person can read, which are Python: it computes the same of them.
+"""Writes a graph as formulas that a person can read, which are Python: it computes the same.
 
 What is used more than once, unless that is short, and what would not fit in a line get lines of their
 own.

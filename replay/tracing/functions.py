@@ -1,4 +1,4 @@
-"""Functions of models, traced: called as they are where kernels are plain Python, graphs elsewhere.
+"""Traces functions of models: called as they are where kernels are plain Python, graphs elsewhere.
 
 A model's function takes tuples of numbers, numbers, parameters (a NamedTuple of numbers), and sometimes
 arrays that it changes; it returns a tuple of numbers, or one number. What it is given is described by

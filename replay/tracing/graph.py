@@ -1,4 +1,4 @@
-"""Expression graphs: numbers that are made of others, each once, with what is known folded.
+"""Defines expression graphs: numbers that are made of others, each once, constants folded.
 
 A node is an operation of Python's or NumPy's on other nodes; equal nodes are one. What is simplified has
 the same bits, but for one thing: zero times anything is zero here, so that what does not depend on

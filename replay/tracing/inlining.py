@@ -1,4 +1,4 @@
-"""Graphs as parts of others: what a traced function gives when it is called with traced numbers."""
+"""Inlines graphs in others: a traced function that is called with traced numbers."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

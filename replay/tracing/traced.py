@@ -1,4 +1,4 @@
-"""Traced numbers: what a model's function is called with so that its graph is known afterwards.
+"""Defines traced numbers: a model's function is called with them, and its graph is known after.
 
 They work with Python's operators and with NumPy's functions of numbers, also inside arrays of objects. A
 condition that depends on them is tried both ways (see `functions`). What would freeze a value that is

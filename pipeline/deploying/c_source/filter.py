@@ -1,4 +1,4 @@
-"""The source of a filter in C99, of the graphs of its steps."""
+"""Writes the source of a filter in C99 from the graphs of its steps."""
 
 import re
 

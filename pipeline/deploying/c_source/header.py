@@ -1,4 +1,4 @@
-"""The header of a filter in C99: types, names of components, functions."""
+"""Writes the header of a filter in C99: types, names of components, functions."""
 
 from collections.abc import Iterator, Sequence
 

@@ -1,4 +1,4 @@
-"""The battery: cars with one fault planted, and how often it is the first that a diagnosis names.
+"""Counts how often the planted fault of a car's log is the first that a diagnosis names.
 
 The inertial unit's faults are told without a filter.
 """

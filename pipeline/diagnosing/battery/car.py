@@ -1,4 +1,4 @@
-"""A car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; with and without prior.
+"""Simulates a car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; prior or none.
 
 Its faults by name, the inertial unit that may ride with it, with its own, and logs of both. Faults are
 put into the columns themselves, not by what a diagnosis undoes them with.

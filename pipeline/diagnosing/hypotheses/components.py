@@ -1,4 +1,4 @@
-"""Faults of the numbers that are read of a topic: factors, signs, biases, axes, conventions."""
+"""Tries faults of the numbers read of a topic: factors, signs, biases, axes, conventions."""
 
 from collections.abc import Iterator, Mapping
 from itertools import combinations

@@ -1,4 +1,4 @@
-"""All that may be wrong of a run and the estimator that is bound to it."""
+"""Lists all that may be wrong of a run and the estimator that is bound to it."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""Faults of parameters: noise, what may be estimated beside the state, and the gate."""
+"""Tries faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence

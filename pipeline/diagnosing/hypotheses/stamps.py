@@ -1,4 +1,4 @@
-"""Faults of stamps: messages are late, or a clock gains."""
+"""Tries faults of stamps: messages are late, or a clock gains."""
 
 from collections.abc import Iterator, Mapping
 

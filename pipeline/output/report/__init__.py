@@ -1,4 +1,4 @@
-"""The report: result folders as one HTML page that fetches nothing and runs only our scripts.
+"""Writes the report: results as one HTML page that fetches nothing and runs only our scripts.
 
 Begin here; `kinds` has what a section opens with, `story` the cards, `scene` the pictures of a run.
 

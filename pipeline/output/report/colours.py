@@ -1,4 +1,4 @@
-"""The colours of estimators' names: those of their curves, dark or light enough to be read."""
+"""Chooses the colours of estimators' names: their curves', dark or light enough to be read."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""The gauge of a card: where NEES or NIS lies between too careful and too sure."""
+"""Computes the gauge of a card: where NEES or NIS lies between too careful and too sure."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""The words that a page explains at its end: two sentences each, and where to read on."""
+"""Explains words at a page's end: two sentences each, and where to read on."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What a page opens with, by the kind of result: experiment, comparison, sweep, tuning, diagnosis.
+"""Opens a page by the kind of its result: experiment, comparison, sweep, tuning, diagnosis.
 
 Begin with `opening`. Each kind has its own first sentences; cards and differences are `story`'s.
 """

@@ -1,4 +1,4 @@
-"""The table of metrics as a person reads it: estimators as columns, a dozen rows, the rest below."""
+"""Makes the table of metrics: estimators as columns, a dozen rows, the rest below."""
 
 import math
 from collections.abc import Mapping

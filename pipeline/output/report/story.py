@@ -1,4 +1,4 @@
-"""The story of a result: what was tried, what to do, a card per estimator, what differs beyond chance.
+"""Tells the story of a result: what was tried, what to do, a card per estimator, what differs.
 
 It is data: sentences and numbers. The template only sets it.
 """

@@ -1,4 +1,4 @@
-"""What the page of a sweep opens with: whom to take at which point, and what chance leaves open.
+"""Opens the page of a sweep: whom to take at which point, and what chance leaves open.
 
 Of each estimator the point at which it errs least is told as an experiment of its own: `story` tells
 whom of these to take. Points at which it is overconfident count only where it is so at all of them.

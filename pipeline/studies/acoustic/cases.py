@@ -1,4 +1,4 @@
-"""What the study of shooter localization runs: one scenario at one noise, all modes, bounds."""
+"""Runs the cases of shooter localization: one scenario at one noise, all modes, bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The figures of Osborne et al. 2014 with our numbers: ellipses, range errors, sweeps, maps."""
+"""Draws the figures of Osborne et al. 2014 with our numbers: ellipses, range errors, sweeps, maps."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""The study of sounds in recordings: arrivals by cross-correlation, places by them, with covariances.
+"""Studies sounds in recordings: arrivals by cross-correlation, places by them, covariances.
 
 Where truth or published differences are known, they are held to them. What a stated covariance is worth
 is tried on simulated recordings, over noise: there each of many sounds is somewhere else.

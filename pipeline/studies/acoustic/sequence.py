@@ -1,4 +1,4 @@
-"""The study of shots in sequence: what it is worth to take them as one problem, and robustly.
+"""Studies shots in sequence: what it is worth to take them as one problem, and robustly.
 
 Errors are those at the last report of each shot: of filters and smoothers where the shooter is by then,
 of single-shot solutions, which know of no motion, where the shot was fired. Estimators are compared by

@@ -1,4 +1,4 @@
-"""The study of biometric score fusion: modality, method and process, and verification of all pairs.
+"""Studies biometric score fusion: modality, method and process, verification of all pairs.
 
 Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
 seeds; those of all pairs get confidence intervals of drawing users again.

@@ -1,4 +1,4 @@
-"""The study of verification in sequence: Wald's test of probe after probe, and Page's of the matcher.
+"""Studies verification in sequence: Wald's test of each probe, and Page's of the matcher.
 
 Log-likelihood ratios are calibrated on other users than they judge. Those of a matcher are drawn again,
 users as clusters: a replicate draws users with replacement, and all intervals are quantiles over the

@@ -1,4 +1,4 @@
-"""The study of a receiver with an inertial unit: how well they bridge outages of a recording.
+"""Studies a receiver with an inertial unit: how well they bridge outages of a recording.
 
 The fixes of a recording with centimetres of error are withheld for a while, again and again; what a
 filter and a smoother make of the rest is compared with the withheld fixes, and with what takes no

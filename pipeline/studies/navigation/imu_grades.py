@@ -1,4 +1,4 @@
-"""The study of inertial units: how far off a body is located, the longer its receiver is silent.
+"""Studies grades of inertial units: how far off a body is, the longer its receiver is silent.
 
 The same drives with units of several grades, and an outage in the middle. Of n runs the largest error is
 above that which a share q of all runs stays below, with the probability 1 - q^n: .95 for 59 runs and

@@ -1,4 +1,4 @@
-"""The study of orientation from inertial samples: total error over each trial's movement.
+"""Studies orientation from inertial samples: total error over each trial's movement.
 
 BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. What counts are the samples that its authors
 marked as movement; an error is the whole angle from the true orientation to the estimated one.

@@ -1,4 +1,4 @@
-"""The study of orientation by filters and by the common methods, trial by trial of the BROAD benchmark.
+"""Studies orientation by filters and the common methods, trial by trial of the BROAD benchmark.
 
 Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021, section 4: what counts are the samples marked
 as movement; the error is the rotation from the true orientation to the estimated one in the axes of the

@@ -1,4 +1,4 @@
-"""Outages of a receiver that are made: fixes of a recording withheld, and errors where they are known.
+"""Makes outages of a receiver: withholds fixes of a recording; errors where they are known.
 
 A window is a span whose fixes and velocities are withheld entirely, by the times of the receiver's rows.
 Windows that lie far enough apart share a run. Errors are horizontal, at the withheld rows.

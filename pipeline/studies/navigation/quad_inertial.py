@@ -1,4 +1,4 @@
-"""The study of several inertial units on one body, whose clocks are off: what more units give.
+"""Studies several inertial units on one body, whose clocks are off: what more units give.
 
 Each recording is replayed with one unit, with the mean of all, and with a filter for each whose
 estimates covariance intersection fuses, since all filters have the same fixes. Stamps of the units are

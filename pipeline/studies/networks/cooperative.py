@@ -1,4 +1,4 @@
-"""The study of cooperative localization: accuracy and consistency of robots that share estimates.
+"""Studies cooperative localization: accuracy and consistency of robots that share estimates.
 
 Its paper, Jin, Lee, Hashimoto, DIND networks, has no numbers of real robots.
 """

@@ -1,4 +1,4 @@
-"""The study of robots that share estimates under stress, on recorded logs.
+"""Studies robots that share estimates under stress, on recorded logs.
 
 When a robot sees another, both get a message. Here some of these sightings are taken out of the log: all
 but one in an interval, a random half, those of a robot that leaves; or a robot is sure of a wrong start.

@@ -1,4 +1,4 @@
-"""The study of sensor networks: what each fusion rule costs in accuracy, consistency and bytes.
+"""Studies sensor networks: what each fusion rule costs in accuracy, consistency and bytes.
 
 Claims: Jin, Lee, Hashimoto, DIND networks. RMSE, over all runs and steps, and NEES are those after
 `settle_s`, when every node has measured; ratios are the nodes' mean RMSE over that of one filter with

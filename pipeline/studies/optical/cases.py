@@ -1,4 +1,4 @@
-"""What the study of lines of sight runs: one scenario under one condition, all schemes, bounds."""
+"""Runs the cases of lines of sight: one scenario under one condition, all schemes, bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The figures of Belfadel et al. 2014 with our numbers: scenes, NEES, NEES of single biases, GDOP."""
+"""Draws the figures of Belfadel et al. 2014 with our numbers: scenes, NEES, biases' NEES, GDOP."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""The study of moving lines of sight: which biases can be told, what would tell them, and how well.
+"""Studies moving lines of sight: which biases can be told, what would tell them, and how well.
 
 Sensors that fly straight on, side by side, leave one direction of the state open: all that they see may
 turn about the line between them if they roll with it, and targets that keep their velocities then keep

@@ -1,4 +1,4 @@
-"""What the studies of ranges share: recordings in a folder, their replay, errors by the truth."""
+"""Shares what studies of ranges need: recordings in a folder, their replay, errors by the truth."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

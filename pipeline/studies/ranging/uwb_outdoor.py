@@ -1,4 +1,4 @@
-"""The study of positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
+"""Studies positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
 
 Published errors are those of a part of each path, which begins and ends where it enters a place. The
 truth is linear between its rows, but for those at another height than the others by half a metre.

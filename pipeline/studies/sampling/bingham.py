@@ -1,4 +1,4 @@
-"""The evaluation of the Bingham filter beside modified Kalman filters: figures 4 and 5.
+"""Evaluates the Bingham filter beside modified Kalman filters: figures 4 and 5.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
 Degree Symmetry", JAIF 9(2), 2014, section 7. Every ensemble is recorded twice, with Bingham noise and

@@ -1,4 +1,4 @@
-"""The extended target of the S2KF's paper: a measurement update with multiplicative noise.
+"""Studies the S2KF paper's extended target: an update with multiplicative noise.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B, Figs. 9 and 10. Beside the paper's filters run the S2KF's with their sample sets turned at

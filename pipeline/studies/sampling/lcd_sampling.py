@@ -1,4 +1,4 @@
-"""Samplings of N(0, I): how near they are to it, what LCD sets cost, and what they look like.
+"""Studies samplings of N(0, I): how near they are to it, what LCD sets cost, how they look.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section V, Figs. 1 and 5. No filter runs here: the logs hold the sample sets.

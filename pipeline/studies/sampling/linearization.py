@@ -1,4 +1,4 @@
-"""What the studies of the S2KF's paper share: filters against the one with the exact moments.
+"""Shares what studies of the S2KF's paper need: filters against the one with exact moments.
 
 An experiment's runs are replayed for several seeds, because errors differ more between seeds than
 between sample sets of one kind; each seed is an ensemble of its own.

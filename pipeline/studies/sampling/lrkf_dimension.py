@@ -1,4 +1,4 @@
-"""How many samples pay in a linear regression Kalman filter: from 2 to 20 dimensions, and on drives.
+"""Studies how many samples pay in a linear regression Kalman filter: 2 to 20 dimensions, drives.
 
 Moments come first, apart from any filter: waves y = sin(k'x + phase) of x ~ N(0, I) have exact ones, by
     E exp(i k'x) = exp(-|k|^2 / 2).

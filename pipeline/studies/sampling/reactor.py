@@ -1,4 +1,4 @@
-"""The batch reactor of the S2KF's paper: nonlinear prediction against the exact moments.
+"""Studies the S2KF paper's batch reactor: nonlinear prediction against the exact moments.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A, Fig. 7. Its statements are judged for the prior mean as printed, (0.5, 3.5), and for the

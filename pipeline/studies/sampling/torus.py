@@ -1,4 +1,4 @@
-"""Estimation on the torus: what a coupling makes of the samples (figure 3), and the recursive filter.
+"""Studies estimation on the torus: what a coupling makes of the samples (figure 3), and a filter.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. The
 propagation is numerics without a log; its truth is the population value, from Gauss-Hermite nodes in

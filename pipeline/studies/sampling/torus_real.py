@@ -1,4 +1,4 @@
-"""Real angles on the torus: densities fitted to dihedrals of a protein, filters that predict the wind.
+"""Studies real angles on the torus: densities of a protein's dihedrals, predictions of the wind.
 
 What is fitted is judged on angles that the fit has not seen: dihedrals stretch by stretch of the chain,
 winds of the second half with noise and coupling that are most likely in the first. Neighbours resemble

@@ -1,4 +1,4 @@
-"""Bounds of a robot's errors, taken from the other robots of its log: their truth says what theirs were.
+"""Takes bounds of a robot's errors from the other robots of its log: their truth says theirs.
 
 So nothing is chosen by the truth of the robot that is judged. Channels state what is found.
 """

@@ -1,4 +1,4 @@
-"""The study of guaranteed sets over time: area, containment, how much the past helps, what was isolated.
+"""Studies guaranteed sets over time: area, containment, what the past helps, what was isolated.
 
 What is compared are the frames for which all estimators have a set or an ellipse; intervals are over the
 robots.

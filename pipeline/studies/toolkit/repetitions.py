@@ -1,4 +1,4 @@
-"""A paper's Monte Carlo experiment, repeated: step k over all runs of an ensemble is one repetition.
+"""Repeats a paper's Monte Carlo experiment: step k over all runs of an ensemble is one repetition.
 
 A log that holds the same experiment several times over, with fresh noise, gives one estimate each. So an
 ensemble of 100 runs with 10 steps repeats a paper's 100 runs ten times, and a rule that a paper states

@@ -1,4 +1,4 @@
-"""The study of tracks of reports without identities: which vessels kept one track of their own.
+"""Studies tracks of reports without identities: which vessels kept one track of their own.
 
 The identities that the log has are used to judge alone. A vessel's own track is the one that it is
 assigned when tracks and vessels are paired one to one: see `replay.judging.tracks.tracks`.

@@ -1,4 +1,4 @@
-"""The study of Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
+"""Studies Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
 
 Quays, marks and other craft have no reference: GOSPA leaves out what is farther than 50 m from both
 vessels. Trackers are replayed in the order of the stamps, and some of them again in the order of

@@ -1,4 +1,4 @@
-"""What studies of trackers have in common: their tracks judged by run, and differences of trackers.
+"""Shares what studies of trackers need: tracks judged by run, and differences of trackers.
 
 Tracks are judged as `replay.judging.tracks.errors` says, at instants that are the same for all trackers.
 """

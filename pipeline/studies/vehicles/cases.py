@@ -1,4 +1,4 @@
-"""Cooperative vehicles in several cases: what each estimator comes to, run by run and step by step."""
+"""Runs cooperative vehicles in several cases: each estimator's errors, by run and by step."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""How time and error of cooperative vehicles' filters grow with the number of vehicles.
+"""Studies how time and error of vehicles' filters grow with the number of vehicles.
 
 Vehicles start anywhere in a square: one that grows with their number, so that they stay as far apart, or
 one so small that any fix may be of any vehicle. Where a method's time grows faster than any power, it is

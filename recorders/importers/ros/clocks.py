@@ -1,4 +1,4 @@
-"""The clocks of a bag: the stamps of headers beside those of the bag, by topic."""
+"""Compares the clocks of a bag: the stamps of headers with those of the bag, by topic."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The importer of ROS logs: topics become streams, and what is not taken is told."""
+"""Imports ROS logs: topics become streams, and what is not taken is told."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Messages of one's own: a TOML file says which of their fields become which stream.
+"""Maps messages of one's own: a TOML file says which of their fields become which stream.
 
 [messages."my_robot_msgs/msg/Wheels"]
 becomes = "VectorMeasurement"                 # one of fuselog's messages

@@ -1,4 +1,4 @@
-"""The parameters of an import of ROS."""
+"""Defines the parameters of an import of ROS."""
 
 from typing import Annotated, Literal
 

@@ -1,4 +1,4 @@
-"""The streams that are made of a bag: what waits for the end of a block, and what is counted of it."""
+"""Makes the streams of a bag: keeps what waits for the end of a block, and counts."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Transforms between frames (TF): those that are sent, as poses, and named pairs composed of them.
+"""Reads transforms between frames (TF): those sent, as poses, and named pairs composed of them.
 
 A transform is the pose of a child frame in its parent frame. A named pair is composed at the stamps of
 that part of its chain which is sent most often; the others are interpolated between the two nearest,

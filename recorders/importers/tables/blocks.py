@@ -1,4 +1,4 @@
-"""Texts in blocks of whole lines, none of which is too long: memory holds one block at a time."""
+"""Reads texts in blocks of whole lines, none of which is too long: memory holds one block."""
 
 import io
 from collections.abc import Iterator

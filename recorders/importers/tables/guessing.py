@@ -1,4 +1,4 @@
-"""A mapping to start from: which messages the columns of tables are, by their names and numbers.
+"""Guesses a mapping to start from: which messages columns are, by their names and numbers.
 
 Every guess stands in the mapping with its reason as a comment beside it; columns that fit no message
 become a vector of plain numbers. A person reads and mends it: the text is the product, not the import.

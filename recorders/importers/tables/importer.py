@@ -1,4 +1,4 @@
-"""The importer of tables: rows become messages by a mapping, and what is left out is told."""
+"""Imports tables: rows become messages by a mapping, and what is left out is told."""
 
 import heapq
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Mappings of tables: a TOML file says which files, which columns, and what becomes of them.
+"""Defines mappings of tables: a TOML file says which files and columns, and what becomes of them.
 
 [[tables]]
 files = "imu_{unit}.csv"                          # {unit} stands for anything, and is {unit} below

@@ -1,4 +1,4 @@
-"""NumPy's archives of arrays (.npz) as columns, block by block: memory holds no array as a whole."""
+"""Reads NumPy's archives of arrays (.npz) as columns, block by block: memory holds no whole array."""
 
 import zipfile
 from collections.abc import Callable, Collection, Iterator

@@ -1,4 +1,4 @@
-"""Patterns of files' names: * and ? as in a shell, and {name} for what is then known by that name.
+"""Matches patterns of files' names: * and ? as in a shell, and {name} for what is known by it.
 
 A match takes time that grows with both lengths, whatever the pattern is: an expression of `re` tries all
 ways in which many stars may share a name.

@@ -1,4 +1,4 @@
-"""The plane that a log's positions are in, made of places on the earth."""
+"""Makes the plane that a log's positions are in of places on the earth."""
 
 from functools import cache
 from typing import Any, NamedTuple

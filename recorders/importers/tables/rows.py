@@ -1,4 +1,4 @@
-"""The rows of one file, batch by batch, as streams."""
+"""Reads the rows of one file, batch by batch, as streams."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence

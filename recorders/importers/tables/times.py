@@ -1,4 +1,4 @@
-"""Stamps of tables: numbers since some zero, dates, GPS weeks, or none but a rate; exact to the ns."""
+"""Reads stamps of tables: numbers since some zero, dates, GPS weeks, or a rate; exact to the ns."""
 
 import re
 import struct

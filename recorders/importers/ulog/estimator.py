@@ -1,4 +1,4 @@
-"""What becomes of the autopilot's own filter, EKF2: its states and innovations, and a simulator's truth.
+"""Imports the autopilot's own filter, EKF2: its states and innovations, and a simulator's truth.
 
 PX4's innovations are what was predicted minus what was measured; ours have the other sign. It fuses one
 component after the other, and logs the variance of each alone: the covariances here are diagonal.

@@ -1,4 +1,4 @@
-"""The layouts of ULog's messages: format definitions, flattened to NumPy's types."""
+"""Lays out ULog's messages: format definitions, flattened to NumPy's types."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple

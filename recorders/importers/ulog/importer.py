@@ -1,4 +1,4 @@
-"""The importer of ULog: topics become streams, and what is not taken is told."""
+"""Imports ULog: topics become streams, and what is not taken is told."""
 
 from collections import Counter
 from collections.abc import Iterator

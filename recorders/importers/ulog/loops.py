@@ -1,4 +1,4 @@
-"""The loops over a ULog's data: where messages begin, and which are whose; see `recorders.log.loops`."""
+"""Loops over a ULog's data: where messages begin, and which are whose; see `recorders.log.loops`."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""What parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing there."""
+"""Says what parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing."""
 
 from collections.abc import Mapping
 from fnmatch import fnmatchcase

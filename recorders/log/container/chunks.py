@@ -1,4 +1,4 @@
-"""Regions of an MCAP file as bytes: packing a chunk, opening one, and the small records around them.
+"""Handles regions of an MCAP file as bytes: packs a chunk, opens one, and the small records about.
 
 A region is a chunk, or a run of records outside chunks, which is laid out like an uncompressed chunk.
 Source: the MCAP specification (mcap.dev/spec).

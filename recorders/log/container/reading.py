@@ -1,4 +1,4 @@
-"""The MCAP container: which regions of a file hold messages, and what else stands in it.
+"""Reads the MCAP container: which regions of a file hold messages, and what else stands in it.
 
 The data section is walked record by record. A chunk that the summary tells of is stepped over; any other
 is opened on the way, so that a file without an index, or with one that leaves chunks out, is read all

@@ -1,4 +1,4 @@
-"""Our own metadata records, sealed with a checksum, since MCAP gives a metadata record none."""
+"""Seals our own metadata records with a checksum, since MCAP gives a metadata record none."""
 
 import json
 import zlib

@@ -1,4 +1,4 @@
-"""Writing an MCAP file that appears whole or not at all: its records, indexes and summary.
+"""Writes an MCAP file that appears whole or not at all: its records, indexes and summary.
 
 It is renamed when it is whole. The small records are mcap's own; chunks and their indexes come from
 `packing`. Source: the MCAP specification (mcap.dev/spec).

@@ -1,4 +1,4 @@
-"""Which topic each innovation is of, where an estimator takes several: that with a message of its stamp.
+"""Finds which topic each innovation is of, where an estimator takes several: the same stamp tells.
 
 Innovations do not say it. Where messages of several topics have one stamp, and as many innovations have
 it, these are of them in the order of the file. Where they are fewer or more, or have another stamp, as

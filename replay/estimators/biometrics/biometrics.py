@@ -1,4 +1,4 @@
-"""Fusion of biometric scores: rules, classifiers and mixture models, as batch estimators.
+"""Fuses biometric scores: rules, classifiers and mixture models, as batch estimators.
 
 Zheng & Blasch, "An exploration of the impacts of three factors in multimodal biometric score fusion",
 JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), a case each, into the stream

@@ -1,4 +1,4 @@
-"""Hidden Markov models with Gaussian mixtures, fitted by Baum-Welch to many short sequences.
+"""Fits hidden Markov models with Gaussian mixtures by Baum-Welch to many short sequences.
 
 Zheng & Blasch, JAIF 2014, 3.2: HMM(m, n, g) takes a sequence of n vectors of m scores; every state has
 a mixture of g Gaussians. With one state it is a mixture; left to right it is a product of mixtures, one

@@ -1,4 +1,4 @@
-"""Pairs of probes and gallery entries: normalised scores, rules over them, and folds of users."""
+"""Makes pairs of probes and gallery entries: normalised scores, rules, and folds of users."""
 
 from collections.abc import Callable
 from typing import NamedTuple

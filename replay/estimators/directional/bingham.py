@@ -1,4 +1,4 @@
-"""Filters for axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
+"""Filters axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
 
 The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
 Kalman filters that it is compared with. All take an ensemble as ragged rows and go through it in

@@ -1,4 +1,4 @@
-"""The filters of axes, orientations and pairs of headings, as a replay has them.
+"""Offers the filters of axes, orientations and pairs of headings to a replay.
 
 The numerics are in `bingham` and `torus`; here they are bound to streams. Noise and prior are what the
 channel states, unless a parameter says otherwise.

@@ -1,4 +1,4 @@
-"""Reference filters: Bayes' rule on a grid over the half circle and over the torus.
+"""Filters by Bayes' rule on a grid over the half circle and the torus, as a reference.
 
 They approximate no density, only the domain, and show what any filter of the same model can reach.
 """

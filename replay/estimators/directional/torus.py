@@ -1,4 +1,4 @@
-"""Filters for two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
+"""Filters two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
 
 The recursive toroidal filter that Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate
 Circular Estimation", 2016, announce, and beside it the unscented Kalman filter with their UKF samples.

@@ -1,4 +1,4 @@
-"""Estimator `shooter:MODE`: where the shots of a log came from, shot by shot (Osborne et al. 2014)."""
+"""Offers the estimator `shooter:MODE`: where shots of a log came from (Osborne et al. 2014)."""
 
 from collections.abc import Iterator, Mapping
 

@@ -1,4 +1,4 @@
-"""Iterated least squares over many runs at once, and the bound that belongs to it.
+"""Solves iterated least squares over many runs at once, with the bound that belongs to it.
 
 A model says, for parameters (runs, n), how far each measurement is from its prediction, how predictions
 change with the parameters, and how noisy the measurements are. From that one answer come the step of

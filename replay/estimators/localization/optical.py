@@ -1,4 +1,4 @@
-"""Target positions and attitude biases from lines of sight: the schemes of Belfadel et al., JAIF 2014.
+"""Finds targets and attitude biases from lines of sight: schemes of Belfadel et al., JAIF 2014.
 
 The parameters are the positions of all targets (x, y, z each) and then those attitude biases (yaw,
 pitch, roll of each sensor) that are not known. Scheme 3 knows none of them; schemes 1 and 2 take all as

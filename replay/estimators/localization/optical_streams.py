@@ -1,4 +1,4 @@
-"""Estimators `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
+"""Offers `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
 
 What is solved together, a batch, holds each line of sight once: where a sensor sees a target again the
 next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 the same on one with

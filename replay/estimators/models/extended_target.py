@@ -1,4 +1,4 @@
-"""The extended target: a random walk, and a measurement with multiplicative noise.
+"""Models the extended target: a random walk, measured with multiplicative noise.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012. The

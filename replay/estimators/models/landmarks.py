@@ -1,4 +1,4 @@
-"""Localization of robots in the plane from odometry and whatever else there is.
+"""Localizes robots in the plane from odometry and whatever else there is.
 
 Sightings of mapped landmarks, position fixes, poses, headings; a gyro may say how fast the robot turns
 in place of its wheels. The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the

@@ -1,4 +1,4 @@
-"""Moving targets, and attitude biases and clocks of the sensors on aircraft that see them: a model.
+"""Models moving targets, and attitude biases and clocks of the sensors on aircraft that see them.
 
 The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`recorders.models.optical`), but
 nothing stands still and nothing is synchronised. A message states the sensor's pose by the sensor's own

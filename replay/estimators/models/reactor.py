@@ -1,4 +1,4 @@
-"""The batch reactor: a quadratic motion, a linear measurement.
+"""Models the batch reactor: a quadratic motion, a linear measurement.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.A and appendix (which prints x_hat where the noise's mean w_hat is meant). In discrete time: every

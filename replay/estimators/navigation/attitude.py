@@ -1,4 +1,4 @@
-"""Orientation of a body that is carried about, from a gyro, an accelerometer and a magnetometer.
+"""Estimates the orientation of a body that is carried about, from gyro, accelerometer, magnetometer.
 
 The state is the rotation, the gyro's bias, the velocity, and the magnetic field of the place. The
 accelerometer drives the velocity, which stays small: what is carried about does not get away. So gravity

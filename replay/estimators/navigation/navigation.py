@@ -1,4 +1,4 @@
-"""Inertial navigation, corrected by what a log has of position and velocity.
+"""Navigates by an inertial unit, corrected by what a log has of position and velocity.
 
 The state of 15 components, with an inertial unit for its control: position and velocity in a local
 plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases of gyro

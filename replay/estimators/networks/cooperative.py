@@ -1,4 +1,4 @@
-"""Cooperative localization: robots that share position estimates when they see each other.
+"""Localizes robots that share position estimates when they see each other.
 
 Every robot follows its odometry; the anchors use the mapped landmarks as well. When a robot sees
 another, each of the two takes the sighting as a measurement of itself that rests on the other one:

@@ -1,4 +1,4 @@
-"""Fusion of estimates whose errors are correlated in an unknown way: covariance intersection and kin.
+"""Fuses estimates whose errors correlate in an unknown way: covariance intersection and kin.
 
 Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion Based on Fast Covariance
 Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,

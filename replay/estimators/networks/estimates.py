@@ -1,4 +1,4 @@
-"""The algebra of estimates that are fused: inverses, transforms and searches, in place."""
+"""Computes with estimates that are fused: inverses, transforms and searches, in place."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""Replay of a sensor network: every node filters with its own sensor and fuses what arrives from others.
+"""Replays a sensor network: every node filters with its own sensor and fuses what others send.
 
 Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
 prediction (not x*) with the x* received, by a rule of `covariance_intersection`; update with the own

@@ -1,4 +1,4 @@
-"""Orientation by the common methods of inertial units: Madgwick's, Mahony's, and Laidig and Seel's VQF.
+"""Estimates orientation by common methods: Madgwick's, Mahony's, and Laidig and Seel's VQF.
 
 They are what filters are compared with, and tell no covariance: one is assumed. Madgwick, "An
 efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,

@@ -1,4 +1,4 @@
-"""Orientation from inertial and magnetic samples: dead reckoning, corrected by the Bingham filter.
+"""Estimates orientation from inertial and magnetic samples by dead reckoning and Bingham filter.
 
 Beside it what it has to beat: dead reckoning alone, and the attitude of every sample alone.
 

@@ -1,4 +1,4 @@
-"""The estimators of orientation from inertial samples, as a replay has them; see `inertial`."""
+"""Offers the estimators of orientation from inertial samples to a replay; see `inertial`."""
 
 import math
 from collections.abc import Callable

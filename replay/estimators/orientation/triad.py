@@ -1,4 +1,4 @@
-"""Orientation from two directions (TRIAD), and steps of an orientation by a turn."""
+"""Finds orientation from two directions (TRIAD), and steps of an orientation by a turn."""
 
 import math
 

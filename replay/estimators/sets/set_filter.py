@@ -1,4 +1,4 @@
-"""Guaranteed sets over time: position sets moved by odometry with bounded errors, cut by every frame.
+"""Moves guaranteed position sets by odometry with bounded errors, and cuts them by every frame.
 
 Briechle, Hanebeck (2004) gives the set of one frame of relative bearings, see `set_membership`; moving
 and intersecting sets is the recursion of Schweppe, Recursive State Estimation: Unknown but Bounded

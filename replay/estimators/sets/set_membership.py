@@ -1,4 +1,4 @@
-"""Guaranteed position fixes from bounded relative bearings, one set per frame of one stamp.
+"""Computes guaranteed fixes from bounded relative bearings, one set per frame of one stamp.
 
 Briechle, Hanebeck (2004). The estimate is the set itself: the exact one, its tightest box, or the
 pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative bearing to blame is

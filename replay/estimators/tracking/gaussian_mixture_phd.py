@@ -1,4 +1,4 @@
-"""The Gaussian mixture PHD filter: how many things there are, and where, from unordered scans.
+"""Estimates how many things there are, and where, from unordered scans: the Gaussian mixture PHD.
 
 Source: Vo, Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 54(11), 2006,
 table I (recursion), II (pruning, merging), III (extraction). Things appear anywhere alike, as in Beard,

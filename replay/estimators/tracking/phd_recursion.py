@@ -1,4 +1,4 @@
-"""The recursion of the Gaussian mixture PHD filter: predict, update, merge, prune and extract."""
+"""Recurses the Gaussian mixture PHD filter: predict, update, merge, prune and extract."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Tracks of vessels from reports that do not say whose they are.
+"""Tracks vessels from reports that do not say whose they are.
 
 Every report goes to the track from which it is most likely, or begins a new one. Tracks are taken for
 independent point processes: what counts is how likely track i reports now (its rate) times how likely

@@ -1,4 +1,4 @@
-"""The kinds of sensors of unordered scans that a tracker takes, and what they are like.
+"""Describes the kinds of sensors of unordered scans that a tracker takes.
 
 A target is (x_m, vx_mps, y_m, vy_mps) in the plane; `origin` is where the sensor is.
 """

@@ -1,4 +1,4 @@
-"""Scans of unordered detections, of one sensor or several: which detections are of which scan.
+"""Reads scans of unordered detections of one sensor or several: which detections are of which scan.
 
 A sensor that moves names the topic of its own position in the metadata of its scans, as ORIGIN.
 """

@@ -1,4 +1,4 @@
-"""Errors of sensors that stay: components of every track's state beside the target's.
+"""Describes errors of sensors that stay: components of every track's state beside the target's.
 
 A registration error is constant and that of all tracks; a correlated one is each track's own, such as
 where on a hull a box lies, and another one after `correlation_s`: a first-order Gauss-Markov process.

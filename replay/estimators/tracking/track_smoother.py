@@ -1,4 +1,4 @@
-"""A tracker whose tracks are smoothed: it says at the end what all detections say of every state."""
+"""Smooths a tracker's tracks: says at the end what all detections say of every state."""
 
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Tracks of vessels and other targets from the unordered scans of several sensors at once.
+"""Tracks vessels and other targets from the unordered scans of several sensors at once.
 
     tracker:nearest     the surest pair of track and detection first
     tracker:hungarian   the best map of tracks to detections (global nearest neighbour)

@@ -1,4 +1,4 @@
-"""Particle filters of cooperative vehicles with unordered fixes.
+"""Filters cooperative vehicles with unordered fixes by particles.
 
 Sources: Zhang et al., "Cooperative vehicle-infrastructure localization based on the symmetric
 measurement equation filter", 2016 (a bootstrap filter on sums of powers: their exact likelihood is a

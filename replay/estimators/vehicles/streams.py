@@ -1,4 +1,4 @@
-"""Cooperative vehicles from the streams of a log: which method uses what, and what it says.
+"""Filters cooperative vehicles from a log's streams: which method uses what, and what it says.
 
 A method is named `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: how the fixes are
 associated, and what is made of the infrastructure sensor. What came at one time in all runs is a frame;

@@ -1,4 +1,4 @@
-"""Symmetric functions of noisy numbers as pseudo-measurements: sums of powers and sums of products.
+"""Makes pseudo-measurements of symmetric functions of noisy numbers: sums of powers, of products.
 
 Sources: Kamen, "Multiple target tracking based on symmetric measurement equations", IEEE TAC 1992;
 Leven and Lanterman, "Unscented Kalman filters for multiple target tracking with symmetric measurement

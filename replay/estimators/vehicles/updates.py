@@ -1,4 +1,4 @@
-"""The joint filter's updates, by what a method makes of fixes and of the infrastructure sensor.
+"""Updates the joint filter, by what a method makes of fixes and of the infrastructure sensor.
 
 Each takes the joint states of some runs and what came in them at one time, and returns them updated.
 """

@@ -1,4 +1,4 @@
-"""The joint Gaussian filter of several vehicles, all runs of an ensemble at once.
+"""Filters several vehicles as one joint Gaussian, all runs of an ensemble at once.
 
 Sources: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016; Bar-Shalom, Li, "Multitarget-Multisensor Tracking",

@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao bound over an ensemble of true trajectories, from the steps along each.
+"""Bounds the errors over an ensemble of true trajectories (posterior Cramer-Rao), step by step.
 
 With transition F, noise Q and the information H' R^-1 H of every step at the true states, and means over
 the trajectories, of products, not products of means,

@@ -1,4 +1,4 @@
-"""Errors against the covariance that was promised: by component, ellipses, dilution of precision.
+"""Compares errors with the covariance promised: by component, ellipses, dilution of precision.
 
 Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
 """

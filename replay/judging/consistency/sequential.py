@@ -1,4 +1,4 @@
-"""Sequential tests of log-likelihood ratios: Wald's of two hypotheses, Page's of a change.
+"""Tests log-likelihood ratios in sequence: Wald's of two hypotheses, Page's of a change.
 
 Wald, "Sequential Tests of Statistical Hypotheses", Annals of Mathematical Statistics 16(2), 1945; Page,
 "Continuous Inspection Schemes", Biometrika 41, 1954. What they promise holds for ratios that are

@@ -1,4 +1,4 @@
-"""Alignment of estimates with truth: the least-squares transform of their positions.
+"""Aligns estimates with truth by the least-squares transform of their positions.
 
 Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
 Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the vertical alone: Zhang,

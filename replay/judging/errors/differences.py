@@ -1,4 +1,4 @@
-"""Paired differences of a metric: what one estimator gave of every run against what another gave.
+"""Pairs differences of a metric: what one estimator gave of every run against another's.
 
 The run is the unit: errors within a run are correlated, runs are independent. Intervals are those of the
 percentile bootstrap over runs. BCa is no better here: paired differences of two alike are symmetric,

@@ -1,4 +1,4 @@
-"""Estimates against truth: alignment, errors, and whether the filter's own covariance can be believed.
+"""Evaluates estimates against truth: alignment, errors, and whether the covariance is believable.
 
 An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
 truth is interpolated at the estimate's stamps, never over a gap; errors are those of the tangent space

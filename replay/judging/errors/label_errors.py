@@ -1,4 +1,4 @@
-"""Errors of several things at once, with the estimators' labels or with the best ones of each step.
+"""Computes errors of several things at once, with the estimators' labels or each step's best.
 
 Source of the total error: Zhang et al., "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, (20). Estimates and truths are (..., things, axes).

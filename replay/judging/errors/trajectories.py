@@ -1,4 +1,4 @@
-"""Trajectories against truth: absolute and relative pose errors, APE and RPE.
+"""Compares trajectories with truth: absolute and relative pose errors, APE and RPE.
 
 Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems",
 IROS 2012; conventions and names are those of evo (https://github.com/MichaelGrupp/evo): figures agree.

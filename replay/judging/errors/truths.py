@@ -1,4 +1,4 @@
-"""The truth at the stamps of estimates, read along with them: memory holds what they are at.
+"""Reads the truth at the stamps of estimates along with them: memory holds what they are at.
 
 A truth that is stated twice, by one topic or by two, is doubtful; what is read is looked at for that.
 """

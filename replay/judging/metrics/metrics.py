@@ -1,4 +1,4 @@
-"""The metrics of any estimator: errors, consistency, innovations, failures, coverage, solutions.
+"""Defines the metrics of any estimator: errors, consistency, innovations, failures, coverage.
 
 NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
 """

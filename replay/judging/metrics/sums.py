@@ -1,4 +1,4 @@
-"""Sums in bins: what is kept of errors whose number nobody knows beforehand."""
+"""Sums in bins what is kept of errors whose number nobody knows beforehand."""
 
 import numpy as np
 from numpy.typing import NDArray

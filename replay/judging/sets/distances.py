@@ -1,4 +1,4 @@
-"""Distances between sets of points: OSPA and GOSPA with its parts.
+"""Measures distances between sets of points: OSPA and GOSPA with its parts.
 
 Sources: Schuhmacher, Vo, Vo, "A consistent metric for performance evaluation of multi-object filters",
 IEEE TSP 56(8), 2008 (OSPA); Rahmathullah, Garcia-Fernandez, Svensson, "Generalized optimal sub-pattern

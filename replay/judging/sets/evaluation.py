@@ -1,4 +1,4 @@
-"""Sets against truth: area, whether the true position is inside, and how often there is no set."""
+"""Judges sets by truth: area, whether the true position is inside, how often there is no set."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

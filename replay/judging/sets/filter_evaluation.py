@@ -1,4 +1,4 @@
-"""Guaranteed sets over time against truth: where what they rest on holds, they must hold the robot."""
+"""Judges guaranteed sets over time: where their premises hold, they must hold the robot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Tracks against the trajectories of targets, judged at instants that no sensor sets.
+"""Compares tracks with the trajectories of targets, at instants that no sensor sets.
 
 At every instant the tracks, predicted to it, are paired with the targets that are there (GOSPA with
 alpha 2). The pairs say how far a track is from its target, for how much of the time a target is

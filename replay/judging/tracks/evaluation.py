@@ -1,4 +1,4 @@
-"""The tracks of a replay against the targets that its log has truths of, block by block.
+"""Evaluates the tracks of a replay by the targets that its log has truths of, block by block.
 
 Instants, pairs and distances are those of `errors`, by which experiments judge trackers, too. A target
 is there from the first to the last stamp of its truth. Judged is what the tracker tells of: from a while

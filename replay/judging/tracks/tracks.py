@@ -1,4 +1,4 @@
-"""Tracks against the targets they should follow: which reports of a target went to one track.
+"""Judges tracks by the targets they should follow: which reports of a target went to one track.
 
 A target's own track is found by assigning tracks to targets one to one, so that as many reports as can
 be are in the track of their target: a track that swallows two targets counts for one of them.

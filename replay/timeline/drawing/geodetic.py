@@ -1,4 +1,4 @@
-"""Places on the earth: points by latitude and longitude on a map.
+"""Draws places on the earth: points by latitude and longitude on a map.
 
 The map's tiles come from the network; without it the points are still in their places.
 """

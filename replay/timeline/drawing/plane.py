@@ -1,4 +1,4 @@
-"""Drawing a scene in the plane: paths, poses, covariance ellipses, numbered points, sight lines.
+"""Draws a scene in the plane: paths, poses, covariance ellipses, numbered points, sight lines.
 
 What is sent are the true coordinates. Rerun's 2-D views have y pointing down, so everything below `map`
 hangs on one transform that turns it up. What moves sits at its time and vanishes when it is no longer

@@ -1,4 +1,4 @@
-"""Plots that every family uses: components, errors with bands, NEES and NIS with chi-square bounds.
+"""Plots what every family uses: components, errors with bands, NEES and NIS with bounds.
 
 Every function sends its columns and returns the views that show them. A band is Rerun's `Measurements`,
 which draws one standard deviation: a band of k sigma is sent with k^2 times the variance.

@@ -1,4 +1,4 @@
-"""The shooter's timeline: a map of sensors, what they heard as rays, the shot's ellipses; NEES."""
+"""Draws shots: a map of sensors, what they heard as rays, the shot's ellipses; NEES."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""The vessels' timeline: reports in the colours of their tracks, on a map and in the tangent plane.
+"""Draws vessels: reports in the colours of their tracks, on a map and in the tangent plane.
 
 The map's tiles come from the network; without it the reports are still in their places. Beside it:
 how many tracks and vessels are live, and the share of each vessel's reports that its own track has.

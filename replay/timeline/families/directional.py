@@ -1,4 +1,4 @@
-"""The timelines of directions: the density of two headings on the torus, of an axis, orientation triads.
+"""Draws directions: the density of two headings on the torus, of an axis, orientation triads.
 
 To the right of each are the errors in degrees with their bands, as everywhere.
 """

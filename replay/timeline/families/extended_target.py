@@ -1,4 +1,4 @@
-"""The extended target's timeline: true and estimated rectangles, and the points that are seen."""
+"""Draws the extended target: true and estimated rectangles, and the points that are seen."""
 
 import numpy as np
 import rerun.blueprint as rrb

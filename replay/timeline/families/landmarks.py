@@ -1,4 +1,4 @@
-"""The robots' timeline: each robot on its map of landmarks, its errors, NEES, NIS and events."""
+"""Draws robots: each on its map of landmarks, its errors, NEES, NIS and events."""
 
 from functools import partial
 from typing import NamedTuple

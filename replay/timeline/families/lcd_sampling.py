@@ -1,4 +1,4 @@
-"""The timeline of sample sets: every sampling's points in the plane, with the circle that holds 95 %."""
+"""Draws sample sets: every sampling's points in the plane, with the circle that holds 95 %."""
 
 import numpy as np
 import rerun as rr

@@ -1,4 +1,4 @@
-"""A body that moves and turns in space: its path, its axes, and how well both are known.
+"""Draws a body that moves and turns in space: its path, its axes, and how well both are known.
 
 Drawn for every estimate of a position in space with an orientation, whatever made the log. Where fixes
 are silent for long, the path is marked, and the plots are shaded.

@@ -1,4 +1,4 @@
-"""A sensor network's timeline: its graph with the messages, the nodes' estimates, NEES node by node.
+"""Draws a sensor network: its graph with the messages, the nodes' estimates, NEES by node.
 
 A message runs from its sender towards its receiver when it is sent; one that is lost is red and ends
 half way. Each fusion rule has maps of its own: the ways, and every node's error with its 95 % ellipse.

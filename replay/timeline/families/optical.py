@@ -1,4 +1,4 @@
-"""The optical sensors' timeline: sensors, targets and lines of sight in space, NEES, errors, events.
+"""Draws optical sensors, targets and lines of sight in space, with NEES, errors, events.
 
 Lines of sight are drawn twice: as measured, with the nominal attitudes, when they come in; and corrected
 by the estimated biases when these are there.

@@ -1,4 +1,4 @@
-"""The timeline of set-valued fixes: every estimator's set as polygons around the truth, and its area.
+"""Draws set-valued fixes: every estimator's set as polygons around the truth, and its area.
 
 A frame whose set is empty shows none; the relative bearing to blame is among the events.
 """

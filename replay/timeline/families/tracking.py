@@ -1,4 +1,4 @@
-"""The timeline of tracks of many targets: what each sensor scans, the tracks in colours of their own.
+"""Draws tracks of many targets: what each sensor scans, the tracks in colours of their own.
 
 The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
 nothing; bearings are rays from where the sensor is. Lines lead from a track to the detections of places

@@ -1,4 +1,4 @@
-"""The vehicles' timeline: a map, the same close up, and errors and GOSPA over time.
+"""Draws vehicles: a map, the same close up, and errors and GOSPA over time.
 
 Errors are a metre where paths are hundreds, so everything is drawn once more close up: about each
 vehicle's true place, side by side. Detections of the infrastructure sensor are shown raw, in its own

@@ -1,4 +1,4 @@
-"""MCAP files of ROS, read by the log's own container, a chunk at a time."""
+"""Reads MCAP files of ROS by the log's own container, a chunk at a time."""
 
 from collections.abc import Callable, Iterator
 from functools import partial

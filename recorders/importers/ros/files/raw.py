@@ -1,4 +1,4 @@
-"""Messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
+"""Holds messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The bags of ROS 1 (.bag), walked record by record: an index is of use, and not needed.
+"""Reads the bags of ROS 1 (.bag) record by record: an index is of use, and not needed.
 
 Source: wiki.ros.org/Bags/Format/2.0.
 """

@@ -1,4 +1,4 @@
-"""The sqlite3 files of ROS 2 (.db3), opened so that nothing beside them is made or changed.
+"""Reads the sqlite3 files of ROS 2 (.db3) so that nothing beside them is made or changed.
 
 Source: rosbag2_storage_sqlite3; definitions of the types are in it since version 4 of its tables.
 """
