@@ -289,7 +289,7 @@ class Replay:
 
     @property
     def input_sha256(self) -> str:
-        """SHA-256 of what was replayed: of logs their files, of recordings their columns."""
+        """Return the SHA-256 of what was replayed: of logs their files, of recordings their columns."""
         digest = hashlib.sha256()
         for log in self.logs:
             if isinstance(log, MemorySource):

@@ -60,7 +60,7 @@ class Evaluation:
 
     @cached_property
     def metrics(self) -> dict[str, float]:
-        """APE and RPE, as `ape_translation_rmse_m`; how many poses and pairs they are of."""
+        """Return APE and RPE, as `ape_translation_rmse_m`; how many poses and pairs they are of."""
         return trajectory_metrics([self.compared])
 
     @property

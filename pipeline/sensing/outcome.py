@@ -93,7 +93,7 @@ class SensorNoise:
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row per number: column, term with its unit, value, 95 % interval."""
+        """Return a row per number: column, term with its unit, value, 95 % interval."""
         rows = [
             (column.name, _TERMS[name].format(unit_of(column.field) or "unit"), *number)
             for column in self.columns
@@ -103,12 +103,12 @@ class SensorNoise:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on all columns."""
+        """Return sentences on all columns."""
         return [note for column in self.columns for note in column.notes]
 
     @property
     def densities(self) -> Densities:
-        """What other programs are told: N and K of each field, the largest of its axes.
+        """Return what other programs read: N and K of each field, the largest of its axes.
 
         Of Gauss-Markov noise without a walk, the walk is the one that begins as it does: s sqrt(2 / T).
         Where no axis has a walk, K is the most that it may be: Kalibr refuses a zero, and a covariance
@@ -134,7 +134,7 @@ class SensorNoise:
 
     @property
     def curves(self) -> pd.DataFrame:
-        """A row per column and time: the deviation, its 95 % interval, the model's."""
+        """Return a row per column and time: the deviation, its 95 % interval, the model's."""
         tables = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)
@@ -151,7 +151,7 @@ class SensorNoise:
 
     @property
     def chart(self) -> Chart:
-        """The measured curves, their intervals, and the models'."""
+        """Draw the measured curves, their intervals, and the models'."""
         panels = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)

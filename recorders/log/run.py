@@ -35,7 +35,7 @@ class RunMetadata:
     notes: dict[str, str] = field(default_factory=dict)
 
     def to_record(self) -> dict[str, str]:
-        """The text pairs of the MCAP metadata record."""
+        """Return the text pairs of the MCAP metadata record."""
         return {
             "format": str(FORMAT),
             "scenario": self.scenario,

@@ -61,7 +61,7 @@ class Stream:
 
     @property
     def components(self) -> list[str]:
-        """The names of a state's or estimate's components, such as `x_m`."""
+        """Return the names of a state's or estimate's components, such as `x_m`."""
         return [name for name in self.metadata.get("components", "").split(",") if name]
 
     def times(self, clock: Clock) -> NDArray[np.int64]:
@@ -69,7 +69,7 @@ class Stream:
         return self.publish_time_ns if clock == "publish_time" else self.log_time_ns
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> "Stream":
-        """The messages of `rows`, in that order."""
+        """Return the messages of `rows`, in that order."""
         return replace(
             self,
             publish_time_ns=self.publish_time_ns[rows],
@@ -79,7 +79,7 @@ class Stream:
         )
 
     def pandas(self) -> "pd.DataFrame":
-        """A row for every message: both stamps in ns, then the fields.
+        """Return a row for every message: both stamps in ns, then the fields.
 
         A vector has a column for every entry, such as `mean_x_m`; where its entries have no names they
         have numbers, such as `covariance_0`.
@@ -89,13 +89,13 @@ class Stream:
         return pd.DataFrame(self._flat())
 
     def arrow(self) -> "pa.Table":
-        """The same table for Arrow."""
+        """Return the same table for Arrow."""
         import pyarrow as pa
 
         return pa.table(self._flat())
 
     def polars(self) -> "pl.DataFrame":
-        """The same table for polars; raises BadInput where that is not installed."""
+        """Return the same table for polars; raises BadInput where that is not installed."""
         try:
             import polars as pl
         except ImportError:

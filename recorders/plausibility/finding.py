@@ -48,7 +48,7 @@ class Finding(NamedTuple):
 
     @property
     def mended(self) -> str:
-        """The sentence, with what to do."""
+        """Return the sentence, with what to do."""
         tries = [f"--set {self.key}={self.setting}"] * bool(self.key) + [self.mapping]
         return "; ".join(filter(None, (self.words, " or ".join(filter(None, tries)))))
 

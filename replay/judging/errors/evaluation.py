@@ -93,7 +93,7 @@ class Errors:
 
     @property
     def squared(self) -> Floats:
-        """(n, d) the squares of the errors, of a bound what they are at least; infinite if too large."""
+        """Return (n, d) squares of the errors, of a bound what they are at least; infinite if large."""
         with np.errstate(over="ignore"):
             return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
 
