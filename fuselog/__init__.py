@@ -47,8 +47,8 @@ __all__ = list(_NAMES)
 def __getattr__(name: str) -> Any:
     if name in _RENAMED:
         new = _RENAMED[name]
-        said = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
-        warnings.warn(said, FutureWarning, stacklevel=2)
+        message = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
+        warnings.warn(message, FutureWarning, stacklevel=2)
         return getattr(sys.modules[__name__], new)
     if name not in _NAMES:
         raise AttributeError(f"module 'fuselog' has no attribute '{name}'")

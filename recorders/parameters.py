@@ -141,7 +141,7 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
     An entry is `name: meaning`, or `name, name: meaning` where several mean alike. Raises BadInput where
     one names no parameter.
     """
-    told: dict[str, str] = {}
+    meaning_of: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         own = base.__doc__ if issubclass(base, Parameters) else None
         section = _ATTRIBUTES.search(cleandoc(own or ""))
@@ -152,8 +152,8 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
                         f"{base.__name__}: its docstring says what '{name}' means, and it has no such "
                         f"parameter; {choices(name, kind.model_fields)}"
                     )
-                told[name] = " ".join(entry["meaning"].split())
-    return told
+                meaning_of[name] = " ".join(entry["meaning"].split())
+    return meaning_of
 
 
 def in_few_words(meaning: str) -> str:
@@ -171,12 +171,12 @@ def in_few_words(meaning: str) -> str:
 
 def _prose(kind: type[BaseModel]) -> str:
     """What a type and its bases say of their parameters as a whole."""
-    told = [
+    texts = [
         _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
         for each in reversed(kind.__mro__)
         if issubclass(each, Parameters) and each is not Parameters
     ]
-    return "\n\n".join(filter(None, dict.fromkeys(told)))
+    return "\n\n".join(filter(None, dict.fromkeys(texts)))
 
 
 class Described(NamedTuple):
@@ -210,8 +210,8 @@ def explain(kind: type[BaseModel]) -> dict[str, str]:
     schema = kind.model_json_schema()
     places: dict[str, list[str]] = {}
     for place, table in _tables("", schema, schema.get("$defs", {})):
-        if told := table.get("description"):
-            places.setdefault(told, []).append(place)
+        if description := table.get("description"):
+            places.setdefault(description, []).append(place)
     return {", ".join(names): text for text, names in places.items()}
 
 

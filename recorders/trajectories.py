@@ -182,9 +182,9 @@ def _recognised(path: object, number: int, line: str) -> Format:
     for name in ("tum", "kitti"):
         if len(fields) == LAYOUTS[name].least:
             return name
-    told = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
+    layouts = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
     raise BadInput(
-        f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {told}; "
+        f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {layouts}; "
         "fuselog import table makes a log of a table with other columns"
     )
 

@@ -190,8 +190,8 @@ def _of_one_topic(
             yield key, value
             continue
         for name, topic in source.topics.items():
-            is_told = stated_in(name, topic.metadata) or f"{name}.plane" in settings
-            if is_planar(topic.schema_name, topic.metadata) and not is_told:
+            is_stated = stated_in(name, topic.metadata) or f"{name}.plane" in settings
+            if is_planar(topic.schema_name, topic.metadata) and not is_stated:
                 yield f"{name}.plane", value
 
 

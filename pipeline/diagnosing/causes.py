@@ -29,7 +29,7 @@ GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign 
 LEADING = 10  # of the likeliest faults: each is tried beside all others
 
 
-class Told(NamedTuple):
+class Estimated(NamedTuple):
     """Holds a number of a cause: the component or parameter it is of, and its 95 % interval."""
 
     part: str
@@ -58,33 +58,33 @@ class Cause(NamedTuple):
     of_halves: tuple[float, float] = (np.inf, np.inf)
 
     @property
-    def said(self) -> str:
+    def statement(self) -> str:
         """What is wrong, and by how much."""
         return self.hypothesis.words(self.value, *self.ends)
 
     @property
-    def numbers(self) -> "list[Told]":
-        """The numbers with their intervals, as they are told: factors, not their logarithms."""
+    def numbers(self) -> "list[Estimated]":
+        """The numbers with their intervals, as they are reported: factors, not their logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
-            return [Told(of.part, *(of.told(each) for each in (self.value, low, high)))]
+            return [Estimated(of.part, *(of.reported(each) for each in (self.value, low, high)))]
         names = [of.topic, *of.part.split(", ")][-of.size :]
-        return [Told(*each) for each in zip(names, self.value, low, high, strict=True)]
+        return [Estimated(*each) for each in zip(names, self.value, low, high, strict=True)]
 
     @property
     def words(self) -> str:
         """What is wrong, by how much, and what that is known by."""
         or_else = "".join(
-            f"; this log does not determine it: as likely, {each.said}"
+            f"; this log does not determine it: as likely, {each.statement}"
             if each.hypothesis is self.hypothesis
-            else f"; or else, which this log does not tell from it, {each.said}"
+            else f"; or else, which this log does not tell from it, {each.statement}"
             for each in self.others
         )
         first, second = self.of_halves
         half, worst = ("first", first) if first < second else ("second", second)
         but = f"; but over the {half} half of the log it loses {number(-worst, 4)}: there it is not so"
         gained = f"; without this the log-likelihood gains {number(self.gain, 4)}"
-        return f"{self.said}{or_else}{gained}{but if worst < -DROP_95 else ''}"
+        return f"{self.statement}{or_else}{gained}{but if worst < -DROP_95 else ''}"
 
 
 class Tried(NamedTuple):
@@ -97,7 +97,7 @@ class Tried(NamedTuple):
     def row(self) -> tuple[str, str, str, str, float]:
         """Its kind, topic and part; the number, or numbers, that gain most; and that gain."""
         of, at = self.hypothesis, self.at.value
-        values = at if isinstance(at, tuple) else (of.told(at),)
+        values = at if isinstance(at, tuple) else (of.reported(at),)
         return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
 
 

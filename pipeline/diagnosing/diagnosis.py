@@ -20,7 +20,7 @@ from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Advice, Trying
-from pipeline.diagnosing.causes import Sought, Told, least_gain, seek, tried_table
+from pipeline.diagnosing.causes import Estimated, Sought, least_gain, seek, tried_table
 from pipeline.diagnosing.consistency import (
     judged_by_itself,
     nis_charts,
@@ -92,12 +92,12 @@ class Diagnosis:
 
     @property
     def hypotheses(self) -> int:
-        """How many faults were tried."""
+        """Count how many faults were tried."""
         return len(self.tried)
 
     @property
     def told(self) -> list[str]:
-        """The sentences, numbered; or that nothing was found."""
+        """Return the sentences, numbered; or that nothing was found."""
         if not self.sentences:
             why = (
                 f"of {self.hypotheses} faults none surely gains {self.least_gain:.3g} in log-likelihood"
@@ -107,14 +107,14 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """A row per sentence, or per number of it: kind, topic, part, interval, gain, setting.
+        """Return a row per sentence, or per number of it: kind, topic, part, interval, gain, setting.
 
         What the log does not tell from a cause has the same number in the column `sentence_number`.
         """
         rows = []
         for order, each in enumerate(self.sentences, start=1):
-            told = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
-            nothing = [Told("", np.nan, np.nan, np.nan)]
+            shared = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
+            nothing = [Estimated("", np.nan, np.nan, np.nan)]
             alike = (each.cause, *each.cause.others) if each.cause else ()
             for cause in alike or (None,):
                 about = cause.hypothesis if cause else None
@@ -122,7 +122,7 @@ class Diagnosis:
                 for part in cause.numbers if cause else nothing:
                     rows.append(
                         {
-                            **told,
+                            **shared,
                             **own,
                             **part._asdict(),
                             "gain": cause.gain if cause else np.nan,
@@ -134,18 +134,18 @@ class Diagnosis:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric of the replay: estimator, quantity, case, value."""
+        """Return a row per metric of the replay: estimator, quantity, case, value."""
         return self.replay.metrics
 
     @cached_property
     def profiles(self) -> dict[str, Chart]:
-        """NIS per component over time, by case."""
+        """Draw NIS per component over time, by case."""
         innovations = Outputs(self.replay, schemas.INNOVATION)
         return nis_charts(self.label, innovations, self.replay.logs[0].epoch_ns)
 
     @property
     def marks(self) -> dict[str, Stream]:
-        """The sentences as messages by topic, for the timeline: at the stamp where each one began."""
+        """Return the sentences as messages by topic, for the timeline: stamped where each one began."""
         first_ns = self.replay.logs[0].extent("publish_time")[0]
         return marks_of(self.sentences, self.label, [*self.replay.estimates[0].topics], first_ns)
 
@@ -366,8 +366,8 @@ def _followed(
             raise
         trying = Trying(label, alterations_of(source), is_own=False)
         mends = [trying.over(Advice.of(each.setting)) for each in mended]
-        said = " ".join(f"--set {each.setting}" for each in mends)
-        note = f"all else is said of the log with {said}, since as it is: {error}"
+        settings_given = " ".join(f"--set {each.setting}" for each in mends)
+        note = f"all else is said of the log with {settings_given}, since as it is: {error}"
         with suppress(BadInput):
             other = alter(source, {each.key: each.value for each in mends})
             return replayed(other)._replace(mended=mended, notes=[note])

@@ -213,12 +213,15 @@ class Likelihood:
             outputs = collect(replay(Ensemble(sources), bound, is_part=True))
         except BadInput:  # no run can be followed with these
             return [[{}] * count for _ in trials]
-        told = {
+        innovations = {
             topic: rows
             for topic, rows in outputs.items()
             if rows.stream.schema.full_name == schemas.INNOVATION.full_name
         }
-        runs = [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(sources))]
+        runs = [
+            {topic: rows.of_run(run) for topic, rows in innovations.items()}
+            for run in range(len(sources))
+        ]
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:

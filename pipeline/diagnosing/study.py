@@ -280,7 +280,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
                 found = diagnose(faulty, scenario.estimator, set=merge(fault.settings, OPEN))
                 row = {"scenario": name, "fault": fault_name, "run": run}
                 rows.append(
-                    {**row, "worth": _worth(scenario, fault, source, faulty), **_said(fault, found)}
+                    {**row, "worth": _worth(scenario, fault, source, faulty), **_named_by(fault, found)}
                 )
                 if fault_name == CLEAN_RUN:
                     clean.append(source)
@@ -326,7 +326,7 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
     return max(after - before, 0.0)
 
 
-def _said(fault: Fault, found: Diagnosis) -> dict[str, Any]:
+def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
     """What the diagnosis said, and whether it is right."""
     is_right = [
         any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in each.names)

@@ -74,7 +74,7 @@ class Page:
     def _make(self) -> None:
         log = self.session.log
         self._head = Div(name="verdict", sizing_mode="stretch_width")
-        self._said = Div(name="said", sizing_mode="stretch_width")
+        self._sentences = Div(name="said", sizing_mode="stretch_width")
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
         self._time = time = Range1d(0.0, 1.0)  # of the estimates, once there are some
@@ -105,7 +105,7 @@ class Page:
         right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
         left.styles = right.styles = {"flex": "1 1 330px"}
         both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
-        main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
+        main = column(self._head, self._sentences, both, sizing_mode="stretch_width", styles=GROW)
         self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
         self._document.title = f"fuselog explore: {self.session.source.name}"
         self._fill_side()
@@ -214,11 +214,11 @@ class Page:
 
         def work(_: Callable[[], bool]) -> None:
             found = self.session.tuned(label, values, free)
-            said = ", ".join(f"{name} = {found[name]:.4g}" for name in free)
+            values_in_words = ", ".join(f"{name} = {found[name]:.4g}" for name in free)
 
             def show() -> None:
                 self._set(found)
-                self._tell(f"tuned by likelihood: {said}")
+                self._tell(f"tuned by likelihood: {values_in_words}")
 
             self._later(show)
 
@@ -229,8 +229,8 @@ class Page:
         self._tell("diagnosing ...")
 
         def work(_: Callable[[], bool]) -> None:
-            told = self.session.diagnosed(label, values)
-            self._later(lambda: self._tell(*told))
+            sentences = self.session.diagnosed(label, values)
+            self._later(lambda: self._tell(*sentences))
 
         self._work.ask(work)
 
@@ -389,11 +389,11 @@ class Page:
         return list(self.session.filters)[place]
 
     def _tell(self, *sentences: str) -> None:
-        self._said.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
+        self._sentences.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
 
     def _say_error(self, error: Exception) -> None:
-        said = str(error) if isinstance(error, BadInput) else f"this failed: {error!r}"
-        self._later(lambda: self._tell(said))
+        message = str(error) if isinstance(error, BadInput) else f"this failed: {error!r}"
+        self._later(lambda: self._tell(message))
 
     def _later(self, act: Callable[[], object]) -> None:
         """Change the page from the thread that may."""

@@ -49,13 +49,13 @@ def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[S
     shaken, turned = unrest(time_ns, force, rate, parameters.window_s)
     stands = (shaken < parameters.still_mps2) & (turned < parameters.still_radps)
     rates_hz = {"standing": parameters.standing_hz, "rolling": parameters.rolling_hz}
-    told = {"standing": stands, "rolling": np.ones(len(stands), bool)}
+    holds = {"standing": stands, "rolling": np.ones(len(stands), bool)}
     beside, found = inertial.topic.rpartition("/")[0], []
     for name, rate_hz in rates_hz.items():
         if rate_hz > 0.0:
             turn = np.floor((time_ns - time_ns[0]) * (1e-9 * rate_hz) + 1e-6)
             rows = np.flatnonzero(np.diff(turn, prepend=-1.0) > 0.0)
-            value = told[name][rows, None].astype(float)
+            value = holds[name][rows, None].astype(float)
             metadata = {"components": name, "kinds": "linear"}
             stream = make_stream(
                 f"{beside}/{name}",

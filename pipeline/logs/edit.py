@@ -169,11 +169,11 @@ def merge(
         for block in stream_blocks(log, names)
     )
     empty = [read_empty(log, name) for log, names in zip(logs, chosen, strict=True) for name in names]
-    told = [
+    merged = [
         f"{log.path.name}{f' {offset_ns * 1e-9:+g} s' if offset_ns else ''}"
         for log, offset_ns in zip(logs, offsets_ns, strict=True)
     ]
-    run = with_operation(joined_runs(logs, offsets_ns, target), "merge", f"merged {', '.join(told)}")
+    run = with_operation(joined_runs(logs, offsets_ns, target), "merge", f"merged {', '.join(merged)}")
     return write_changed(target, run, empty, blocks, notes)
 
 
@@ -264,8 +264,8 @@ def constrain(
             )
     notes = losses_of(log)
     for stream in added:
-        told, total = int(stream["value"].sum()), len(stream)
-        notes.append(f"{stream.topic}: holds at {told} of {total} stamps")
+        held, total = int(stream["value"].sum()), len(stream)
+        notes.append(f"{stream.topic}: holds at {held} of {total} stamps")
     chosen = readable_log(log, ranked(log), notes)
     empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
     names = " ".join(stream.topic for stream in added)

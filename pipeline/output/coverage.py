@@ -130,8 +130,8 @@ def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock
 def replayed_note(source: Source, order: Clock) -> dict[str, str]:
     """The note REPLAYED of a source's estimates; none where it was replayed whole, by publish time."""
     ends = source.start_ns, getattr(source, "end_ns", None)
-    said = json.dumps([*ends, order])
-    return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: said}
+    text = json.dumps([*ends, order])
+    return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: text}
 
 
 def _noted(note: str) -> tuple[int | None, int | None, Clock]:
@@ -162,14 +162,14 @@ def _recounted(
         usage.note_start(own_maps[name])
     streamed = sorted({topic for each in bound for topic in each.streams})
     empty = {topic: source.empty(topic) for topic in streamed}
-    told = [
+    counted = [
         topic
         for topic, about in estimates.topics.items()
         if about.schema_name in (INNOVATION, SKIPPED) and topic.rpartition("/")[0] in _places(bound)
     ]
-    for topic in told:  # that it has innovations is said by a topic without messages too
+    for topic in counted:  # that it has innovations is said by a topic without messages too
         usages[_places(bound)[topic.rpartition("/")[0]]].note_outputs([gather([estimates.empty(topic)])])
-    outputs = estimates.blocks(told, "publish_time", BLOCK_MESSAGES) if told else iter(())
+    outputs = estimates.blocks(counted, "publish_time", BLOCK_MESSAGES) if counted else iter(())
     inputs = source.blocks(streamed, order, BLOCK_MESSAGES) if streamed else iter(())
     reached_ns = -1
 
@@ -253,5 +253,5 @@ def sentences(rows: Sequence[Row]) -> list[str]:
     measuring = {
         row.estimator for row in rows if row.used is not None and not row.why.startswith(UNTAKEN)
     }
-    told = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
-    return list(dict.fromkeys(row.sentence for row in told if row.sentence))
+    shown = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
+    return list(dict.fromkeys(row.sentence for row in shown if row.sentence))

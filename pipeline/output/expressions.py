@@ -86,7 +86,7 @@ def formatted(template: str, values: Values) -> str:
         if expression is not None:
             found = evaluate(expression, values)
             try:
-                parts.append(_said(found, form or ".3g", named=conversion == "n"))
+                parts.append(_in_words(found, form or ".3g", named=conversion == "n"))
             except ValueError:
                 raise BadInput(f"'{form}' is no format of numbers; write as {{value:.2f}}") from None
     return "".join(parts)
@@ -100,9 +100,9 @@ def expressions_in(template: str) -> list[str]:
         raise BadInput(f"'{template}': {error}; write braces as {{{{ and }}}}") from None
 
 
-def _said(value: Value, form: str, *, named: bool) -> str:
+def _in_words(value: Value, form: str, *, named: bool) -> str:
     if isinstance(value, list):
-        return ", ".join(_said(each, form, named=named) for each in value)
+        return ", ".join(_in_words(each, form, named=named) for each in value)
     if not isinstance(value, Number):
         return value if isinstance(value, str) else {True: "yes", False: "no", None: "open"}[value]
     text = format(value.value, form)

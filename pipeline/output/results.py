@@ -334,10 +334,10 @@ def keep(
     folder: Path, result: Result, **found: Sequence[Cause] | Sequence[Stressing] | Sequence[Claim]
 ) -> Result:
     """Write what was found afterwards, `causes`, or `stress` and `claims`, into a result's folder."""
-    told = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
+    sealed = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
     with whole_file(folder / RESULT_FILE) as new:
-        new.write_text(_text(told), encoding="utf-8")
-    return told
+        new.write_text(_text(sealed), encoding="utf-8")
+    return sealed
 
 
 def read_result(folder: Path) -> Result:

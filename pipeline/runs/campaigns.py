@@ -74,8 +74,8 @@ class Cell:
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
         files = [*self.files, *program_files(self.experiment.estimators)]
-        said = [experiment, states_of(files), runs, str(self.place), version_of_code()]
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        contents = [experiment, states_of(files), runs, str(self.place), version_of_code()]
+        return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
         """Record or open the runs, replay and judge them; files go to the folder."""
@@ -188,17 +188,17 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
     cells = list(chain.from_iterable(parts))
     pace = Pace(sum(cell.runs for cell in cells))
     results = work_off(cells, setting.open_pool or inline_pool, setting.checkpoints, pace)
-    told = iter(setting.progress(results, pace, len(cells)))
+    finished = iter(setting.progress(results, pace, len(cells)))
     for part in parts:
-        whole = next(told)
+        whole = next(finished)
         hashes = hashlib.sha256(whole.input_sha256.encode())
-        for done in islice(told, len(part) - 1):
+        for done in islice(finished, len(part) - 1):
             hashes.update(done.input_sha256.encode())
             whole.merge(done)
         if len(part) > 1:
             whole.input_sha256 = hashes.hexdigest()
         yield whole.check()
-    for _ in told:  # there are no more: progress and pool come to their ends
+    for _ in finished:  # there are no more: progress and pool come to their ends
         pass
 
 

@@ -241,12 +241,12 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
         if quantity in runs:
             is_own = (runs["estimator"] == estimator) & (runs["case"] == case)
             low, high = runs.loc[is_own, quantity].quantile([LOW, HIGH])
-        said = {"estimator": estimator, "quantity": quantity, "case": case}
+        keys = {"estimator": estimator, "quantity": quantity, "case": case}
         bound_low, bound_high = bounds.get(key, (math.nan, math.nan))
         aim = sizes.get(key, 1.0) if key in bounds else math.nan
         estimate = {"value": value, "low": low, "high": high}
         consistent = {"aim": aim, "bound_low": bound_low, "bound_high": bound_high}
-        rows.append({"point": number, **point, **said, **estimate, **consistent})
+        rows.append({"point": number, **point, **keys, **estimate, **consistent})
     return pd.DataFrame(rows)
 
 

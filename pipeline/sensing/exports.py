@@ -50,8 +50,8 @@ def settings(found: Densities) -> str:
         for field, density in found.fields.items()
         for name, number in zip(names.get(field, ()), density, strict=False)
     }
-    said = "# continuous: N in unit/sqrt(Hz), K in unit/sqrt(s); for --settings\n"
-    return found.warned("#", said + tomli_w.dumps({"ekf": values})) if values else ""
+    header = "# continuous: N in unit/sqrt(Hz), K in unit/sqrt(s); for --settings\n"
+    return found.warned("#", header + tomli_w.dumps({"ekf": values})) if values else ""
 
 
 def kalibr(found: Densities) -> str:
@@ -99,11 +99,11 @@ def gtsam(found: Densities) -> str:
         "setBiasOmegaCovariance": rate.walk,
     }
     lines = [f"params->{name}(I_3x3 * {density**2:.6g});\n" for name, density in calls.items()]
-    said = (
+    header = (
         "// continuous: N^2 and K^2; GTSAM divides by the step itself. A BetweenFactor of your own\n"
         "// over T seconds needs the standard deviation K sqrt(T)\n"
     )
-    return found.warned("//", said + "".join(lines))
+    return found.warned("//", header + "".join(lines))
 
 
 def robot_localization(found: Densities) -> str:

@@ -206,7 +206,7 @@ def _misfits(found: ColumnNoise) -> list[str]:
 
 def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> list[str]:
     longest_s = len(values) // 3 * found.step_s
-    said = []
+    sentences = []
     for tau_s in taus_s:
         m = round(tau_s / found.step_s)
         if not 1 <= m <= len(values) // 3:
@@ -217,11 +217,11 @@ def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> lis
         at = allan_deviation(values, found.step_s, np.array([m]))
         degrees = degrees_of_freedom(found.fitted.terms, found.step_s, m, int(at.pairs[0]))
         low, high = interval(at.deviations, np.array([degrees]))
-        said.append(
+        sentences.append(
             f"Allan deviation at {at.taus_s[0]:.4g} s: {at.deviations[0]:.4g} "
             f"({low[0]:.4g} to {high[0]:.4g}) {unit_of(found.field) or 'unit'}"
         )
-    return said
+    return sentences
 
 
 def _least(found: ColumnNoise, unit: str) -> str:

@@ -87,7 +87,7 @@ def stress_result(
                 f"--stress --scheduler {scheduler}: its workers do not see the files that are replayed; "
                 "put them where all see them, or leave out --scheduler"
             )
-        return [each.told for each in _merged(parts, pool, progress).values()]
+        return [each.summary for each in _merged(parts, pool, progress).values()]
 
 
 def claims_under_stress(

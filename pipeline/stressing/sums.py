@@ -51,7 +51,7 @@ class StressSums:
                 own[key] = before[0] + by, before[1] + runs
 
     @property
-    def told(self) -> Stressing:
+    def summary(self) -> Stressing:
         """The verdict over all runs."""
         runs = self.verdicts.total()
         often = [each for each, own in self.verdicts.items() if own * RARE_RUNS > runs]
@@ -83,4 +83,4 @@ def verdicts_of(stressed: Iterable[Stressed]) -> dict[str, Stressing]:
     sums: dict[str, StressSums] = {}
     for each in stressed:
         sums.setdefault(each.estimator, StressSums(each.estimator)).add(each)
-    return {label: each.told for label, each in sums.items()}
+    return {label: each.summary for label, each in sums.items()}

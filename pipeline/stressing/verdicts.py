@@ -253,7 +253,7 @@ class Stress:
     def sentences(self) -> list[str]:
         """Return the verdicts in words, the worst first."""
         by_weight = sorted(self.stressed, key=lambda each: -ORDER.index(each.worst))
-        return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
+        return list(dict.fromkeys(sentence for each in by_weight for sentence in each.sentences))
 
     def draw(self, save: str | Path) -> None:
         """Write the timeline of the first run to the .rrd file `save`: copies fan out from estimates.

@@ -106,8 +106,8 @@ def _chart(summary: pd.DataFrame) -> Chart:
         length_s = rows["duration_s"]
         covered.series.append(curve(str(name), length_s, rows["covered_share"], "line+markers"))
         spread.series.append(curve(str(name), length_s, rows["ratio_spread"], "line+markers"))
-        said = rows["standard_error"]
-        spread.series.append(curve(f"{name}, as intervals say", length_s, said, "dashed"))
+        standard_error = rows["standard_error"]
+        spread.series.append(curve(f"{name}, as intervals say", length_s, standard_error, "dashed"))
     covered.series.append(level("95 %", summary["duration_s"], COVERAGE))
     return Chart(title="tuned values over the length of the log", panels=[covered, spread])
 

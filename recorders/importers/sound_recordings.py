@@ -107,8 +107,8 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     for path, table in placing.items():
         arrays.append(_array(folder, path, table, 1 + count, notes))
         count += len(arrays[-1].files)
-    told = [each.begin_ns for array in arrays for each in array.files.values()]
-    epoch_ns = min((each for each in told if each is not None), default=SIMULATION_EPOCH_NS)
+    begins_ns = [each.begin_ns for array in arrays for each in array.files.values()]
+    epoch_ns = min((each for each in begins_ns if each is not None), default=SIMULATION_EPOCH_NS)
     streams = [
         stream
         for array in arrays

@@ -47,10 +47,10 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
     """
     found: dict[tuple[str, str, str], list[Finding]] = {}
     for index, streams in enumerate(islice(_portions(blocks), portions)):
-        told = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
-        for each in (*told, *_asked(CHECKS, streams)):
+        of_stamps = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
+        for each in (*of_stamps, *_asked(CHECKS, streams)):
             others = found.setdefault((each.cause, each.topic, each.field), [])
-            if not others or (each in told and not index):
+            if not others or (each in of_stamps and not index):
                 others.append(each)
     listed = [each for several in found.values() for each in several]
     return sorted(listed, key=lambda each: each.sure == "hint")

@@ -51,32 +51,32 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Fields whose circle in a full turn is off the origin (hard iron), or an ellipse (soft iron)."""
     field = _field(stream)
-    told = None if field is None else ellipse(field)
-    if told is None:
+    circle = None if field is None else ellipse(field)
+    if circle is None:
         return
-    share = float(np.linalg.norm(told.centre)) / told.radius
+    share = float(np.linalg.norm(circle.centre)) / circle.radius
     if share > HARD:
-        offsets = ", ".join(f"{-each:.4g}" for each in told.centre)
-        axis = int(np.argmax(np.abs(told.centre)))
+        offsets = ", ".join(f"{-each:.4g}" for each in circle.centre)
+        axis = int(np.argmax(np.abs(circle.centre)))
         yield Finding(
             "magnetometer",
             stream.topic,
             FIELD,
             share,
             f"{stream.topic}: hard iron: in a full turn {FIELD} goes round a centre that is {share:.2g} "
-            f"of the radius, {told.radius:.3g} uT, off zero",
+            f"of the radius, {circle.radius:.3g} uT, off zero",
             f"{stream.topic}.magnetic_field_{'xyz'[axis]}_bias",
-            digits(float(told.centre[axis])),
+            digits(float(circle.centre[axis])),
             f"offsets.{FIELD} = [{offsets}] in the mapping",
         )
-    elif told.ratio > SOFT:
+    elif circle.ratio > SOFT:
         yield Finding(
             "magnetometer",
             stream.topic,
             FIELD,
-            told.ratio,
+            circle.ratio,
             f"{stream.topic}: soft iron: in a full turn {FIELD} goes along an ellipse whose axes are "
-            f"{told.ratio:.3g} to 1",
+            f"{circle.ratio:.3g} to 1",
             mapping="calibrate its axes",
         )
 

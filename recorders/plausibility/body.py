@@ -102,9 +102,9 @@ def bodies(streams: Mapping[str, Stream]) -> list[Body]:
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
     )
-    told = {topic: stream for topic, stream in streams.items() if len(stream) >= FEWEST}
-    together, apart = Body(), {topic.rpartition("/")[0]: Body() for topic in told}
-    for topic, stream in told.items():
+    long_enough = {topic: stream for topic, stream in streams.items() if len(stream) >= FEWEST}
+    together, apart = Body(), {topic.rpartition("/")[0]: Body() for topic in long_enough}
+    for topic, stream in long_enough.items():
         _add(together, stream, first_ns)
         space = topic.rpartition("/")[0]
         for name, body in apart.items():

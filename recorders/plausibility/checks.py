@@ -46,9 +46,9 @@ def findings(streams: Mapping[str, Stream]) -> list[Finding]:
     found = [each for stream in sensed.values() for check in OF_STAMPS for each in check(stream, sensed)]
     for body in bodies(sensed):
         motion = Motion(body)
-        told = [each for check in OF_MOTION for each in check(motion)]
+        of_motion = [each for check in OF_MOTION for each in check(motion)]
         known = {(each.cause, each.topic) for each in found}
-        found += [each for each in told if (each.cause, each.topic) not in known]
+        found += [each for each in of_motion if (each.cause, each.topic) not in known]
     return found + list(stamps.drifts(sensed))
 
 

@@ -49,8 +49,8 @@ class Slope(NamedTuple):
     @property
     def sign(self) -> int:
         """1 or -1, or 0 where the two are not alike."""
-        is_told = self.windows >= FEWEST and abs(self.likeness) > ALIKE
-        return int(np.sign(self.value)) if is_told else 0
+        is_clear = self.windows >= FEWEST and abs(self.likeness) > ALIKE
+        return int(np.sign(self.value)) if is_clear else 0
 
 
 def slope(x: Floats, y: Floats) -> Slope:
@@ -109,9 +109,9 @@ class Motion:
         windows = turned(self.courses, 1.0)
         found = []
         for source in self.body.turns:
-            told = timing(windows, source, turn_between, tolerance_s=_hold_s(source))
-            if told is not None:
-                found.append(Lag(source.topic, self.courses.topic, told))
+            lag = timing(windows, source, turn_between, tolerance_s=_hold_s(source))
+            if lag is not None:
+                found.append(Lag(source.topic, self.courses.topic, lag))
         return found
 
     @cached_property
@@ -175,9 +175,9 @@ class Motion:
         aligned = self.aligned(source)
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
-                told = each.timing
-                if told.evidence > SURE and abs(told.likeness) > ALIKE:
-                    return source.moved(-told.lag_s, told.gain)
+                lag = each.timing
+                if lag.evidence > SURE and abs(lag.likeness) > ALIKE:
+                    return source.moved(-lag.lag_s, lag.gain)
         return aligned
 
     def speed(self, source: Series) -> Slope | None:
@@ -186,8 +186,8 @@ class Motion:
             return None
         if (moved := clear_moves(self.places)) is None:
             return None
-        told = travelled(self.aligned(source), moved.begin_s, moved.end_s)
-        return slope(told, np.linalg.norm(moved.values, axis=1))
+        distances = travelled(self.aligned(source), moved.begin_s, moved.end_s)
+        return slope(distances, np.linalg.norm(moved.values, axis=1))
 
     def turn(self, source: Series) -> Slope | None:
         """How much the course turns for each radian of a turn rate.
@@ -198,10 +198,10 @@ class Motion:
             return None
         windows = turned(self.courses, self.turn_span_s)
         for moved in (source, self.aligned(source), self.likened(source)):
-            told = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
-            if told.sign > 0:
+            ratio = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
+            if ratio.sign > 0:
                 break
-        return told
+        return ratio
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
         """How much a heading turns for each radian of a turn rate."""
@@ -242,8 +242,8 @@ class Motion:
         speed = np.abs(v)
         is_clear = np.minimum(speed[step:], speed[:-step]) > 0.1 * np.quantile(speed, 0.95)
         change = (v[step:] - v[:-step]) * middle
-        told = force.integral(end_s) - force.integral(begin_s)
-        pushed = told[:, 0] + 1j * told[:, 1]
+        impulse = force.integral(end_s) - force.integral(begin_s)
+        pushed = impulse[:, 0] + 1j * impulse[:, 1]
         known = np.isfinite(pushed) & is_clear & (end_s - begin_s < 2.0)
         resting = np.isfinite(pushed) & ~is_clear
         still = resting if resting.sum() >= FEWEST else known
@@ -281,8 +281,8 @@ def _hold_s(source: Series) -> float:
     return step_s if source.values.ndim > 1 else 0.5 * step_s
 
 
-def _sure_lag_s(told: Timing) -> float:
+def _sure_lag_s(lag: Timing) -> float:
     """The lag where it is one; a clock that gains has none."""
-    is_lag = abs(told.lag_s) > max(LEAST_LAG_S, told.tolerance_s)
-    is_sure = told.evidence > SURE and abs(told.likeness) > ALIKE and not told.gain
-    return told.lag_s if is_lag and is_sure else 0.0
+    is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
+    is_sure = lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
+    return lag.lag_s if is_lag and is_sure else 0.0

@@ -78,11 +78,11 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
 def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats) -> Floats:
     """The correlation for each lag; NaN where less than half of the windows are in the source's span."""
     begin_s, end_s = (each - lags_s[:, None] for each in (windows.begin_s, windows.end_s))
-    told = account(source, begin_s, end_s)
-    is_in = np.isfinite(told)
+    moves = account(source, begin_s, end_s)
+    is_in = np.isfinite(moves)
     count = is_in.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        x, y = np.where(is_in, told, 0.0), np.where(is_in, windows.values, 0.0)
+        x, y = np.where(is_in, moves, 0.0), np.where(is_in, windows.values, 0.0)
         x = np.where(is_in, x - (x.sum(axis=1) / count)[:, None], 0.0)
         y = np.where(is_in, y - (y.sum(axis=1) / count)[:, None], 0.0)
         found = np.sum(x * y, axis=1) / np.sqrt(np.sum(x * x, axis=1) * np.sum(y * y, axis=1))

@@ -210,8 +210,8 @@ def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Gener
             altitude_m=altitude,
             covariance_m2=spread,
         )
-    told = [_outages(f"{topic}/outages", outages_s)] if receiver.outages_per_minute > 0 else []
-    return [fixes, *told]
+    outages = [_outages(f"{topic}/outages", outages_s)] if receiver.outages_per_minute > 0 else []
+    return [fixes, *outages]
 
 
 def _targets(

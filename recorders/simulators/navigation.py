@@ -326,18 +326,18 @@ def _prior(
 
     The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
     """
-    told, unit = parameters.prior, parameters.unit
+    prior, unit = parameters.prior, parameters.unit
     sigma = np.repeat(
         [
-            told.sigma_m,
-            told.sigma_mps,
-            told.tilt_sigma_rad,
+            prior.sigma_m,
+            prior.sigma_mps,
+            prior.tilt_sigma_rad,
             unit.gyro_bias_sigma_radps,
             unit.force_bias_sigma_mps2,
         ],
         3,
     )
-    sigma[8] = told.heading_sigma_rad
+    sigma[8] = prior.heading_sigma_rad
     error = sigma * rng.normal(size=15)
     mean = truth.copy()
     mean[:6] += error[:6]
@@ -349,8 +349,8 @@ def _prior(
     mean[10:] = 0.0  # the biases are drawn about zero
     covariance = np.diag(sigma**2)
     up = (turned * tilt).inv().apply([0.0, 0.0, 1.0])
-    level = told.tilt_sigma_rad**2 * (np.eye(3) - np.outer(up, up))
-    covariance[6:9, 6:9] = level + told.heading_sigma_rad**2 * np.outer(up, up)
+    level = prior.tilt_sigma_rad**2 * (np.eye(3) - np.outer(up, up))
+    covariance[6:9, 6:9] = level + prior.heading_sigma_rad**2 * np.outer(up, up)
     return make_stream(
         "/body/prior",
         schemas.GAUSSIAN_ESTIMATE,

@@ -177,7 +177,7 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
     scan_s = _times(parameters, parameters.infrastructure.rate_hz)
     fixes = drive.states_at(fix_s)[..., 0::2]
     fixes += np.sqrt(parameters.fix.variance_m2) * fix_rng.normal(size=fixes.shape)
-    told = fix_rng.uniform(size=fixes.shape[:2]) >= parameters.fix.dropout_probability
+    is_received = fix_rng.uniform(size=fixes.shape[:2]) >= parameters.fix.dropout_probability
     seen = np.stack(
         into_frame(
             parameters.infrastructure.pose, np.moveaxis(drive.states_at(scan_s)[..., 0::2], -1, 0)
@@ -185,13 +185,13 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
         axis=-1,
     )
     seen += np.sqrt(parameters.infrastructure.variance_m2) * sensor_rng.normal(size=seen.shape)
-    network = _scan(parameters, parameters.network, fixes, told, network_rng)
+    network = _scan(parameters, parameters.network, fixes, is_received, network_rng)
     everyone = np.ones(seen.shape[:2], bool)
     sensor = _scan(parameters, parameters.infrastructure, seen, everyone, sensor_rng)
     truth_s = np.union1d(np.append(0.0, fix_s), scan_s)
     streams = [
         *_vehicle_streams(parameters, drive, truth_s),
-        *_fix_streams(parameters, fix_s, fixes, told, delay_rng),
+        *_fix_streams(parameters, fix_s, fixes, is_received, delay_rng),
         *_scan_streams("/network", parameters, parameters.network, fix_s, network, delay_rng),
         *_scan_streams(
             "/infrastructure", parameters, parameters.infrastructure, scan_s, sensor, delay_rng
@@ -296,14 +296,14 @@ def _fix_streams(
     parameters: VehiclesParameters,
     times_s: Floats,
     fixes: Floats,
-    told: NDArray[np.bool_],
+    is_received: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> list[Stream]:
     """Every vehicle's fixes, in the plane and as latitude and longitude."""
     covariance = (parameters.fix.variance_m2 * np.eye(2)).reshape(1, 4)
     streams = []
     for index in range(fixes.shape[1]):
-        rows = told[:, index]
+        rows = is_received[:, index]
         places = fixes[rows, index]
         published, logged = _clocks(parameters.fix, times_s[rows], rng)
         latitude, longitude, _ = out_of_tangent_plane(places.T, parameters.origin_deg)

@@ -118,8 +118,8 @@ def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str]) -> _Text
         return _constant(node.value)
     if operation is SELECT:
         condition, yes, no = given
-        said = f"{yes.within(_OR)} if {condition.within(_OR)} else {no.within(_CHOICE)}"
-        return _Text(said, _CHOICE)
+        choice = f"{yes.within(_OR)} if {condition.within(_OR)} else {no.within(_CHOICE)}"
+        return _Text(choice, _CHOICE)
     if operation is POWER:
         return _Text(f"{given[0].within(_WHOLE)} ** {node.value}", _POWER)
     if operation is operator.neg:

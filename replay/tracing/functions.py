@@ -281,10 +281,10 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
     try:
         return follow({})
     except Exception as error:
-        raise BadInput(f"{place_of(function, error)}: {_said(error)}") from error
+        raise BadInput(f"{place_of(function, error)}: {_reason(error)}") from error
 
 
-def _said(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """What stopped a function; what NumPy says of traced numbers in our words."""
     if isinstance(error, CannotTrace | BadInput):
         return str(error)

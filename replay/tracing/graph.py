@@ -223,6 +223,6 @@ def described(outputs: Iterable[Node]) -> Iterator[str]:
         parts = [words[each] for each in node.arguments]
         if node.operation in _COMMUTATIVE:
             parts.sort()
-        said = f"{name} {' '.join(parts)} {node.value!r}"
-        words[node] = blake2b(said.encode(), digest_size=16).hexdigest()
+        text = f"{name} {' '.join(parts)} {node.value!r}"
+        words[node] = blake2b(text.encode(), digest_size=16).hexdigest()
     yield from (words[each] for each in outputs)

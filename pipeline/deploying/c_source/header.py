@@ -98,10 +98,10 @@ def _struct(made: CFilter) -> Iterator[str]:
     for part, values in made.values.items():
         yield "    struct {"
         for name in values:
-            told = " ".join(meaning.get(name, "").split()).replace("*/", "")
+            words = " ".join(meaning.get(name, "").split()).replace("*/", "")
             unit = unit_of(name)
             comment = ", ".join(
-                filter(None, (told.rstrip("."), f"in {unit}" if unit and unit not in told else ""))
+                filter(None, (words.rstrip("."), f"in {unit}" if unit and unit not in words else ""))
             )
             yield f"        {made.precision.real} {identifier(name)};" + (
                 f" /* {comment} */" if comment else ""

@@ -23,7 +23,7 @@ from pipeline.diagnosing.findings import FIRST, without_filter
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.runs.ensemble import Progress
 from recorders.plausibility.checks import findings
-from recorders.plausibility.finding import Cause as Told
+from recorders.plausibility.finding import Cause as Estimated
 
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
 UNIT, VELOCITY = "/car/inertial", "/car/velocity"
@@ -87,7 +87,7 @@ SPREADS: dict[str, tuple[float, float]] = {
     "compass + 4.5 deg": (0.00165, np.nan),
 }
 # Of the unit's faults: what is told, of which topic, and the number.
-UNIT_RIGHT: dict[str, tuple[Told, str, float] | None] = {
+UNIT_RIGHT: dict[str, tuple[Estimated, str, float] | None] = {
     "nothing": None,
     "accelerometer in g": ("gravity", UNIT, 1.0 / 9.80665),
     "gravity's sign": ("gravity", UNIT, -1.0),
@@ -168,16 +168,16 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
 
 def unit_tried(fault: str, seed: int) -> dict[str, Any]:
     """Plant a fault into the unit's log, and see whether it is what is told without a filter."""
-    told = findings(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
+    found = findings(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
     right = UNIT_RIGHT[fault]
-    named = [(each.cause, each.topic) for each in told]
+    named = [(each.cause, each.topic) for each in found]
     return {
         "fault": fault,
         "seed": seed,
         "findings": len(named),
         "is_first": named[:1] == [right[:2]] if right else not named,
         "first": " ".join(named[0]) if named else "",
-        "value": abs(told[0].value) if told else np.nan,  # of half a turn the sign says nothing
+        "value": abs(found[0].value) if found else np.nan,  # of half a turn the sign says nothing
     }
 
 
@@ -199,9 +199,9 @@ def _named(cause: Cause) -> Iterator[Right]:
     """What a cause names, and what the log does not tell from it; factors of noise as logarithms."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
-        for told in each.numbers:
-            value = np.log(told.value) if kind.endswith(" noise") else told.value
-            yield Right(kind, topic, told.part, value)
+        for estimate in each.numbers:
+            value = np.log(estimate.value) if kind.endswith(" noise") else estimate.value
+            yield Right(kind, topic, estimate.part, value)
 
 
 def results(

@@ -173,7 +173,7 @@ class _Own(NamedTuple):
 def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:
     units = UNITS.get(unit_of(entry.name), {})
     specials = {float(np.log(size)): f"{name} are" for name, size in units.items()}
-    specials |= {-at: f"{said} that are converted twice" for at, said in specials.items()}
+    specials |= {-at: f"{meaning} that are converted twice" for at, meaning in specials.items()}
 
     def words(at: float, low: float, high: float) -> str:
         more = f", as {specials[at]}" if at in specials else ""
@@ -197,7 +197,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         words,
         mend,
         specials,
-        told=lambda at: float(np.exp(at)),
+        reported=lambda at: float(np.exp(at)),
     )
 
 
@@ -213,17 +213,17 @@ def _sign(topic: str, entry: Entry) -> Hypothesis:
         lambda *_: f"{topic}: {entry.name} has the wrong sign",
         lambda _: Advice(f"{topic}.{bare(entry.name)}_scale", -1),
         IS_SO,
-        told=lambda _: -1.0,
+        reported=lambda _: -1.0,
     )
 
 
 def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
     def words(at: float, low: float, high: float) -> str:
         is_so, size, least, most = in_sense(at, low, high)
-        said = f"{topic}: {entry.name} is {is_so} by {number(size)} ({number(least)} to {number(most)})"
+        bias = f"{topic}: {entry.name} is {is_so} by {number(size)} ({number(least)} to {number(most)})"
         if not entry.is_angle:
-            return said
-        return f"{said}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
+            return bias
+        return f"{bias}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
 
     def mend(at: float) -> Advice:
         if own and own.bias:
@@ -336,7 +336,7 @@ def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis
         lambda *_: f"{topic}: the heading has the wrong sign",
         lambda _: Advice(f"{topic}.heading_scale", -1),
         IS_SO,
-        told=lambda _: -1.0,
+        reported=lambda _: -1.0,
     )
     yield Hypothesis(
         "convention",

@@ -59,7 +59,7 @@ class Hypothesis:
         specials: numbers that are tried as they are, with what they mean, such as a unit.
         size: of how many numbers it is.
         floor: of the magnitude: what is less is no fault.
-        told: the number as tables have it: a factor, where it is searched by its logarithm.
+        reported: the number as tables have it: a factor, where it is searched by its logarithm.
     """
 
     kind: Kind
@@ -73,7 +73,7 @@ class Hypothesis:
     specials: Mapping[float, str] = field(default_factory=dict)
     size: int = 1
     floor: float = 0.0
-    told: Callable[[float], float] = float
+    reported: Callable[[float], float] = float
 
     @property
     def has_end(self) -> bool:

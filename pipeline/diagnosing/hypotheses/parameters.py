@@ -72,7 +72,7 @@ def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
     def mend(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
 
-    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor)
+    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor)
 
 
 def _noise_of(
@@ -99,8 +99,8 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
     for field, spread in fields:
 
         def words(at: float, low: float, high: float, field: str = field) -> str:
-            said = f"of {field} the standard deviation is {times(at, low, high)}"
-            return f"{stream.topic}: {said}, so that R is too {size_of(at)}"
+            changes = f"of {field} the standard deviation is {times(at, low, high)}"
+            return f"{stream.topic}: {changes}, so that R is too {size_of(at)}"
 
         def mend(at: float) -> Advice:
             return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
@@ -109,7 +109,7 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
         without = partial(_spread, stream.topic, spread)
         kind: Kind = "measurement noise"
         yield Hypothesis(
-            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor
+            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor
         )
 
 
@@ -166,7 +166,7 @@ def _parameters(
         return trial._replace(settings=with_values(trial.settings, list(names), added))
 
     def words(at: Any, low: Any, high: Any) -> str:
-        said = [
+        changes = [
             f"{name} is {number(value + by)} ({number(value + least)} to {number(value + most)})"
             for name, value, by, least, most in zip(
                 names, values, numbers(at), numbers(low), numbers(high), strict=True
@@ -174,7 +174,7 @@ def _parameters(
         ]
         where = " and ".join(topic or "the motion" for topic in topics)
         given = ", ".join(number(value) for value in values)
-        return f"{where}: {', '.join(said)}, not {given}"
+        return f"{where}: {', '.join(changes)}, not {given}"
 
     def mend(at: Any) -> Advice:
         (name, value), *more = zip(

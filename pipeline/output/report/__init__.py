@@ -297,10 +297,10 @@ def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: b
 
 def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
     """What an estimator errs in each case."""
-    told = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
+    by_case = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
     return {
         case: float(each.value)
-        for case, each in told.items()
+        for case, each in by_case.items()
         if each and isinstance(each.value, int | float)
     }
 

@@ -45,7 +45,7 @@ class Spread(NamedTuple):
     high: float = math.nan
 
     @property
-    def is_told(self) -> bool:
+    def is_known(self) -> bool:
         """Whether there is an interval."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
@@ -80,7 +80,7 @@ class Consistency:
     def state(self) -> State:
         """What that says of the estimator: by chance over the stated covariances, and over the runs."""
         low, high = self.honest
-        is_excluded = self.found.is_told and not self.found.low <= self.aim <= self.found.high
+        is_excluded = self.found.is_known and not self.found.low <= self.aim <= self.found.high
         is_usual = low <= self.found.value <= high and not is_excluded
         if is_usual or abs(self.found.value / self.aim - 1.0) <= MATERIAL:
             return "honest"

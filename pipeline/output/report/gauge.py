@@ -32,7 +32,7 @@ class Gauge(NamedTuple):
 def numbers_of(by: Consistency) -> str:
     """The mean of squares with its interval, and what is right."""
     name = "NIS per component" if by.name == "NIS" else by.name
-    if not by.found.is_told:
+    if not by.found.is_known:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
     found, low, high = alike(by.found, Scale())
     return f"{name} {found}, 95 % {low} to {high}; {number(by.aim)} is right"
@@ -48,7 +48,7 @@ def gauge(by: Consistency) -> Gauge:
 
     low, high = by.honest
     found = by.found
-    spread = (found.low, found.high) if found.is_told else (found.value, found.value)
+    spread = (found.low, found.high) if found.is_known else (found.value, found.value)
     words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
     is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
     ends = (place(spread[0]), place(spread[1]))

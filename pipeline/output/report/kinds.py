@@ -78,7 +78,7 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     return Opening(tried, base, found, notes)
 
 
-def said(result: Result, folder: Path) -> tuple[str, str]:
+def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
     """What was tried, and what came of it, as a terminal has them; `folder` is the result's."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
@@ -176,14 +176,16 @@ def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
         ends = row["low"], row["high"]
         known = all(math.isfinite(each) for each in ends)
-        told_by = f" (95 % {number(ends[0])} to {number(ends[1])})" if known else ", without an interval"
+        interval = (
+            f" (95 % {number(ends[0])} to {number(ends[1])})" if known else ", without an interval"
+        )
         begun = (
             "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
         )
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
         unit = f" {sign}" if (sign := unit_of(row["parameter"])) else ""
-        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{told_by}{begun}.")
+        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{interval}{begun}.")
     return replace(base, verdict=[*sentences, *base.verdict])
 
 

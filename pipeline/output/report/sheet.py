@@ -80,7 +80,7 @@ def table_of_pairs(found: Findings) -> pd.DataFrame:
     for each in found.pairs:
         words = quantity(each.quantity.removeprefix("change_in_"))
         own = scale(words.unit, each.more.value)
-        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_told else ""
+        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_known else ""
         of = rows.setdefault((each.first, each.second, words.name), {})
         of[each.case or "all"] = f"{own.text(each.more.value)}{ends} {own.sign}".rstrip()
     about = ("estimator", "has more than", "of")

@@ -259,7 +259,7 @@ def _card(
     card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
         about, value = quantity(found.main).name, own.text(each.error.value)
-        if each.error.is_told:
+        if each.error.is_known:
             value, low, high = alike(each.error, own)
             about += f"; 95 % {low} to {high}"
         card = replace(card, value=value, unit=own.sign, about=about)

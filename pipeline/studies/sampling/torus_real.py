@@ -105,7 +105,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     _judge_predictions(wind, half, found, options, outcome)
     time_ns = source.in_order("/wind", "publish_time").publish_time_ns
     predicted = (
-        _told(name, time_ns, predicted_by(wind, run, found[name])) for name, run in FILTERS.items()
+        _estimates(name, time_ns, predicted_by(wind, run, found[name])) for name, run in FILTERS.items()
     )
     runner.keep([source], {each.stream.topic: each for each in predicted})
     return outcome
@@ -305,7 +305,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
     return Chart(panels=[panel])
 
 
-def _told(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
+def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
     """A filter's predictions of every hour but the first, as estimates."""
     angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
     stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)

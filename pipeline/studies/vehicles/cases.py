@@ -167,14 +167,14 @@ def bytes_per_step(
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
     names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]
     counts = {name: sum(source.topics[name].messages for source in sources) for name in [*names, *fixes]}
-    steps, told, looks, seen = (counts[name] for name in names)
+    steps, detected, looks, seen = (counts[name] for name in names)
     own = sum(counts[name] for name in fixes)
     found = {}
     for label, settings in estimators.items():
         kind, _, method = str(settings.get("kind", label)).partition(":")
         association, sensor = split_method(method)
         is_known = kind == "vehicle-kalman" or association == "known"
-        sent = own * (POSITION_BYTES + IDENTITY_BYTES) if is_known else told * POSITION_BYTES
+        sent = own * (POSITION_BYTES + IDENTITY_BYTES) if is_known else detected * POSITION_BYTES
         sent += {"topology": NUMBER_BYTES * looks, "": 0}.get(sensor, POSITION_BYTES * seen)
         found[label] = sent / max(steps, 1)
     return found

@@ -208,7 +208,7 @@ class _Import:
                     f"{chain.left_out} stamps left out at which a transform of the chain is not known"
                 )
         notes |= self._streams.noise
-        for (subject, fact), count in self._streams.told.items():
+        for (subject, fact), count in self._streams.counts.items():
             notes[f"{subject}: {fact}"] = str(count)
         for topic, why in sorted(self._not_taken.items()):
             notes[f"not taken, {topic}"] = f"{counts[topic]} {why}"
@@ -255,7 +255,7 @@ def read(path: Path, parameters: RosParameters) -> Blocks:
     return found
 
 
-def _blocks(path: Path, parameters: RosParameters, told: Blocks) -> Iterator[list[Stream]]:
+def _blocks(path: Path, parameters: RosParameters, result: Blocks) -> Iterator[list[Stream]]:
     with open_bag(path) as bag:
         work = _Import(bag, parameters)
         for batch in bag.batches(work.is_wanted):
@@ -264,8 +264,8 @@ def _blocks(path: Path, parameters: RosParameters, told: Blocks) -> Iterator[lis
                 yield work.block()
         yield work.block(is_last=True)
         work.check()
-        told.notes.update(work.notes())
-        told.epoch_ns = work.first_ns
+        result.notes.update(work.notes())
+        result.epoch_ns = work.first_ns
 
 
 ROS = Importer(

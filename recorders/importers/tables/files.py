@@ -77,7 +77,7 @@ class Table:
         except BadInput:
             raise
         except DAMAGED as error:
-            raise BadInput(f"{self.path}: {_said(error, self)}") from None
+            raise BadInput(f"{self.path}: {_reason(error, self)}") from None
 
 
 def open_table(
@@ -121,7 +121,7 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _said(error: Exception, table: Table) -> str:
+def _reason(error: Exception, table: Table) -> str:
     """What Arrow says of a cell, with the column's name and the mend."""
     found = re.search(r"In CSV column #(\d+):.*invalid value '(.*)'", str(error))
     if not found:

@@ -198,9 +198,9 @@ def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
             try:
                 cells = texts.cast(pa.float64())
             except pa.ArrowInvalid as error:
-                said = str(error).splitlines()[0]
+                why = str(error).splitlines()[0]
                 raise BadInput(
-                    f'{label} has cells that are not numbers ({said}); dates need unit = "date"'
+                    f'{label} has cells that are not numbers ({why}); dates need unit = "date"'
                 ) from None
         else:
             # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
@@ -238,9 +238,9 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
             rows = (zones == zone) & (since_ns != NOT_A_TIME)
             since_ns[rows] = _from_zone(since_ns[rows], offset_of(zone))
     except ValueError as error:
-        said = str(error).splitlines()[0]
+        why = str(error).splitlines()[0]
         raise BadInput(
-            f"{label} has cells that are not dates ({said}); give their `format`, or the unit of numbers"
+            f"{label} has cells that are not dates ({why}); give their `format`, or the unit of numbers"
         ) from None
     return since_ns
 

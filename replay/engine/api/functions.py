@@ -168,7 +168,7 @@ def recursive(
         def run(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
             # without static topics, the first block is what tells how many runs there are
             carried = carried or started({}, len(block.events.offsets) - 1)
-            settings, before, told, generators = carried
+            settings, before, reported, generators = carried
             if advance is not None:
                 state, outcome = advance(settings, before, block)
                 return carried._replace(state=state), outcome
@@ -178,11 +178,11 @@ def recursive(
             results = made.blank(len(messages.time_ns))
             generators = _drawn_on(generators, messages, values) if draws else generators
             advance_all((settings, messages, state, results), generators)
-            is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
-            failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
-            told = told | failing
+            is_lost = ~np.isfinite(np.reshape(state[0], (len(reported), -1)).sum(axis=1))
+            failing: NDArray[np.bool_] = is_lost & ~reported & (np.diff(messages.offsets) > 0)
+            reported = reported | failing
             outcome = made.of_block(messages, results, np.flatnonzero(failing))
-            return _Carried(settings, state, told, generators), [*outcome, *made.of_skipped(skipped)]
+            return _Carried(settings, state, reported, generators), [*outcome, *made.of_skipped(skipped)]
 
         return Recursive(name, *_topics(bound), begin, run, _priors(bound))
 
@@ -389,12 +389,12 @@ def _estimator(
 
 
 class _Carried(NamedTuple):
-    """Holds what a recursion carries from block to block; `told` (runs,): whose failure was reported.
+    """Holds what a recursion carries from block to block; `reported` (runs,): whose failure was.
 
     A run's generator is None until there is a message, or where none is wanted.
     """
 
     settings: Any
     state: Any
-    told: NDArray[np.bool_]
+    reported: NDArray[np.bool_]
     generators: Generators

@@ -146,16 +146,16 @@ def _checked(
     model: Model, calls: Sequence[_Call], parts: Sequence[Motion | Sensor], states: int
 ) -> Checked:
     """Say what was checked of every function, and what was not, since nothing is declared of it."""
-    said = [f"{model.summary}: {len(calls)} functions at {states} states"]
+    sentences = [f"{model.summary}: {len(calls)} functions at {states} states"]
     for call, part in zip(calls, parts, strict=True):
         by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
         found = [f"derivatives by {by}", "angles, jumps and lengths"]
         found += ["linear"] if part.linear else []
         of_messages = isinstance(part, Sensor) and part.covariance
         found += ["variances"] if part.noise is not None and not of_messages else []
-        said.append(f"{call.what}: {'; '.join(found)}")
+        sentences.append(f"{call.what}: {'; '.join(found)}")
     others = {"moments": any(part.moments for part in parts), "start": model.start is not None}
-    return Checked([*said, *(f"{name}: not checked" for name, has in others.items() if has)])
+    return Checked([*sentences, *(f"{name}: not checked" for name, has in others.items() if has)])
 
 
 def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:

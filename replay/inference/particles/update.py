@@ -143,7 +143,7 @@ def keep_predicted(own: SensorMemory) -> int:
     return size
 
 
-def is_told(own: SensorMemory, i: int, size: int) -> bool:
+def is_predicted(own: SensorMemory, i: int, size: int) -> bool:
     """Tell whether a particle predicts all components that are used."""
     for a in range(size):
         if np.isnan(own.differences[i, own.kept[a]]):
@@ -171,7 +171,7 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
         mean[own.kept[a]] = 0.0
     first, total = -1, 0.0
     for i in range(len(weight)):
-        if not is_told(own, i, size):
+        if not is_predicted(own, i, size):
             continue
         first = i if first < 0 else first
         total += weight[i]

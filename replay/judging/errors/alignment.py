@@ -54,14 +54,14 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
     if align in ("yaw", "se2"):
         cosine, sine = cross[0, 0] + cross[1, 1], cross[1, 0] - cross[0, 1]
         extent = np.linalg.norm(of_estimate[:, :2]) * np.linalg.norm(of_truth[:, :2])
-        is_told = np.hypot(cosine, sine) > LEAST_WIDTH * extent
+        is_determined = np.hypot(cosine, sine) > LEAST_WIDTH * extent
         rotation = Rotation.from_rotvec([0.0, 0.0, np.arctan2(sine, cosine)]).as_matrix()
     else:
         left, widths, right = np.linalg.svd(cross)
-        is_told = widths[1] > LEAST_WIDTH * widths[0]
+        is_determined = widths[1] > LEAST_WIDTH * widths[0]
         proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
         rotation = left * [1.0, 1.0, proper] @ right  # (40), (43)
-    if not is_told:
+    if not is_determined:
         needed = (
             "two apart in the plane" if align in ("yaw", "se2") else "three that are not in one line"
         )

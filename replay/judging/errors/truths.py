@@ -89,7 +89,7 @@ class Truths:
                 continue
             found.setdefault(topic, []).append(f"{what}: {name} differs by up to {apart[name]:.3g}")
         topics = self.source.topics
-        return {topic: Doubt(topics[topic].messages, "; ".join(said)) for topic, said in found.items()}
+        return {topic: Doubt(topics[topic].messages, "; ".join(why)) for topic, why in found.items()}
 
     def _note_twice(self, block: dict[str, Stream]) -> None:
         """Note how far truths of one thing are apart in a block, by linear component."""
