@@ -125,7 +125,7 @@ MOST_WORDS = 8  # of a name
 
 
 def unit_of(name: str) -> str:
-    """The unit of a parameter, as the end of its name says it; empty where it says none.
+    """Return the unit of a parameter, as the end of its name says it; empty where it says none.
 
     >>> unit_of("turn_bias_radps"), unit_of("clutter_per_m2"), unit_of("gate_probability")
     ('rad/s', '1/m^2', '')
@@ -316,7 +316,7 @@ _OTHERS = "additionalProperties"  # of a table whose names are the user's
 
 
 def nested(name: str, value: Any) -> dict[str, Any]:
-    """The tables in which a value of this full name stands.
+    """Return the tables in which a value of this full name stands.
 
     >>> nested("range.rate_hz", 5.0)
     {'range': {'rate_hz': 5.0}}

@@ -33,14 +33,14 @@ def parse_json(text: str, *, constants: bool = False) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The values of a TOML text; raises ValueError where it is malformed or too deep."""
+    """Return the values of a TOML text; raises ValueError where it is malformed or too deep."""
     if _DOTTED_TOO_DEEP.search(text):
         raise ValueError(_TOO_DEEP)
     return _shallow(_toml, text)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file's values; raises BadInput where it is missing or malformed."""
+    """Return a TOML file's values; raises BadInput where it is missing or malformed."""
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

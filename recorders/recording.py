@@ -45,7 +45,7 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
 def named_generator(
     rng: np.random.Generator, name: str, numbers: Mapping[str, int] | None = None
 ) -> np.random.Generator:
-    """A generator of its own for what has this name: one more name changes no other's numbers.
+    """Return a generator of its own for what has this name: one more name changes no other's numbers.
 
     Args:
         rng: of the run, or of a part of it; it is not drawn from.

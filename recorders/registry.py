@@ -25,7 +25,7 @@ def available(kind: str) -> dict[str, EntryPoint]:
 
 
 def load(kind: str, name: str, expected: type = object) -> Any:
-    """The object registered under `name`.
+    """Return the object registered under `name`.
 
     Raises BadInput where there is none, with the names there are, where it does not import, or where it
     is not of the `expected` type.

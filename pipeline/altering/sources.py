@@ -30,7 +30,7 @@ def alter(source: MemorySource, settings: Settings) -> MemorySource: ...
 @overload
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource: ...
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
-    """A run with topics altered; of one that is altered already, more so.
+    """Return a run with topics altered; of one that is altered already, more so.
 
     Where its topics state different planes, it is read in one of them; see `in_one_plane`.
 
@@ -54,7 +54,7 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
 
 
 def alterations_of(source: Source) -> dict[str, Any]:
-    """How a run was altered, by `/TOPIC.WHAT`."""
+    """Return how a run was altered, by `/TOPIC.WHAT`."""
     return dict(source.alterations) if isinstance(source, AlteredLog | AlteredRecording) else {}
 
 
@@ -64,7 +64,7 @@ def note_of(source: Source) -> dict[str, str]:
 
 
 def setting_of(source: Source) -> dict[str, dict[str, Any]]:
-    """What the settings of a result say of the alterations; nothing where there are none."""
+    """Return what the settings of a result say of the alterations; nothing where there are none."""
     applied = alterations_of(source)
     return {NOTE: applied} if applied else {}
 
@@ -126,13 +126,13 @@ class AlteredLog(LogSource):
 
     @cached_property
     def changes(self) -> dict[str, Change]:
-        """What is done to topics."""
+        """Return what is done to topics."""
         changes = changes_of(LogSource(self.log), self.alterations)
         return in_one_plane(self.name, self.log.topics, changes)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
-        """The log's topics as they are altered."""
+        """Return the log's topics as they are altered."""
         of_log = self.log.topics
         return {
             name: self.changes[name].stated(of_log[self.changes[name].stored])

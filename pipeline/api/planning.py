@@ -147,7 +147,7 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
 def sources_of(
     logs: Log | Iterable[Log], alterations: Mapping[str, Any] | None = None
 ) -> list[LogSource | MemorySource]:
-    """One log or several as sources, with topics altered where that is asked for.
+    """Return one log or several as sources, with topics altered where that is asked for.
 
     Raises BadInput where there is none, or one is no log, or cannot be altered so.
     """
@@ -170,7 +170,7 @@ def _source(log: Log) -> LogSource | MemorySource:
 def settings_of(
     estimators: Named | Iterable[Named],
 ) -> dict[str, dict[str, Any]]:
-    """The settings of each estimator by its label; raises BadInput where they are none."""
+    """Return the settings of each estimator by its label; raises BadInput where they are none."""
     are_several = isinstance(estimators, Iterable) and not isinstance(estimators, str | Mapping)
     listed: list[Any] = [*estimators] if are_several else [estimators]  # type: ignore[misc]
     chosen: dict[str, dict[str, Any]] = {}

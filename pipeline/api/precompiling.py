@@ -81,7 +81,7 @@ def precompile(
 
 
 def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> list[Precompiled]:
-    """The same for these pairs of a model and a method."""
+    """Return the same for these pairs of a model and a method."""
     pairs = list(dict.fromkeys(pairs))
     for model, method in pairs:
         modelled(load("models", model, Model), method)

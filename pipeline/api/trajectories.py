@@ -329,7 +329,7 @@ def _places(done: Compared) -> np.ndarray:
 
 
 def error_along_path(done: Compared) -> "Figure":
-    """The aligned path, its APE as colours, and the true one."""
+    """Draw the aligned path, its APE as colours, and the true one."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 

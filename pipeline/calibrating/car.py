@@ -42,7 +42,7 @@ def changing_speed(time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def circle(time_s: Floats) -> tuple[Floats, Floats]:
-    """A circle of 20 m."""
+    """Return a circle of 20 m."""
     return np.full_like(time_s, SPEED_MPS), np.full_like(time_s, 0.4)
 
 
@@ -53,7 +53,7 @@ def circles(time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def slalom(time_s: Floats) -> tuple[Floats, Floats]:
-    """A slalom at 8 m/s."""
+    """Return a slalom at 8 m/s."""
     return np.full_like(time_s, SPEED_MPS), 0.4 * np.sin(0.8 * time_s)
 
 
@@ -125,7 +125,7 @@ def drive(
 
 
 def recorded(car: Measured, sigmas: tuple[float, float, float] = (10.0, 10.0, 0.1)) -> MemorySource:
-    """The car as a log, whose prior is about the origin."""
+    """Return the car as a log, whose prior is about the origin."""
     half, zero = 0.5 * car.compass_rad, np.zeros_like(car.compass_rad)
     streams = [
         make_stream(

@@ -53,7 +53,7 @@ class Discrepancy(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """All of it in words."""
+        """Return all of it in words."""
         where = " ".join(filter(None, (self.run, self.topic, self.part)))
         detail = ""
         if self.row is not None:

@@ -108,7 +108,7 @@ def golden_of(
     metrics: Mapping[str, Any] | None = None,
     tolerances: Tolerances | None = None,
 ) -> Golden:
-    """A golden of these parts, as reading gives it back."""
+    """Return a golden of these parts, as reading gives it back."""
     found = {
         "format": FORMAT,
         "arithmetic": arithmetic(),
@@ -161,7 +161,7 @@ def kept_rows(count: int, most: int) -> NDArray[np.int64]:
 
 
 def checksums(columns: Mapping[str, Floats]) -> NDArray[np.uint16]:
-    """A checksum (rows,) of each row's bits: which tells where the first that differs is."""
+    """Return a checksum (rows,) of each row's bits: which tells where the first that differs is."""
     parts = [
         column.reshape(len(column), math.prod(column.shape[1:])) for _, column in sorted(columns.items())
     ]

@@ -7,7 +7,7 @@ import click
 
 
 def with_examples(text: str, *examples: str) -> str:
-    """A help text that ends with commands to try, which click does not wrap."""
+    """Return a help text that ends with commands to try, which click does not wrap."""
     return "\n".join([inspect.cleandoc(text), "", "\b", *(f"    {each}" for each in examples)])
 
 

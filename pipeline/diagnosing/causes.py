@@ -59,7 +59,7 @@ class Cause(NamedTuple):
 
     @property
     def statement(self) -> str:
-        """What is wrong, and by how much."""
+        """Return what is wrong, and by how much."""
         return self.hypothesis.words(self.value, *self.ends)
 
     @property
@@ -73,7 +73,7 @@ class Cause(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What is wrong, by how much, and what that is known by."""
+        """Return what is wrong, by how much, and what that is known by."""
         or_else = "".join(
             f"; this log does not determine it: as likely, {each.statement}"
             if each.hypothesis is self.hypothesis
@@ -102,14 +102,14 @@ class Tried(NamedTuple):
 
 
 def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
-    """A row per hypothesis, the one that gains most first, less what its numbers cost."""
+    """Return a row per hypothesis, the one that gains most first, less what its numbers cost."""
     ranked = sorted(tried, key=lambda each: -each.at.score(each.hypothesis))
     names = ("kind", "topic", "part", "value", "gain")
     return pd.DataFrame([each.row for each in ranked], columns=names)
 
 
 def least_gain(count: int, size: int = 1) -> float:
-    """What the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
+    """Return what the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
 
     Twice the gain is chi-square with as many degrees of freedom as there are numbers (Wilks), shared
     among them (Bonferroni).
@@ -204,7 +204,7 @@ class _Supposed(NamedTuple):
     value: Number
 
     def without(self, trial: Trial) -> Trial:
-        """The trial without it."""
+        """Return the trial without it."""
         return self.of.without(trial, self.value)
 
 

@@ -116,7 +116,7 @@ def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str])
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
-    """A row per measured component.
+    """Return a row per measured component.
 
     Of the normalised innovations: how many there are, their mean with its 95 % interval, mean square,
     the share beyond 3 standard deviations (0.27 % of a Gaussian), the excess kurtosis, the correlation

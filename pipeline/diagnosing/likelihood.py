@@ -328,7 +328,7 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 
 
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
-    """Whether rows are of the first share of their sensor's, told by what is measured.
+    """Tell whether rows are of the first share of their sensor's, told by what is measured.
 
     Of all rows it would be other measurements where a delay changes their order.
     """

@@ -45,13 +45,13 @@ class Outputs(Mapping[str, Stream]):
         return len(self._topics)
 
     def state(self, column: str) -> bool:
-        """Whether all of them have a column."""
+        """Tell whether all of them have a column."""
         firsts = (next(iter(self._estimates.blocks([topic], "publish_time", 1))) for topic in self)
         return all(column in stream.columns for first in firsts for stream in first.values())
 
 
 def silent(name: str, label: str, bound: Sequence[Bound]) -> BadInput:
-    """The sentence on an estimator that gives no innovations of a log of this name."""
+    """Return the sentence on an estimator that gives no innovations of a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
     mend = "give a filter of the same model, such as -e ekf"
@@ -61,7 +61,7 @@ def silent(name: str, label: str, bound: Sequence[Bound]) -> BadInput:
 
 
 def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:
-    """The estimates that a recording has of an estimator, as if a replay had made them."""
+    """Return the estimates that a recording has of an estimator, as if a replay had made them."""
     estimates = Renamed(source, label, label)
     judge = judge_logs([estimates], [source], find_metrics(), gap_limit_s=gap_limit_s)
     return Replay([source], [estimates], {label: {}}, Pass(judge, {label: {}}), gap_limit_s)
@@ -78,7 +78,7 @@ class Portion(NamedTuple):
 def first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> Portion:
-    """What the estimator reads of a log; of a long one its first MOST_MESSAGES."""
+    """Return what the estimator reads of a log; of a long one its first MOST_MESSAGES."""
     whole = dict.fromkeys(topic for each in bound for topic in each.static)
     streams = source.read([topic for topic in whole if topic in source.topics])
     parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
@@ -112,7 +112,7 @@ def on_the_rest(
     advised: Mapping[str, Any],
     end_ns: int,
 ) -> str:
-    """What following an advice gains after a part of the log, as a sentence goes on.
+    """Return what following an advice gains after a part of the log, as a sentence goes on.
 
     Args:
         source: the whole log.

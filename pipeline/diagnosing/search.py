@@ -40,7 +40,7 @@ class Peak(NamedTuple):
     is_special: bool = False
 
     def score(self, of: Hypothesis) -> float:
-        """The gain less what each number costs that is found."""
+        """Return the gain less what each number costs that is found."""
         is_free = of.tried and not self.is_special
         return self.gain - (NUMBER_COST * of.size if is_free else 0.0)
 

@@ -38,7 +38,7 @@ class Nis(NamedTuple):
 
     @property
     def outside(self) -> float:
-        """The share of spans outside."""
+        """Return the share of spans outside."""
         return _share((self.mean < self.low) | (self.mean > self.high))
 
 
@@ -72,27 +72,27 @@ class Case:
 
     @property
     def outside(self) -> Floats:
-        """The share of errors beyond 1.96 standard deviations (d,), where 5 % are right."""
+        """Return the share of errors beyond 1.96 standard deviations (d,), where 5 % are right."""
         assert self.errors is not None
         sigma = np.sqrt(np.diagonal(self.errors.covariance, axis1=1, axis2=2))
         return np.mean(np.abs(self.errors.error) > 1.96 * sigma, axis=0)
 
     @property
     def nees_interval(self) -> tuple[float, float]:
-        """Where 95 % of the NEES of a consistent filter lie."""
+        """Return where 95 % of the NEES of a consistent filter lie."""
         low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.components)))
         return float(low), float(high)
 
     @property
     def nees_outside(self) -> float:
-        """The share of NEES outside that."""
+        """Return the share of NEES outside that."""
         assert self.errors is not None
         low, high = self.nees_interval
         return _share((self.errors.nees < low) | (self.errors.nees > high))
 
 
 def cases_of(outputs: Mapping[str, Ragged], errors: Sequence[Errors], epoch_ns: int) -> dict[str, Case]:
-    """What is drawn of a filter's outputs on one log, by the name of what is estimated.
+    """Return what is drawn of a filter's outputs on one log, by the name of what is estimated.
 
     Args:
         outputs: by topic.
@@ -169,12 +169,12 @@ def _of_innovations(
 
 
 def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
-    """The rows that are drawn of so many: evenly chosen, with the first and the last."""
+    """Return the rows that are drawn of so many: evenly chosen, with the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
-    """The rows that are drawn of values (n,), the extremes of each span: no outlier is lost."""
+    """Return the rows that are drawn of values (n,), the extremes of each span: no outlier is lost."""
     count = len(values)
     if count <= most:
         return np.arange(count)
@@ -197,7 +197,7 @@ def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Fl
 
 
 def typical_time_s(case: Case) -> float | None:
-    """The second whose share of truths outside is nearest the whole run's: there the lens looks.
+    """Return the second whose share of truths outside is nearest the whole run's: there the lens looks.
 
     Of several the one in the middle of the run; None without truth.
     """
@@ -215,7 +215,7 @@ def typical_time_s(case: Case) -> float | None:
 
 
 def true_path(source: MemorySource, topic: str) -> Path | None:
-    """The path of a truth of a log; None where it has no position."""
+    """Return the path of a truth of a log; None where it has no position."""
     if topic not in source.topics:
         return None
     stream = source[topic]
@@ -228,7 +228,7 @@ def true_path(source: MemorySource, topic: str) -> Path | None:
 
 
 def map_points(source: MemorySource) -> Floats:
-    """The points of the log's map in the plane (n, 2)."""
+    """Return the points of the log's map in the plane (n, 2)."""
     found = [
         source[topic]["position_m"][:, :2]
         for topic, stated in source.topics.items()

@@ -29,7 +29,7 @@ def label_of(slider: Slider, value: float) -> str:
 
 
 def verdict_html(label: str, verdict: Verdict, colour: str) -> str:
-    """A filter's verdict, in its colour."""
+    """Return a filter's verdict, in its colour."""
     mark = MARKS[verdict.level]
     red = "" if verdict.level == "good" else f"color:{RED};"
     return (

@@ -53,7 +53,7 @@ class Plot:
     sources: dict[tuple[int | str, str], ColumnDataSource] = field(default_factory=dict)
 
     def source(self, of: int | str, what: str, *columns: str) -> ColumnDataSource:
-        """A source that is empty still."""
+        """Return a source that is empty still."""
         made = ColumnDataSource({name: [] for name in columns}, name=f"{self.figure.name}-{what}-{of}")
         self.sources[of, what] = made
         return made
@@ -74,7 +74,7 @@ class Plot:
 
 
 def blank(name: str, title: str, *, over_time: Range1d | None = None, **options: Any) -> Plot:
-    """An empty figure of the page's look, without a tool bar."""
+    """Return an empty figure of the page's look, without a tool bar."""
     ranges = {} if over_time is None else {"x_range": over_time}
     made = figure(
         name=name,
@@ -128,7 +128,7 @@ def ratio_plot(name: str, title: str, over_time: Range1d, cursor: Span) -> Plot:
 
 
 def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
-    """The plane from above: map, truth, estimates."""
+    """Draw the plane from above: map, truth, estimates."""
     plot = blank("scene", "Scene from above", match_aspect=True)
     points = map_points(log)
     plot.figure.scatter(points[:, 0], points[:, 1], marker="triangle", size=8, line_color=QUIET,
@@ -145,7 +145,7 @@ def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
 
 
 def lens_plot() -> Plot:
-    """The scene at one instant, so near that errors of centimetres are seen."""
+    """Draw the scene at one instant, so near that errors of centimetres are seen."""
     plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
     plot.figure.match_aspect = True
     plot.figure.line("x", "y", source=plot.source(0, "truth", "x", "y"), line_color=INK, line_width=2)
@@ -174,7 +174,7 @@ def whiteness_plot() -> Plot:
 
 
 def likelihood_plot() -> Plot:
-    """The log-likelihood of all measurements over the parameter that is dragged."""
+    """Draw the log-likelihood of all measurements over the parameter that is dragged."""
     plot = blank("likelihood", "Likelihood", y_range=Range1d(0.0, 1.0))
     plot.figure.yaxis.formatter = NumeralTickFormatter(format="0,0")
     source = plot.source(0, "line", "x", "y")
@@ -335,7 +335,7 @@ def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, compon
 
 
 def instant_of(played: Played, case: str) -> float:
-    """Where the lens looks at first: at a typical second, else in the middle."""
+    """Return where the lens looks at first: at a typical second, else in the middle."""
     one = played.cases.get(case)
     if one is None or not len(one.time_s):
         return 0.0

@@ -80,11 +80,11 @@ class Session:
 
     @property
     def log(self) -> MemorySource:
-        """What is in memory of the log."""
+        """Return what is in memory of the log."""
         return self._run.ensemble[0]
 
     def slider(self, name: str) -> Slider:
-        """The slider of a parameter; raises BadInput where it has none."""
+        """Return the slider of a parameter; raises BadInput where it has none."""
         found = next((each for each in self.sliders if each.name == name), None)
         if found is None:
             raise BadInput(f"no slider '{name}'; {choices(name, [each.name for each in self.sliders])}")
@@ -95,11 +95,11 @@ class Session:
         return any(each.name == name for each in self.sliders)
 
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
-        """The same log with other filters; raises BadInput where one cannot follow it."""
+        """Return the same log with other filters; raises BadInput where one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
 
     def with_estimated(self, names: Sequence[str]) -> "Session":
-        """The same with these parameters in the state, each from a quarter of its slider's way.
+        """Return the same with these parameters in the state, each from a quarter of its slider's way.
 
         Raises BadInput where a model cannot estimate one.
         """
@@ -126,7 +126,7 @@ class Session:
     def likelihoods(
         self, label: str, values: Values, name: str, count: int = 15
     ) -> Iterator[tuple[float, float]]:
-        """The log-likelihood along one parameter: value and likelihood, from its least value on.
+        """Yield the log-likelihood along one parameter: value and likelihood, from its least value on.
 
         The gate is open: likelihoods of other measurements are not to be compared.
         """
@@ -141,7 +141,7 @@ class Session:
                 yield value, likelihood
 
     def tuned(self, label: str, values: Values, free: Sequence[str]) -> dict[str, float]:
-        """The values of most likelihood of some parameters, the others as they are set.
+        """Return the values of most likelihood of some parameters, the others as they are set.
 
         Raises BadInput as `tune` does.
         """
@@ -152,7 +152,7 @@ class Session:
         return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}
 
     def diagnosed(self, label: str, values: Values) -> list[str]:
-        """What is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""
+        """Return what is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""
         found = diagnose(
             self.source, {label: self.settings(label, values)}, gap_limit_s=self.gap_limit_s
         )
@@ -170,7 +170,7 @@ class Session:
             viewer.view(rrd, at_s=at_s)
 
     def settings(self, label: str, values: Values) -> dict[str, Any]:
-        """The settings of a filter, with values over its own where it has such parameters."""
+        """Return the settings of a filter, with values over its own where it has such parameters."""
         own = self.filters[label]
         taken = {name: value for name, value in values.items() if self._takes(label, name)}
         for name, value in taken.items():
@@ -180,7 +180,7 @@ class Session:
         return dict(own)
 
     def toml(self, values: Values) -> str:
-        """All filters' settings as a settings file has them, for `--settings`.
+        """Return all filters' settings as a settings file has them, for `--settings`.
 
         Raises BadInput where one is no text, such as an estimator of one's own.
         """

@@ -18,7 +18,7 @@ NO_FILTERS = ("bound",)  # methods that estimate nothing
 
 
 def widget_of(slider: Slider, value: float) -> Any:
-    """The slider of a parameter, from 0 to 1, at its value."""
+    """Return the slider of a parameter, from 0 to 1, at its value."""
     return SliderWidget(
         start=0.0,
         end=1.0,

@@ -28,7 +28,7 @@ UNUSED = 0.05  # of a topic's messages
 def alarms_of(
     judge: Judge, parameters: Mapping[str, Mapping[str, Any]], coverage: Sequence[Row] = ()
 ) -> list[Alarm]:
-    """The alarms of a judged replay, the worst first.
+    """Return the alarms of a judged replay, the worst first.
 
     Args:
         judge: of all runs.

@@ -147,7 +147,7 @@ def _has_own_colour(drawn: Drawn) -> bool:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> slice:
-    """Every k-th of so many points: by default no more of them than a person sees in a line."""
+    """Return every k-th of so many points: by default no more of them than a person sees in a line."""
     return slice(None, None, max(1, -(-count // most)))
 
 
@@ -193,7 +193,7 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
 
 
 def level(label: str, x: ArrayLike, y: float) -> Series:
-    """A value that others are seen against, from end to end."""
+    """Return a value that others are seen against, from end to end."""
     ends = np.asarray(x)[[0, -1]]
     return curve(label, ends, [y, y], reference=True)
 
@@ -230,7 +230,7 @@ def _numbers(values: ArrayLike) -> Numbers:
 
 
 def draw(chart: Chart) -> "Figure":
-    """The chart as a figure of matplotlib."""
+    """Draw the chart as a figure of matplotlib."""
     from matplotlib.figure import Figure
 
     rows = -(-len(chart.panels) // chart.columns)

@@ -40,7 +40,7 @@ REPLAYED = "replayed"
 def untaken(
     sources: Sequence[Source], labels: Iterable[str], bound: Iterable[Bound], order: Clock
 ) -> list[Row]:
-    """The topics that an estimator does not take at all, in the replayed spans of all logs.
+    """Return the topics that an estimator does not take at all, in the replayed spans of all logs.
 
     Truths and maps are none, nor are controls but for those that it would take if told to.
     """
@@ -203,7 +203,7 @@ def _places(bound: Iterable[Bound]) -> dict[str, str]:
 def rows_of(
     usages: Mapping[str, Usage], others: Sequence[Row], doubts: Mapping[str, Doubt] | None = None
 ) -> list[Row]:
-    """All lines, by estimator and topic: what was counted, other topics, and doubtful truths."""
+    """Return all lines, by estimator and topic: what was counted, other topics, and doubtful truths."""
     rows = [row for usage in usages.values() for row in usage.rows()]
     there = {(row.estimator, row.topic) for row in rows}
     rows += [row for row in others if (row.estimator, row.topic) not in there]
@@ -228,7 +228,7 @@ def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
 
 
 def stored_rows(folder: Path) -> list[Row]:
-    """The table `coverage` of a result; older ones have none."""
+    """Return the table `coverage` of a result; older ones have none."""
     path = folder / "tables" / "coverage.parquet"
     if not path.is_file():
         return []
@@ -237,12 +237,12 @@ def stored_rows(folder: Path) -> list[Row]:
 
 
 def rows_of_candidate(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
-    """The lines of one estimator, under a candidate's name."""
+    """Return the lines of one estimator, under a candidate's name."""
     return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 
 def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
-    """A row per estimator and topic; see `Row`."""
+    """Return a row per estimator and topic; see `Row`."""
     import pandas as pd  # which takes long to import
 
     return pd.DataFrame(rows, columns=COLUMNS).astype({"used": "Int64", "gated": "Int64"})

@@ -111,7 +111,7 @@ class Result(Parameters):
 
     @property
     def contents(self) -> list[str]:
-        """The folders and files at the top of the result's folder."""
+        """Return the folders and files at the top of the result's folder."""
         return [*dict.fromkeys(Path(name).parts[0] for name in self.files)]
 
 
@@ -128,7 +128,7 @@ def split_metric(key: str) -> tuple[str, str, str]:
 
 
 def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> dict[str, MetricValue]:
-    """The metrics of these estimators first and in their order, those of others as they were."""
+    """Return the metrics of these estimators first and in their order, those of others as they were."""
     place = {label: index for index, label in enumerate(estimators)}
     keys = sorted(metrics, key=lambda key: place.get(split_metric(key)[0], len(place)))
     return {key: metrics[key] for key in keys}
@@ -159,7 +159,7 @@ class MetricTable:
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """A table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
+    """Return a table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
     import pandas as pd
 
     with path.open("rb") as file:
@@ -171,7 +171,7 @@ def metric_tables(
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
 ) -> list[MetricTable]:
-    """The metrics by case; with a table of runs also the interval of the mean NEES over them."""
+    """Return the metrics by case; with a table of runs also the interval of the mean NEES over them."""
     over_runs = {} if runs is None else _nees_over_runs(runs)
     estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
     cases: dict[str, dict[str, dict[str, Measured]]] = {}
@@ -267,7 +267,7 @@ def _is_by_clock(path: Path) -> bool:
 
 
 def hash_of(path: Path) -> str:
-    """The SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

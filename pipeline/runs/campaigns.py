@@ -65,12 +65,12 @@ class Cell:
 
     @property
     def files(self) -> list[Path]:
-        """The logs that it reads."""
+        """Return the logs that it reads."""
         return self.experiment.files[self.first : self.end]
 
     @cached_property
     def key(self) -> str:
-        """A hash of what decides about the result: this description, the data, and the code."""
+        """Return a hash of what decides about the result: this description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
         files = [*self.files, *program_files(self.experiment.estimators)]
@@ -203,7 +203,7 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
-    """The cells: a cut that only the number of runs decides."""
+    """Return the cells: a cut that only the number of runs decides."""
     require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)

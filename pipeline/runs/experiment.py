@@ -195,7 +195,7 @@ class Stated(NamedTuple):
 
     @property
     def labels(self) -> Mapping[str, Mapping[str, Any]]:
-        """The labels of its estimators, with their settings."""
+        """Return the labels of its estimators, with their settings."""
         return self.with_settings({}, {}).estimators
 
     @property
@@ -207,7 +207,7 @@ class Stated(NamedTuple):
         return {**self.values, "estimators": allowed_in(estimators, self.folder)}
 
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
-        """The experiment with settings and then `over` over it; see `load_experiment`."""
+        """Return the experiment with settings and then `over` over it; see `load_experiment`."""
         where = f"experiment {self.source}"
         values = self._values
         own = _settings_of_experiment(build(Experiment, values, where), settings)
@@ -224,7 +224,7 @@ class Stated(NamedTuple):
 def load_experiment(
     name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
 ) -> tuple[str, Experiment]:
-    """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
+    """Return an experiment by its shipped name or its TOML file, with settings and then `over` over it.
 
     A setting goes to the entry of the experiment or to the estimator that its first word names, else to
     the scenario's or importer's parameters, else to all estimators that have such a parameter:
@@ -235,7 +235,7 @@ def load_experiment(
 
 
 def read_experiment(name: str) -> Stated:
-    """An experiment by its shipped name or its TOML file, without settings."""
+    """Return an experiment by its shipped name or its TOML file, without settings."""
     known = shipped("experiments")
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")

@@ -94,7 +94,7 @@ SHIPPED = resources.files("fuselog_data")
 
 
 def shipped(kind: str) -> dict[str, Path]:
-    """The TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
+    """Return the TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
     with resources.as_file(SHIPPED / kind) as folder:
         return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 

@@ -46,7 +46,7 @@ class Replayed:
         return [*self.errors, *self.innovations, *self.sets, *outputs]
 
     def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
-        """The metrics of these names, of all where none is given; see `measure`."""
+        """Return the metrics of these names, of all where none is given; see `measure`."""
         return measure(self.judged, find_metrics(names))
 
 

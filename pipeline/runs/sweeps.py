@@ -65,7 +65,7 @@ class Over(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What an axis says."""
+        """Return what an axis says."""
         unit = unit_of(self.key)
         return f"{self.name}{f' ({unit})' if unit else ''}" if self.name else self.key
 
@@ -224,7 +224,7 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """A row per metric: its value over all runs, and between what nine in ten runs lie.
+    """Return a row per metric: its value over all runs, and between what nine in ten runs lie.
 
     Of NEES and NIS also what it should be, and where it lies with 95 % if the estimator is consistent.
     """
@@ -251,7 +251,7 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
 
 
 def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
-    """The errors of every run at a point, by which points are compared run by run."""
+    """Return the errors of every run at a point, by which points are compared run by run."""
     runs = judge.runs_table
     names = [name for name in ("estimator", "case", "run") if name in runs]
     kept = runs[[*names, *(key for key in runs if is_error(str(key)))]].copy()
@@ -273,7 +273,7 @@ def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
 
 
 def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
-    """Every metric as a list, by point; null where a point has none."""
+    """Return every metric as a list, by point; null where a point has none."""
     found: dict[str, MetricValue] = {}
     for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
         values = dict(zip(rows["point"], rows["value"], strict=True))
@@ -300,7 +300,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
 
 
 def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = "") -> Chart:
-    """The quantity over each parameter; where others are swept too, the mean over them."""
+    """Draw the quantity over each parameter; where others are swept too, the mean over them."""
     panels = []
     for each in over:
         numbers = all(isinstance(value, int | float) for value in each.taken)

@@ -41,7 +41,7 @@ def _stride(multiple: int, count: int) -> int:
 
 
 def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve:
-    """The overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
+    """Return the overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
 
     Only pairs of whole windows count. Of many samples a thousand differences a window do.
 

@@ -30,12 +30,12 @@ class Densities(NamedTuple):
 
     @property
     def unit(self) -> tuple[Density, Density] | None:
-        """The accelerometer's and the gyro's, where there are both."""
+        """Return the accelerometer's and the gyro's, where there are both."""
         force, rate = self.fields.get(_FORCE), self.fields.get(_RATE)
         return None if force is None or rate is None else (force, rate)
 
     def warned(self, mark: str, text: str) -> str:
-        """The text after the sentences, as comments that begin with a mark."""
+        """Return the text after the sentences, as comments that begin with a mark."""
         return "".join(f"{mark} {each}\n" for each in self.doubts) + text
 
 

@@ -62,7 +62,7 @@ def likelihood(samples: Samples, terms: Terms) -> Likelihood:
 
 
 def residuals(samples: Samples, terms: Terms) -> Floats:
-    """The normalised innovations (n - 1,) of samples, without what regressors explain."""
+    """Return the normalised innovations (n - 1,) of samples, without what regressors explain."""
     columns = samples.values.shape[1]
     moments, found = np.zeros((columns, columns)), np.zeros(samples.values.shape)
     _filtered(samples, terms, moments, found)

@@ -67,12 +67,12 @@ class ColumnNoise:
 
     @property
     def name(self) -> str:
-        """The column as sentences name it."""
+        """Return the column as sentences name it."""
         return f"{self.topic}.{self.field}" + (f".{self.component}" if self.component else "")
 
     @property
     def model_deviations(self) -> Floats:
-        """The Allan deviation (n,) of the fitted model at the curve's times."""
+        """Return the Allan deviation (n,) of the fitted model at the curve's times."""
         return np.sqrt(self.fitted.terms.allan_variance(self.curve.taus_s, self.step_s))
 
 

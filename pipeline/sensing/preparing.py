@@ -35,12 +35,12 @@ class Grid(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many places there are."""
+        """Count how many places there are."""
         return int(self.places[-1]) + 1
 
     @property
     def lost(self) -> float:
-        """The share of messages that are not there."""
+        """Return the share of messages that are not there."""
         return 1 - len(self.places) / self.size
 
 
@@ -54,7 +54,7 @@ class Drift(NamedTuple):
     gain: float
 
     def over(self, times_s: Floats) -> Floats:
-        """The drift (n,) at times since the first sample."""
+        """Return the drift (n,) at times since the first sample."""
         return self.rate * times_s + self.offset * np.exp(-times_s / self.time_s)
 
 

@@ -24,7 +24,7 @@ class Terms(NamedTuple):
     quantisation: float = 0.0
 
     def allan_variance(self, taus_s: Floats, step_s: float) -> Floats:
-        """The expected Allan variance (n,) of samples every `step_s` at times (n,), exactly."""
+        """Return the expected Allan variance (n,) of samples every `step_s` at times (n,), exactly."""
         multiples = np.rint(taus_s / step_s)
         return self._second_differences(multiples, step_s) / (2 * taus_s**2)
 

@@ -93,7 +93,7 @@ def stress_result(
 def claims_under_stress(
     experiment: Experiment, result: Result, stress: Sequence[Stressing]
 ) -> list[Claim]:
-    """The claims of a result: those that stress may carry across their limit are not shown.
+    """Return the claims of a result: those that stress may carry across their limit are not shown.
 
     They are decided again with each metric's interval, or its value, wider on both sides by the largest
     change that stress makes to it. Verdicts on metrics that are not of single estimators stay.

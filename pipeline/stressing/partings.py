@@ -44,13 +44,13 @@ class Parting(NamedTuple):
 
     @property
     def growth(self) -> float:
-        """The largest A for the first one that is not zero."""
+        """Return the largest A for the first one that is not zero."""
         there = self.amplification[self.amplification > 0.0]
         return float(np.max(there) / there[0]) if len(there) else 1.0
 
     @property
     def parted(self) -> int | None:
-        """The row where the copies part; None where they do not."""
+        """Return the row where the copies part; None where they do not."""
         there = np.flatnonzero(self.amplification > 0.0)
         if not len(there):
             return None
@@ -122,7 +122,7 @@ def _explained(covariance: Floats, other: Floats) -> Floats:
 
 
 def covariances(stream: Stream) -> Floats:
-    """The covariances (rows, n, n) of Gaussian estimates."""
+    """Return the covariances (rows, n, n) of Gaussian estimates."""
     n = int(np.sqrt(stream["covariance"].shape[1]))
     return stream["covariance"].reshape(len(stream), n, n)
 
@@ -152,7 +152,7 @@ class Undetermined(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
+        """Return the direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
         parts = [
             f"{'-' if value < 0 else '+'} {abs(value):.2g} {name}"
             for name, value in zip(self.components, self.direction, strict=True)

@@ -147,7 +147,7 @@ class _Replayed:
     how: How
 
     def estimates(self, run: int) -> dict[str, Stream]:
-        """The Gaussian estimates of a run, by topic, in the order of their stamps."""
+        """Return the Gaussian estimates of a run, by topic, in the order of their stamps."""
         wanted = schemas.GAUSSIAN_ESTIMATE.full_name
         found = {
             topic: rows.of_run(run)
@@ -173,7 +173,7 @@ class _Replayed:
         return found
 
     def metrics(self, run: int) -> Mapping[tuple[str, str], float]:
-        """The metrics of one run by case and quantity, those that are known."""
+        """Return the metrics of one run by case and quantity, those that are known."""
         return self._metrics.get(run, {})
 
 

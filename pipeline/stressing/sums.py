@@ -52,7 +52,7 @@ class StressSums:
 
     @property
     def summary(self) -> Stressing:
-        """The verdict over all runs."""
+        """Return the verdict over all runs."""
         runs = self.verdicts.total()
         often = [each for each, own in self.verdicts.items() if own * RARE_RUNS > runs]
         verdict = max(often, key=ORDER.index)
@@ -79,7 +79,7 @@ class StressSums:
 
 
 def verdicts_of(stressed: Iterable[Stressed]) -> dict[str, Stressing]:
-    """The verdict on each estimator over its runs."""
+    """Return the verdict on each estimator over its runs."""
     sums: dict[str, StressSums] = {}
     for each in stressed:
         sums.setdefault(each.estimator, StressSums(each.estimator)).add(each)

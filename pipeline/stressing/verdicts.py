@@ -47,12 +47,12 @@ class Tried(NamedTuple):
 
     @property
     def largest(self) -> float:
-        """The largest A."""
+        """Return the largest A."""
         return float(self.parting.amplification.max(initial=0.0)) if self.parting else 0.0
 
     @property
     def is_wider(self) -> bool:
-        """Whether moved stamps change a covariance by more than noise per second mostly does."""
+        """Tell whether moved stamps change a covariance by more than noise per second mostly does."""
         return (
             self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
         )
@@ -83,7 +83,7 @@ class Stressed:
 
     @property
     def run(self) -> str:
-        """The run's name."""
+        """Return the run's name."""
         return self.source.name
 
     def _is_explained(self, name: str) -> bool:
@@ -103,7 +103,7 @@ class Stressed:
         return self.tried[name].largest / half.largest if half and half.largest > 0.0 else np.nan
 
     def verdict(self, name: str) -> Verdict:
-        """What a change does."""
+        """Return what a change does."""
         each = self.tried[name]
         if each.why:
             return "not tried"
@@ -116,12 +116,12 @@ class Stressed:
 
     @property
     def worst(self) -> Verdict:
-        """The worst of all verdicts."""
+        """Return the worst of all verdicts."""
         return max((self.verdict(name) for name in self.tried), key=ORDER.index)
 
     @property
     def deciding(self) -> str:
-        """Which change decides the worst verdict: of those that have it what moves most."""
+        """Return which change decides the worst verdict: of those that have it what moves most."""
         own = [name for name in self.tried if self.verdict(name) == self.worst]
         return max(own, key=lambda name: self.tried[name].largest)
 
@@ -140,13 +140,13 @@ class Stressed:
 
     @cached_property
     def undetermined(self) -> Undetermined | None:
-        """The direction that measurements do not determine, of the estimate that moves most."""
+        """Return the direction that measurements do not determine, of the estimate that moves most."""
         moved = max(self.tried.values(), key=lambda each: each.largest).parting
         return None if moved is None else undetermined(self.estimates[moved.topic])
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each change."""
+        """Return a row for each change."""
         found = []
         for name, each in self.tried.items():
             row: dict[str, Any] = {
@@ -182,7 +182,7 @@ class Stressed:
 
     @property
     def sentence(self) -> str:
-        """The verdict, with the numbers of the change that decides it."""
+        """Return the verdict, with the numbers of the change that decides it."""
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
         name = self.deciding
@@ -205,7 +205,7 @@ class Stressed:
 
     @property
     def sentences(self) -> list[str]:
-        """The verdict first, then what explains it."""
+        """Return the verdict first, then what explains it."""
         sentences = [self.sentence]
         if self.is_per_prediction:
             sentences.append(

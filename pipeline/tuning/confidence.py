@@ -37,7 +37,7 @@ class Confidence(NamedTuple):
 
     @property
     def errors(self) -> Floats:
-        """The standard errors (m,) of the coordinates."""
+        """Return the standard errors (m,) of the coordinates."""
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
@@ -86,14 +86,14 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
 
 
 def doubts(confidence: Confidence, coordinates: Coordinates) -> Iterator[str]:
-    """A sentence for every direction of the parameters (k,) of which the logs tell little."""
+    """Yield a sentence for every direction of the parameters (k,) of which the logs tell little."""
     own = [coordinates.free[place] for place in confidence.places]
     for direction, value in _weak(confidence, coordinates):
         yield _in_words(direction, value, own)
 
 
 def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
-    """The parameters (k,), by their places, of which the logs tell nothing by the curvature."""
+    """Return the parameters (k,), by their places, of which the logs tell nothing by the curvature."""
     found = []
     for direction, value in _weak(confidence, coordinates):
         first, *others = _involved(direction)

@@ -84,7 +84,7 @@ def is_innovation(rows: Ragged) -> bool:
 
 
 def innovations_in(outputs: Mapping[str, Ragged]) -> Iterator[tuple[str, Stream]]:
-    """The innovation streams of one log's outputs, by topic."""
+    """Yield the innovation streams of one log's outputs, by topic."""
     for topic, rows in outputs.items():
         if is_innovation(rows) and len(rows):
             yield topic, rows.stream
@@ -284,7 +284,7 @@ class Objective:
         )
 
     def begun(self, values: Floats, run: Run) -> Run:
-        """The log, with how the estimator begins with these values (k,); BadInput as `replay`."""
+        """Return the log, with how the estimator begins with these values (k,); BadInput as `replay`."""
         begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
         if any(initialization_of(each) for each in bound):

@@ -64,7 +64,7 @@ class Reports(NamedTuple):
     speed_mps: Floats
 
     def take(self, rows: NDArray) -> "Reports":
-        """Some of the rows."""
+        """Return some of the rows."""
         return Reports(*(column[rows] for column in self))
 
 

@@ -107,7 +107,7 @@ class StreamMapping(Parameters):
     states: dict[str, float] = {}
 
     def sources(self) -> Iterator[str]:
-        """The names of all sources of numbers; some may come again."""
+        """Yield the names of all sources of numbers; some may come again."""
         for fields in (self.fields, *self.each):
             for given in fields.values():
                 yield from (source for source in _listed(given) if isinstance(source, str))
@@ -115,7 +115,7 @@ class StreamMapping(Parameters):
             yield from (source for source in listed if isinstance(source, str))
 
     def conditions(self) -> Iterator[tuple[str, list[Source]]]:
-        """The sources that are compared, and with what."""
+        """Yield the sources that are compared, and with what."""
         for where in (self.where, *(each.where for each in self.inflated)):
             for source, values in where.items():
                 yield source, _listed(values)
@@ -198,7 +198,7 @@ class _Maker(NamedTuple):
     where: str
 
     def columns(self, fields: Mapping[str, OneOrMore[Source]], stretch: Floats) -> dict[str, NDArray]:
-        """A column for every field of the message but the sensor's clock."""
+        """Return a column for every field of the message but the sensor's clock."""
         made: dict[str, NDArray] = {}
         for entry in list(self.schema)[1:]:
             if entry.name in self.mapping.deviations:

@@ -42,7 +42,7 @@ _FACTOR = re.compile(r"\s*([/*]?)\s*([A-Za-z]+)(?:\^?(-?\d))?\s*")
 
 
 def unit(text: str) -> Unit:
-    """The unit that a text such as `m/s^2`, `deg/s` or `m s^-2` names.
+    """Return the unit that a text such as `m/s^2`, `deg/s` or `m s^-2` names.
 
     Raises BadInput where it names none.
 

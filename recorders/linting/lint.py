@@ -33,7 +33,7 @@ CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] 
 
 
 def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None) -> list[Finding]:
-    """What is wrong with a log, of blocks that follow one another in time; hints stand last.
+    """Return what is wrong with a log, of blocks that follow one another in time; hints stand last.
 
     Every portion of some `MOST` messages is checked by itself, and what is found in several is said
     once, of the first. Topics are compared in pairs in the first portion alone.
@@ -57,7 +57,7 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
 
 
 def lint_log(log: Log, *, portions: int | None = None) -> list[Finding]:
-    """The findings of a log file, see `lint`; raises BadInput where it is damaged."""
+    """Return the findings of a log file, see `lint`; raises BadInput where it is damaged."""
     topics = [topic for topic in log.topics if _is_sensed(log, topic)]
     blocks = read_blocks(log, topics, block_messages=BLOCK) if topics else ()
     return lint(blocks, portions=portions)

@@ -41,7 +41,7 @@ class Numbered(NamedTuple):
 
 
 def descriptor_set(message: Message) -> bytes:
-    """The serialised FileDescriptorSet of a message with all that it is made of."""
+    """Return the serialised FileDescriptorSet of a message with all that it is made of."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def add(file: Any) -> None:

@@ -53,7 +53,7 @@ class Pattern(NamedTuple):
 
 
 def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Pattern:
-    """The pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
+    """Return the pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
     size = len(record)
     places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
     mask = words_of(is_fixed)[places]
@@ -75,7 +75,7 @@ def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern)
 
 
 def words_of(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """The words that start at every byte of `data` but the last seven, without a copy."""
+    """Return the words that start at every byte of `data` but the last seven, without a copy."""
     count = max(len(data) - 7, 0)
     return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
 

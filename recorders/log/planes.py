@@ -48,7 +48,7 @@ class Origin(NamedTuple):
 
 
 def origin_of(parts: Sequence[str]) -> Origin | None:
-    """The origin that two or three numbers state; None where they state none."""
+    """Return the origin that two or three numbers state; None where they state none."""
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
@@ -88,7 +88,7 @@ def is_framed(metadata: Mapping[str, str]) -> bool:
 
 
 def plane_in_words(metadata: Mapping[str, str]) -> str:
-    """The frame that a channel names, else that it is one of its own."""
+    """Return the frame that a channel names, else that it is one of its own."""
     return f"frame {metadata[FRAME]}" if metadata.get(FRAME) else "a frame of its own"
 
 

@@ -76,7 +76,7 @@ def read_span(log: Log, clock: Clock) -> tuple[int, int]:
 
 
 def read_empty(log: Log, topic: str) -> Stream:
-    """A topic without its messages: its schema and metadata."""
+    """Return a topic without its messages: its schema and metadata."""
     return Decoder(log, topic).empty()
 
 

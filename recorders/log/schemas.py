@@ -117,7 +117,7 @@ def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message
 
 
 def schema_of(message_type: type[message.Message]) -> Schema:
-    """The numeric fields of a message of any origin; fields of other kinds are left out.
+    """Return the numeric fields of a message of any origin; fields of other kinds are left out.
 
     Where the name is one of ours, what may be NaN is what we declare; else everything may.
     """

@@ -299,7 +299,7 @@ def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
 
 
 def empty_stream(topic: str, schema: Schema, metadata: Mapping[str, str]) -> Stream:
-    """A stream without messages; its vectors have width 0."""
+    """Return a stream without messages; its vectors have width 0."""
     times = np.empty(0, np.int64)
     columns = {
         entry.name: np.empty((0, 0) if entry.kind == "vector" else 0, entry.dtype) for entry in schema

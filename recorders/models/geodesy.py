@@ -14,7 +14,7 @@ ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 def earth_centred(
     latitude_deg: Component, longitude_deg: Component, altitude_m: Component = 0.0
 ) -> tuple[Component, Component, Component]:
-    """A point at a height above the ellipsoid in the frame that turns with the earth, in m."""
+    """Return a point at a height above the ellipsoid in the frame that turns with the earth, in m."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
     return (

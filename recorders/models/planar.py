@@ -14,7 +14,7 @@ Components = Any
 
 
 def wrap_angle(angle: Component) -> Component:
-    """The equal angle in [-pi, pi).
+    """Return the equal angle in [-pi, pi).
 
     >>> round(float(wrap_angle(3 * np.pi / 2) / np.pi), 12)
     -0.5

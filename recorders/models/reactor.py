@@ -11,7 +11,7 @@ PRODUCED = 0.16
 
 
 def react(pressures: Components, duration_s: Component) -> tuple[Component, Component]:
-    """The pressures after one time step, without noise."""
+    """Return the pressures after one time step, without noise."""
     reacted = duration_s * pressures[0] * pressures[0]
     return pressures[0] + CONSUMED * reacted, pressures[1] + PRODUCED * reacted
 

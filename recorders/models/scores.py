@@ -52,7 +52,7 @@ class Comparisons(NamedTuple):
 def score_stream(
     matchers: Sequence[Matcher], scores: NDArray[np.float64], arrival_ns: ArrayLike
 ) -> Stream:
-    """The stream of scores (users, users, matchers), probe by probe as they arrive (users,)."""
+    """Return the stream of scores (users, users, matchers), probe by probe as they arrive (users,)."""
     users = len(scores)
     metadata = {
         "matchers": ",".join(each.name for each in matchers),
@@ -74,7 +74,7 @@ def score_stream(
 
 
 def matchers_of(metadata: Mapping[str, str]) -> tuple[Matcher, ...]:
-    """The matchers that a score stream's metadata name; raises BadInput where they do not fit."""
+    """Return the matchers that a score stream's metadata name; raises BadInput where they do not fit."""
     keys = ("matchers", "modalities", "senses", "failure_scores")
     try:
         rows = zip(*(metadata[key].split(",") for key in keys), strict=True)

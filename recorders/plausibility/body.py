@@ -89,7 +89,7 @@ class Body:
 
     @property
     def roles(self) -> list[Sequence[Series]]:
-        """All lists."""
+        """Return all lists."""
         measured = self.rates, self.forces, self.orientations, self.references
         return [self.fixes, self.velocities, self.speeds, self.turns, *measured]
 

@@ -34,7 +34,7 @@ OF_MOTION: tuple[Callable[[Motion], Iterator[Finding]], ...] = (
 
 
 def findings(streams: Mapping[str, Stream]) -> list[Finding]:
-    """What topics say of their own faults, the worst first; see `finding.Finding`.
+    """Return what topics say of their own faults, the worst first; see `finding.Finding`.
 
     Estimates are not looked at. A log without a fault has none: thresholds are far from chance.
     """
@@ -53,7 +53,7 @@ def findings(streams: Mapping[str, Stream]) -> list[Finding]:
 
 
 def findings_in(blocks: Iterable[Mapping[str, Stream]]) -> list[Finding]:
-    """The findings of blocks that follow one another in time, by the first `MOST` messages."""
+    """Return the findings of blocks that follow one another in time, by the first `MOST` messages."""
     parts: dict[str, list[Stream]] = {}
     count = 0
     for block in blocks:

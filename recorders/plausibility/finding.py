@@ -54,5 +54,5 @@ class Finding(NamedTuple):
 
 
 def digits(value: float) -> float:
-    """A number in four digits, as a setting states it."""
+    """Return a number in four digits, as a setting states it."""
     return float(f"{value:.4g}")

@@ -54,7 +54,7 @@ class Slope(NamedTuple):
 
 
 def slope(x: Floats, y: Floats) -> Slope:
-    """The slope of y (k,) on x (k,) through zero, over windows where both are known."""
+    """Return the slope of y (k,) on x (k,) through zero, over windows where both are known."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     xx, xy, yy = x @ x, x @ y, y @ y
@@ -116,7 +116,7 @@ class Motion:
 
     @cached_property
     def delays_s(self) -> dict[str, float]:
-        """How late each topic's stamps are beside the most of them, where that is sure.
+        """Return how late each topic's stamps are beside the most of them, where that is sure.
 
         Of two topics the later one is late: messages come late, and never early.
         """
@@ -151,11 +151,11 @@ class Motion:
 
     @cached_property
     def gains(self) -> dict[str, float]:
-        """How many seconds a second the clocks of topics gain beside that of the places."""
+        """Return how many seconds a second the clocks of topics gain beside that of the places."""
         return {each.source: each.timing.gain for each in self.speed_lags if each.timing.gain}
 
     def aligned(self, source: Series) -> Series:
-        """A topic on the clock of the places, or of the courses where it has no other."""
+        """Return a topic on the clock of the places, or of the courses where it has no other."""
         for each in (*self.speed_lags, *self.turn_lags):
             if each.source == source.topic:
                 late_s = self.delays_s.get(each.source, 0.0) - self.delays_s.get(each.against, 0.0)
@@ -165,7 +165,7 @@ class Motion:
         return source
 
     def timed(self, source: Series) -> Series:
-        """A topic on the clock that most topics have."""
+        """Return a topic on the clock that most topics have."""
         if source.topic in self.gains:
             return self.aligned(source)
         return source.moved(self.delays_s.get(source.topic, 0.0))
@@ -181,7 +181,7 @@ class Motion:
         return aligned
 
     def speed(self, source: Series) -> Slope | None:
-        """How far places move for each metre of a speed or velocity."""
+        """Return how far places move for each metre of a speed or velocity."""
         if self.places is None or source.topic == self.places.topic:
             return None
         if (moved := clear_moves(self.places)) is None:
@@ -190,7 +190,7 @@ class Motion:
         return slope(distances, np.linalg.norm(moved.values, axis=1))
 
     def turn(self, source: Series) -> Slope | None:
-        """How much the course turns for each radian of a turn rate.
+        """Return how much the course turns for each radian of a turn rate.
 
         One that is like the course as it is needs no lag: half a period of a winding road is none.
         """
@@ -204,13 +204,13 @@ class Motion:
         return ratio
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
-        """How much a heading turns for each radian of a turn rate."""
+        """Return how much a heading turns for each radian of a turn rate."""
         angles = Series("", "", orientation.times_s, heading(orientation.values))
         windows = turned(angles, self.turn_span_s)
         return slope(turn_between(self.timed(source), windows.begin_s, windows.end_s), windows.values)
 
     def heading_course(self, orientation: Series) -> Slope | None:
-        """How much a heading turns for each radian of the course."""
+        """Return how much a heading turns for each radian of the course."""
         if self.courses is None:
             return None
         windows = turned(self.timed(self.courses), self.turn_span_s)

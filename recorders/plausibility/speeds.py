@@ -128,7 +128,7 @@ def rest(motion: Motion) -> Iterator[Finding]:
 
 
 def scatter(fixes: Fixes, source: Series) -> tuple[float, int, float] | None:
-    """How fixes scatter while a speed says that the body rests.
+    """Return how fixes scatter while a speed says that the body rests.
 
     Returns the variance as a multiple of what is stated, its degrees of freedom, and the correlation of
     an error with the next; None where the body does not rest, or no variance is stated.
@@ -164,7 +164,7 @@ def _filled(values: Floats) -> Floats:
 
 
 def chance(degrees: int, sigmas: float) -> float:
-    """A quantile of chi-square over its degrees of freedom, by that of a Gaussian.
+    """Return a quantile of chi-square over its degrees of freedom, by that of a Gaussian.
 
     Wilson and Hilferty, PNAS 17, 1931: within 2 % from 18 degrees on.
     """

@@ -130,7 +130,7 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def clock_rate(stream: Stream) -> float | None:
-    """How long 1 s of a topic's stamps lasts for the recorder; None where that cannot be told."""
+    """Return how long 1 s of a topic's stamps lasts for the recorder; None where that cannot be told."""
     if len(stream) < FEWEST:
         return None
     measured = (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9

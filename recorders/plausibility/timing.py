@@ -34,7 +34,7 @@ class Timing(NamedTuple):
 
 
 def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: float) -> Timing | None:
-    """The lag, and gain, of the best correlation; None where too few windows can tell."""
+    """Return the lag, and gain, of the best correlation; None where too few windows can tell."""
     if len(windows) < FEWEST or not np.ptp(windows.values):
         return None
     count = _independent(windows)

@@ -68,7 +68,7 @@ class AcousticParameters(Parameters):
 
     @property
     def medium(self) -> Medium:
-        """The air and the bullet."""
+        """Return the air and the bullet."""
         return Medium(self.speed_of_sound_mps, self.mach_number)
 
     @property

@@ -86,7 +86,7 @@ class Course(NamedTuple):
     bias_rad: Floats
 
     def rows(self, times_s: Floats) -> NDArray[np.int64]:
-        """The rows of times that are among its own."""
+        """Return the rows of times that are among its own."""
         return np.searchsorted(self.times_s, times_s)
 
 

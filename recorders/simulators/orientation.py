@@ -51,7 +51,7 @@ class AxisParameters(Parameters):
 
     @classmethod
     def dimension(cls) -> int:
-        """The number of components."""
+        """Return the number of components."""
         return 2
 
 
@@ -65,7 +65,7 @@ class OrientationParameters(AxisParameters):
 
     @classmethod
     def dimension(cls) -> int:
-        """The number of components."""
+        """Return the number of components."""
         return 4
 
 

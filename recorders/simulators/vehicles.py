@@ -147,13 +147,13 @@ class Drive(NamedTuple):
     accelerations: Floats
 
     def states_at(self, times_s: Floats) -> Floats:
-        """The exact states (n, vehicles, 4) at any times within the drive."""
+        """Return the exact states (n, vehicles, 4) at any times within the drive."""
         steps = len(self.accelerations)
         step = np.minimum((times_s / self.step_s + 1e-9).astype(int), steps - 1)
         return self.after(step, times_s - step * self.step_s)
 
     def after(self, step: Integers, duration_s: Floats) -> Floats:
-        """The states (n, vehicles, 4) so long (n,) after the beginning of steps (n,)."""
+        """Return the states (n, vehicles, 4) so long (n,) after the beginning of steps (n,)."""
         span_s, acceleration = duration_s[:, None], self.accelerations[step]
         moved = turn(np.moveaxis(self.states[step], -1, 0), self.turn_rate_radps, span_s)
         states = np.stack(moved, axis=-1)

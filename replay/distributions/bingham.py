@@ -31,7 +31,7 @@ class Bingham(NamedTuple):
 
     @property
     def mode(self) -> NDArray[np.float64]:
-        """The most probable axis (..., d); its negative is the same."""
+        """Return the most probable axis (..., d); its negative is the same."""
         return self.axes[..., -1]
 
 
@@ -72,7 +72,7 @@ def around(mode: ArrayLike, concentrations: ArrayLike) -> Bingham:
 
 
 def from_parameter_matrix(matrix: ArrayLike) -> Bingham:
-    """The distributions proportional to exp(x^T A x) for symmetric A (..., d, d)."""
+    """Return the distributions proportional to exp(x^T A x) for symmetric A (..., d, d)."""
     eigenvalues, axes = np.linalg.eigh(_symmetric(matrix, "Bingham parameter matrix"))
     return Bingham(axes, eigenvalues - eigenvalues[..., -1:])
 
@@ -134,12 +134,12 @@ def fit(second_moment: ArrayLike) -> Bingham:
 
 
 def product(first: Bingham, second: Bingham) -> Bingham:
-    """The normalised product of two densities: lemma 1."""
+    """Return the normalised product of two densities: lemma 1."""
     return from_parameter_matrix(parameter_matrix(first) + parameter_matrix(second))
 
 
 def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
-    """The density of x given z = x (+) v, v ~ `noise`, alone: the factor of an update, (52)-(53).
+    """Return the density of x given z = x (+) v, v ~ `noise`, alone: the factor of an update, (52)-(53).
 
     M is z (+) (D M^v), where (53) and algorithm 2 misprint M^p, and the left factor in (52) is Q_z.
     """
@@ -149,13 +149,13 @@ def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
 
 
 def rotate(bingham: Bingham, increment: ArrayLike) -> Bingham:
-    """The distributions of x (+) u for known unit increments u (..., d), such as a gyro's."""
+    """Return the distributions of x (+) u for known unit increments u (..., d), such as a gyro's."""
     turned = right_matrix(require_unit(increment, "increment")) @ bingham.axes
     return Bingham(turned, np.broadcast_to(bingham.concentrations, turned.shape[:-1]))
 
 
 def compose(first: Bingham, second: Bingham) -> Bingham:
-    """The Bingham distributions with the second moments of x (+) y, x ~ `first` and y ~ `second`.
+    """Return the Bingham distributions with the second moments of x (+) y, x ~ `first` and y ~ `second`.
 
     Lemmas 2 and 4 with (13)-(14); a fit that does not converge is NaN.
     """

@@ -66,7 +66,7 @@ class VonMisesMixture(NamedTuple):
 
 
 def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) -> WrappedMixture:
-    """The most likely wrapped normals near the clusters that k-means finds.
+    """Return the most likely wrapped normals near the clusters that k-means finds.
 
     With one component it is the maximum-likelihood fit of a wrapped normal. Raises BadInput where there
     are fewer than ten angles a component.

@@ -70,7 +70,7 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
 
 
 def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
-    """The density (...) at angles x (..., 2)."""
+    """Return the density (...) at angles x (..., 2)."""
     deviation = np.asarray(x, float) - distribution.mean
     batch = np.broadcast_shapes(deviation.shape[:-1], distribution.covariance.shape[:-2])
     covariance = flatten(distribution.covariance, batch, 2, 2)
@@ -118,7 +118,7 @@ def require_central_weight(central_weight: float) -> None:
 
 
 def fit_moments(moments: CircularMoments) -> WrappedNormal:
-    """The wrapped normal with these circular moments.
+    """Return the wrapped normal with these circular moments.
 
     Raises BadInput where a variance is not positive and finite, or no positive definite covariance has
     this r_c; `fit_mixed_mle` always finds one.
@@ -153,7 +153,7 @@ def product_mixture(first: WrappedNormal, second: WrappedNormal) -> Mixture:
 
 
 def product(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:
-    """The wrapped normal with the circular moments and r_c of the product of two densities."""
+    """Return the wrapped normal with the circular moments and r_c of the product of two densities."""
     batch = np.broadcast_shapes(first.mean.shape[:-1], second.mean.shape[:-1])
     parameters = kernels.fit_product_each(
         flatten(first.mean, batch, 2),

@@ -45,7 +45,7 @@ def circular_correlation(c11: Component, c12: Component, c22: Component) -> Comp
 
 
 def covariance_of(correlation: Component, c11: Component, c22: Component) -> Component:
-    """The c12 with which a wrapped normal has this r_c; the inverse of `circular_correlation`."""
+    """Return the c12 with which a wrapped normal has this r_c; the inverse of `circular_correlation`."""
     return np.arcsinh(correlation * np.sqrt(np.sinh(c11) * np.sinh(c22)))
 
 
@@ -255,7 +255,7 @@ def _turns(variance: float) -> int:
 def fit_product(
     mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
 ) -> Components:
-    """The wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
+    """Return the wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
     Where no positive definite covariance has them (modes far apart), the components' correlation stays.
     `mixture` is memory, see `blank_mixture`.

@@ -71,7 +71,7 @@ class TopicRead(_Part):
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """How many numbers a vector field has; 0 for a field that is one number."""
+        """Count how many numbers a vector field has; 0 for a field that is one number."""
         parts = (field.partition("[") for field in self.fields)
         return {name: int(size[:-1]) if size else 0 for name, _, size in parts}
 

@@ -214,7 +214,7 @@ class Judge:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """The numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
+        """Return the numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
         return self._measured.finish()
 
     @property

@@ -48,7 +48,7 @@ class Arcs(NamedTuple):
     length: Floats
 
     def at(self, distance: Floats) -> Floats:
-        """The points at `distance` (m,) along the arcs."""
+        """Return the points at `distance` (m,) along the arcs."""
         pose = (*self.start.T, self.heading_rad)
         return np.stack(drive(pose, (1.0, self.curvature), distance)[:2], axis=-1)
 
@@ -83,7 +83,7 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
 
 
 def arena_around(points: ArrayLike, margin_m: float) -> Arena:
-    """The rectangle around points (n, 2), larger by a margin on every side."""
+    """Return the rectangle around points (n, 2), larger by a margin on every side."""
     places = np.asarray(points, float)
     return Arena(places.min(axis=0) - margin_m, places.max(axis=0) + margin_m)
 
@@ -102,7 +102,7 @@ def excess_rad(pairs: Pairs, points: Floats) -> Floats:
 
 
 def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
-    """The discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
+    """Return the discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
 
     D(g) holds sin(gamma - g) >= 0: its circle passes through both landmarks and, on one side of their
     chord, sees it at the angle g. The sign of (20) needs Delta_perp turned by +90 degrees, which the
@@ -120,7 +120,7 @@ def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
 
 
 def discs(pairs: Pairs) -> Floats:
-    """The two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
+    """Return the two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
 
     Between g1 = angle - bound and g2 = angle + bound: D(g1) without D(g2). That is a lune, a lens where
     g2 passes pi, the outside of two discs where g1 passes 0; no case needs its own formula.
@@ -131,7 +131,7 @@ def discs(pairs: Pairs) -> Floats:
 
 
 def half_planes(arena: Arena) -> Floats:
-    """The arena's four sides as generalised discs (4, 4)."""
+    """Return the arena's four sides as generalised discs (4, 4)."""
     sides = np.zeros((4, 4))
     sides[[0, 1], [1, 2]] = -1.0
     sides[[2, 3], [1, 2]] = 1.0
@@ -140,20 +140,20 @@ def half_planes(arena: Arena) -> Floats:
 
 
 def evaluate(constraints: Floats, points: Floats) -> Floats:
-    """The values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k)."""
+    """Return the values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k)."""
     squared = np.sum(points**2, axis=-1)[..., None]
     linear = points @ constraints[:, 1:3].T
     return constraints[:, 0] * squared + linear + constraints[:, 3]
 
 
 def exact_set(pairs: Pairs, arena: Arena) -> Arcs:
-    """The exact feasible set (4) of a frame inside an arena; no arcs where it is empty."""
+    """Return the exact feasible set (4) of a frame inside an arena; no arcs where it is empty."""
     constraints = np.concatenate([discs(pairs).reshape(-1, 4), half_planes(arena)])
     return intersection(constraints, arena)
 
 
 def intersection(constraints: Floats, arena: Arena) -> Arcs:
-    """The border of an intersection of generalised discs (k, 4), the arena's sides among them."""
+    """Return the border of an intersection of generalised discs (k, 4), the arena's sides among them."""
     pieces = _cut(constraints, arena)
     middle = pieces.at(0.5 * pieces.length)
     tolerance = 1e-11 * float(np.linalg.norm(arena.high - arena.low))
@@ -215,7 +215,7 @@ def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
 
 
 def area(border: Arcs) -> float:
-    """The area inside, by Green's theorem: chords and circular segments."""
+    """Return the area inside, by Green's theorem: chords and circular segments."""
     end = border.at(border.length)
     chords = border.start[:, 0] * end[:, 1] - border.start[:, 1] * end[:, 0]
     turn = border.curvature * border.length
@@ -226,7 +226,7 @@ def area(border: Arcs) -> float:
 
 
 def box(border: Arcs) -> Arena:
-    """The tightest axis-parallel box; raises BadInput for an empty set."""
+    """Return the tightest axis-parallel box; raises BadInput for an empty set."""
     if len(border.length) == 0:
         raise BadInput("the set is empty, so that it has no bounding box")
     points = [border.start, border.at(border.length)]
@@ -269,7 +269,7 @@ def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
 
 
 def signed_area(ring: Floats) -> float:
-    """The area inside a polygon (n, 2), positive where it runs anticlockwise."""
+    """Return the area inside a polygon (n, 2), positive where it runs anticlockwise."""
     following = np.roll(ring, -1, axis=0)
     return float(0.5 * np.sum(ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]))
 

@@ -57,7 +57,7 @@ class Frame(NamedTuple):
 
 
 def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
-    """The frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
+    """Yield the frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
 
     What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
     where nothing says how far the robot can be from what it sees.

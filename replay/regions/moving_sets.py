@@ -66,7 +66,7 @@ class Growth(NamedTuple):
     rate: float
 
     def over(self, span_s: Any) -> Any:
-        """The largest error over a span, or over each of several."""
+        """Return the largest error over a span, or over each of several."""
         return self.offset + self.rate * span_s
 
 
@@ -105,7 +105,7 @@ def relative_pose(first: Floats, second: Floats) -> Floats:
 
 
 def common_headings(one: Headings, other: Headings) -> Headings | None:
-    """The headings that are in both intervals; None where there are none.
+    """Return the headings that are in both intervals; None where there are none.
 
     Where wide intervals meet at both ends, the narrower of them holds what they have in common.
     """
@@ -120,7 +120,7 @@ def common_headings(one: Headings, other: Headings) -> Headings | None:
 
 
 def all_headings_of(one: Headings, other: Headings) -> Headings:
-    """The least interval that holds both."""
+    """Return the least interval that holds both."""
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     low = min(-one.half_rad, apart - other.half_rad)
     high = max(one.half_rad, apart + other.half_rad)
@@ -170,7 +170,7 @@ def directions(places: shapely.Geometry, target: Floats) -> Headings:
 
 
 def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
-    """A set from its borders (n, 2), holes the other way round."""
+    """Return a set from its borders (n, 2), holes the other way round."""
     places: shapely.Geometry = shapely.Polygon()
     for ring in rings:
         places = places.symmetric_difference(shapely.make_valid(shapely.Polygon(ring)))
@@ -178,12 +178,12 @@ def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
 
 
 def corners_of(places: shapely.Geometry) -> shapely.Geometry:
-    """A set without the vertices on its edges, which are there or not as rounding has it."""
+    """Return a set without the vertices on its edges, which are there or not as rounding has it."""
     return shapely.simplify(places, ON_A_LINE_M)
 
 
 def to_rings(places: shapely.Geometry) -> list[Floats]:
-    """The borders (n, 2) of a set: on their left is the set."""
+    """Return the borders (n, 2) of a set: on their left is the set."""
     found = []
     for part in shapely.get_parts(corners_of(places)):
         if isinstance(part, shapely.Polygon) and not part.is_empty:
@@ -195,7 +195,7 @@ def to_rings(places: shapely.Geometry) -> list[Floats]:
 
 
 def within_l8(places: shapely.Geometry) -> shapely.Geometry:
-    """A pseudo-ellipsoid with L = 8 around a set, as a polygon.
+    """Return a pseudo-ellipsoid with L = 8 around a set, as a polygon.
 
     It is the level set of the least ellipsoid around the monomials T of the set's points (by
     Titterington's weights of 1976, which need no step length), grown until it holds the set. A set that

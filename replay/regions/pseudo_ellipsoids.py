@@ -160,14 +160,14 @@ def order_of(ellipsoid: PseudoEllipsoid) -> Order:
 
 
 def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
-    """The fused slack at points (..., 2): the set is where it is >= 0."""
+    """Return the fused slack at points (..., 2): the set is where it is >= 0."""
     raised = monomials((points - ellipsoid.origin) / ellipsoid.scale_m, order_of(ellipsoid))
     quadratic = np.einsum("...i,...i->...", raised @ ellipsoid.information, raised)
     return 2 * raised @ ellipsoid.vector - quadratic - ellipsoid.constant
 
 
 def most_room(ellipsoid: PseudoEllipsoid) -> float:
-    """The greatest fused slack of any monomials, s of (7), at least its rounding error.
+    """Return the greatest fused slack of any monomials, s of (7), at least its rounding error.
 
     Raises BadInput where it is negative by more than that: the sets have no common point.
     """
@@ -307,7 +307,7 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
 
 
 def outline(ellipsoid: PseudoEllipsoid, arena: Arena, nodes: int = 400) -> Outline:
-    """The part of the set inside the arena, on a grid of nodes x nodes around it."""
+    """Return the part of the set inside the arena, on a grid of nodes x nodes around it."""
     window = _window(lambda points: room(ellipsoid, points), arena, nodes)
     grid = _grid(window, nodes)
     return _outline(room(ellipsoid, grid.points), grid)

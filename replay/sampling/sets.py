@@ -32,7 +32,7 @@ class SampleSets(NamedTuple):
 def sets_by_runs(
     sampler: Sampler, generators: Sequence[Generator | None], offsets: NDArray[np.int64]
 ) -> Iterator[tuple[slice, SampleSets]]:
-    """The sets of all runs, as many runs at once as memory should hold.
+    """Yield the sets of all runs, as many runs at once as memory should hold.
 
     Run r has the uses offsets[r]:offsets[r + 1]. A randomised sampling needs every run's generator, and
     moves it on.

@@ -30,7 +30,7 @@ class Fan(NamedTuple):
 
 
 def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
-    """The layout above a plot for each estimate that copies fan out from."""
+    """Return the layout above a plot for each estimate that copies fan out from."""
     plots = []
     for estimate in dict.fromkeys(fan.estimate for fan in fans):
         plot = entity_path("plots", "stress", estimate)

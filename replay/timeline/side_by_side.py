@@ -21,7 +21,7 @@ Board = rrb.Container | rrb.View
 def draw_side_by_side(
     canvas: Canvas, scene: Scene, layout: Board, estimators: Sequence[str]
 ) -> rrb.Container:
-    """The layout with a scene for each estimator, above the differences of their errors."""
+    """Return the layout with a scene for each estimator, above the differences of their errors."""
     plots = [view for case in scene.cases for view in _draw_differences(canvas, scene, case, estimators)]
     board = _split(layout, estimators)
     if not plots:

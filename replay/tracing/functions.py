@@ -76,7 +76,7 @@ class TracedFunction:
 
     @cached_property
     def graph(self) -> Graph:
-        """The graph, with that of derivatives as they are asked for."""
+        """Return the graph, with that of derivatives as they are asked for."""
         return Graph()
 
     @cached_property
@@ -134,7 +134,7 @@ class Derivative:
 
     @cached_property
     def entries(self) -> dict[Any, Node]:
-        """The derivatives by place; zero where there is none."""
+        """Return the derivatives by place; zero where there is none."""
         trace = Trace(self.function.graph, {})
         returned = self.function.result.returned
         slopes = slopes_of(trace, returned, self._seeds(trace))
@@ -148,7 +148,7 @@ class Derivative:
 
     @property
     def outputs(self) -> list[Node]:
-        """The values and then the derivatives."""
+        """Return the values and then the derivatives."""
         return [*self.function.result.returned, *self.entries.values()]
 
     def kernel_identity(self) -> str:
@@ -331,7 +331,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
 
 
 def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
-    """A function's name, with its file and line, or with those at which its own code stopped."""
+    """Return a function's name, with its file and line, or with those at which its own code stopped."""
     own = [
         frame
         for frame in (traceback.extract_tb(error.__traceback__) if error else ())
@@ -357,7 +357,7 @@ _KNOWN: dict[Any, tuple[TracedFunction, Reads | None]] = {}
 
 
 def traced(function: Any, *arguments: Argument) -> Any:
-    """A function as a traced one; the same again while it does the same.
+    """Return a function as a traced one; the same again while it does the same.
 
     It is called anew where what it reads has changed, or may have changed unseen; see `reads`.
     None for None, and what is traced already is as it was.

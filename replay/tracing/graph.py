@@ -87,13 +87,13 @@ class Graph:
         return self._node(INPUT, (), place, (INPUT, place))
 
     def constant(self, value: Any) -> Node:
-        """A number, or a truth."""
+        """Return a number, or a truth."""
         value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
         sign = math.copysign(1.0, value)
         return self._node(CONSTANT, (), value, (CONSTANT, type(value), sign, repr(value)))
 
     def power(self, base: Node, exponent: int) -> Node:
-        """A number to the power of an integer: by multiplication."""
+        """Return a number to the power of an integer: by multiplication."""
         if exponent == 1:
             return base
         if exponent == 0:
@@ -113,7 +113,7 @@ class Graph:
         )
 
     def apply(self, operation: Any, *arguments: Node) -> Node:
-        """An operation on nodes, or what is known to be the same."""
+        """Return an operation on nodes, or what is known to be the same."""
         if all(each.is_constant for each in arguments):
             return self.constant(evaluated(operation, *(each.value for each in arguments)))
         simpler = self._simpler(operation, arguments)
@@ -181,7 +181,7 @@ def _power(base: float, exponent: int) -> float:
 
 
 def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
-    """All nodes that some are made of, and these, in the order in which they can be computed.
+    """Return all nodes that some are made of, and these, in the order in which they can be computed.
 
     What is known already stands among them, and nothing that only this is made of.
     """

@@ -119,13 +119,13 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The fault with what the log has."""
+        """Return the fault with what the log has."""
         more = [*["compass"] * self.has_compass, *["prior"] * self.has_prior]
         return ", ".join([self.fault, *more])
 
 
 def cells(*, has_prior: bool = False) -> Iterator[Cell]:
-    """All faults, with a compass and, those that are not of it, without."""
+    """Yield all faults, with a compass and, those that are not of it, without."""
     for has_compass in (True, False):
         for fault in FAULTS:
             if has_compass or not fault.startswith("compass"):
@@ -266,7 +266,7 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
-    """The runs of the unit whose fault is told first, and the spread of the number, by fault."""
+    """Return the runs of the unit whose fault is told first, and the spread of the number, by fault."""
     found = {"diagnosis.unit_runs": float(rows.groupby("fault")["seed"].size().max())}
     for fault, own in rows.groupby("fault", sort=False):
         found[f"diagnosis.unit_first.{_case(str(fault))}"] = float(own["is_first"].sum())

@@ -55,12 +55,12 @@ class Entry(NamedTuple):
 
     @property
     def is_heading(self) -> bool:
-        """Whether it is the heading of orientations."""
+        """Tell whether it is the heading of orientations."""
         return self.field == "quaternion"
 
 
 def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
-    """The numbers of a topic that are read: those whose change changes what is read.
+    """Return the numbers of a topic that are read: those whose change changes what is read.
 
     Where it is not known what is read, all numbers, and the entries of positions and velocities.
     """
@@ -115,7 +115,7 @@ def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
 def of_components(
     stream: Stream, reading: Reading | None, parameters: Parameters | None, first_ns: int
 ) -> Iterator[Hypothesis]:
-    """All faults of the numbers of a topic; `first_ns` is where a bias begins to grow."""
+    """Yield all faults of the numbers of a topic; `first_ns` is where a bias begins to grow."""
     is_control = reading is not None and stream.topic in reading.controls
     entries = entries_of(stream, reading)
     if "latitude_deg" in stream.columns:

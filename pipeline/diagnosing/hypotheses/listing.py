@@ -27,7 +27,7 @@ def hypotheses(
     innovations: Mapping[str, Stream],
     readings: Mapping[str, Reading],
 ) -> list[Hypothesis]:
-    """All that may be wrong.
+    """Return all that may be wrong.
 
     Args:
         bound: what is estimated.

@@ -38,7 +38,7 @@ STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """The noise that the estimator's parameters state, channels for them, or that is assumed."""
+    """Yield the noise that the estimator's parameters state, channels for them, or that is assumed."""
     parameters = bound[0].parameters
     if parameters is None:
         return
@@ -88,7 +88,7 @@ def _noise_of(
 
 
 def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
-    """The covariances that messages state, or their channel for them."""
+    """Yield the covariances that messages state, or their channel for them."""
     fields = [
         (field, alter.spread(field))
         for field in ("covariance_m2", "covariance_m2ps2", "covariance")

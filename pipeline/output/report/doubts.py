@@ -27,7 +27,7 @@ _CHECKS: dict[str, Callable[[str], str]] = {
 
 
 def doubts_of(found: Findings, alarms: Sequence[Alarm], take: str, equal: Sequence[str]) -> list[str]:
-    """What is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
+    """Return what is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
         *_of_covariances(found, alarms),

@@ -46,7 +46,7 @@ class Spread(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether there is an interval."""
+        """Tell whether there is an interval."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
 
@@ -68,7 +68,7 @@ class Consistency:
 
     @property
     def factor(self) -> float:
-        """How many times larger errors are than the estimator claims."""
+        """Return how many times larger errors are than the estimator claims."""
         return math.sqrt(max(self.found.value, 0.0) / self.aim)
 
     @property
@@ -113,7 +113,7 @@ class Evidence:
 
     @property
     def state(self) -> State:
-        """What can be said of it in a word; NIS counts where NEES finds nothing."""
+        """Return what can be said of it in a word; NIS counts where NEES finds nothing."""
         if self.failed and self.failed >= self.runs:
             return "failed"
         states = [each.state for each in (self.consistency, self.also) if each is not None]
@@ -161,13 +161,13 @@ class Findings:
 
     @cached_property
     def main(self) -> str:
-        """The quantity by which estimators are compared; empty where there is none."""
+        """Return the quantity by which estimators are compared; empty where there is none."""
         there = [key for table in self.tables for key in table.quantities if is_error(key)]
         return next((key for key in (*PREFERRED, *there) if key in there), "")
 
     @cached_property
     def of(self) -> Mapping[str, Evidence]:
-        """The evidence by estimator."""
+        """Return the evidence by estimator."""
         return {label: self._evidence(label) for label in self.labels}
 
     @cached_property
@@ -177,7 +177,7 @@ class Findings:
 
     @property
     def compared(self) -> list[str]:
-        """The estimators that have an error in every case."""
+        """Return the estimators that have an error in every case."""
         return [label for label in self.labels if self.of[label].error is not None]
 
     def least_in(self) -> Counter[str]:
@@ -209,18 +209,18 @@ class Findings:
         return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
 
     def stressed(self, *labels: str) -> float:
-        """How far changes that should not matter move the main error, of any of these at most."""
+        """Return how far changes that should not matter move the main error, of any of these at most."""
         own = [self.stress[label].moved.get(self.main, 0.0) for label in labels if label in self.stress]
         return max(own, default=0.0)
 
     def values(self, label: str, key: str) -> list[float]:
-        """An estimator's metric in every case that has it."""
+        """Return an estimator's metric in every case that has it."""
         found = [table.quantities.get(key, {}).get(label) for table in self.tables]
         numbers = [each.value for each in found if each is not None]
         return [float(each) for each in numbers if isinstance(each, int | float)]
 
     def has_any(self, label: str, *stems: str) -> bool:
-        """Whether an estimator has a quantity with one of these in its name."""
+        """Tell whether an estimator has a quantity with one of these in its name."""
         return any(
             stem in key and label in of
             for table in self.tables
@@ -296,7 +296,7 @@ class Findings:
 
 
 def broken_of(found: Findings) -> list[Evidence]:
-    """Who cannot be believed: who fails, then who is too sure, the worst first."""
+    """Return who cannot be believed: who fails, then who is too sure, the worst first."""
 
     def badness(each: Evidence) -> float:
         return math.inf if each.state == "failed" else each.decisive.factor if each.decisive else 0.0
@@ -355,7 +355,7 @@ def is_withheld(found: Findings, first: str, second: str, difference: float) -> 
 
 
 def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
-    """What a result knows of its estimators; `tables` are those of its folder, by name."""
+    """Return what a result knows of its estimators; `tables` are those of its folder, by name."""
     rows = tables.get("runs", pd.DataFrame())
     if not {"estimator", "run"} <= {*rows}:
         rows = pd.DataFrame()
@@ -391,7 +391,7 @@ def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
 
 
 def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:
-    """How many runs a result is of: as many as its tables have, else as its settings say."""
+    """Count how many runs a result is of: as many as its tables have, else as its settings say."""
     if "differences" in tables and len(tables["differences"]):
         return int(tables["differences"]["runs"].max())
     logs = result.settings.get("logs")

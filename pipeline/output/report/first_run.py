@@ -153,7 +153,7 @@ def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats
 
 
 def picture_of_timeline(timeline: Path) -> bytes:
-    """The viewer's picture of a timeline, as WebP.
+    """Return the viewer's picture of a timeline, as WebP.
 
     Raises BadInput where there is no timeline, or no Vulkan driver to draw it with.
     """

@@ -30,7 +30,7 @@ class Gauge(NamedTuple):
 
 
 def numbers_of(by: Consistency) -> str:
-    """The mean of squares with its interval, and what is right."""
+    """Return the mean of squares with its interval, and what is right."""
     name = "NIS per component" if by.name == "NIS" else by.name
     if not by.found.is_known:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
@@ -39,7 +39,7 @@ def numbers_of(by: Consistency) -> str:
 
 
 def gauge(by: Consistency) -> Gauge:
-    """Where a mean of squares lies on its scale."""
+    """Return where a mean of squares lies on its scale."""
 
     def place(value: float) -> float:
         low, high = map(math.log, GAUGE_ENDS)

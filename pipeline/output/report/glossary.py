@@ -77,7 +77,7 @@ _TERMS = {
 
 
 def glossary(keys: set[str], *, draws: bool) -> list[Term]:
-    """The entries that a page with these quantities needs; with `draws` what a tie is."""
+    """Return the entries that a page with these quantities needs; with `draws` what a tie is."""
     needed = {
         "rmse": any("rmse" in key for key in keys),
         "nees": any("nees" in key for key in keys),

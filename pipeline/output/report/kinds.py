@@ -79,14 +79,14 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
 
 
 def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
-    """What was tried, and what came of it, as a terminal has them; `folder` is the result's."""
+    """Return what was tried, and what came of it, as a terminal has them; `folder` is the result's."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
     return begun.tried, " ".join(begun.story.verdict) or "No errors against a truth, and no claims."
 
 
 def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
-    """The estimators, the runs, how long each was, and where they come from."""
+    """Return the estimators, the runs, how long each was, and where they come from."""
     settings = result.settings
     estimators = list(settings.get("estimators") or [*found.labels, *found.bounds])
     named = listed(estimators)
@@ -148,7 +148,7 @@ def _with_claims(base: Story, result: Result) -> Story:
 
 
 def claims_sentences(result: Result) -> list[str]:
-    """How many claims hold, and how many do not."""
+    """Say how many claims hold, and how many do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     of_all = count(len(result.claims), "claim")
     if counts["confirmed"] == len(result.claims):

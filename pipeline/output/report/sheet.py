@@ -61,7 +61,7 @@ class Sheet:
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """The table of a result, and of several cases one each; None without numbers."""
+    """Return the table of a result, and of several cases one each; None without numbers."""
     columns = [*found.labels, *found.bounds]
     tables = [table for table in found.tables if any(table.quantities.values())]
     if not tables or not columns:

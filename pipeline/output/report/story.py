@@ -80,7 +80,7 @@ def story(
     timings: Timings | None = None,
     alarms: Sequence[Alarm] = (),
 ) -> Story:
-    """The story of estimators that were judged.
+    """Return the story of estimators that were judged.
 
     Causes, what each cost, and alarms are told where they are known.
     """

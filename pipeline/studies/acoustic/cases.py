@@ -180,7 +180,7 @@ def run_case(experiment: Experiment, setting: Setting, number: int, multiplier: 
 
 
 def bound_of(parameters: AcousticParameters, settings: Mapping[str, Any], label: str) -> Floats:
-    """The CRLB (n, n) of an estimator at the truth."""
+    """Return the CRLB (n, n) of an estimator at the truth."""
     estimator = configure(label, settings)[1]
     assert isinstance(estimator, ShooterParameters)
     chosen = acoustic.Setting(
@@ -214,7 +214,7 @@ def _heard(sources: list[MemorySource]) -> Detections:
 
 
 def hearing(case: Case) -> list[float]:
-    """The numbers of the sensors that hear the shockwave."""
+    """Return the numbers of the sensors that hear the shockwave."""
     true = acoustic.noise_free(case.parameters.medium, *truth_of(case.parameters))
     return [float(sensor + 1) for sensor in np.flatnonzero(np.isfinite(true.shockwave_rad[0]))]
 

@@ -15,7 +15,7 @@ from replay.timeline.drawing.plane import ellipses
 
 
 def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[str, Chart | Figure]:
-    """All figures by name."""
+    """Draw all figures by name."""
     nominal = [case for case in cases if case.multiplier == 1.0]
     return {
         "ellipses": _ellipses(nominal, options.modes),

@@ -102,7 +102,7 @@ def _judge_simulated(simulated: pd.DataFrame, label: str, outcome: Outcome) -> N
 
 
 def differences_of(source: MemorySource) -> pd.DataFrame:
-    """The differences of all sounds: later than at the first of its microphones, and how sure."""
+    """Return the differences of all sounds: later than at the first of its microphones, and how sure."""
     tables = []
     points = source.streams["/microphones"]
     places = pd.DataFrame(points["position_m"], points["landmark_id"].astype(int), ["x_m", "y_m", "z_m"])
@@ -143,7 +143,7 @@ def known_place(errors: Errors) -> dict[str, MetricValue]:
 
 
 def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
-    """The differences of every sound, and how far they are from those that were published."""
+    """Return the differences of every sound, and how far they are from those that were published."""
     delays = {name: rows["delay_s"].to_numpy() for name, rows in table.groupby("sound", sort=False)}
     found: dict[str, MetricValue] = {
         f"sound.delay_s.{name!s}": of.tolist() for name, of in delays.items()

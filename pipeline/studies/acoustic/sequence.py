@@ -65,7 +65,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
-    """How far off each estimator is at every shot of every run, NaN where it has no estimate.
+    """Return how far off each estimator is at every shot of every run, NaN where it has no estimate.
 
     `nees` is per component, of all that an estimator tells and the truth has.
     """
@@ -101,7 +101,7 @@ def shots_of(source: MemorySource) -> tuple[Floats, Any]:
 
 
 def positions(source: MemorySource, time_ns: Any) -> Floats:
-    """Where the shooter is (n, 2)."""
+    """Return where the shooter is (n, 2)."""
     truth = source.streams["/shooter/truth"]
     elapsed, known = time_ns - source.epoch_ns, truth.publish_time_ns - source.epoch_ns
     return np.stack([np.interp(elapsed, known, truth["state"][:, axis]) for axis in range(2)], axis=1)

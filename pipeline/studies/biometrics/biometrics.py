@@ -117,7 +117,7 @@ def _repeated(
 
 
 def printed_metrics() -> dict[str, float]:
-    """The paper's rates, beside ours."""
+    """Return the paper's rates, beside ours."""
     fused = {
         f"printed-{label}.rate_percent.{case}": rate
         for label, rates in PAPER_FUSED.items()

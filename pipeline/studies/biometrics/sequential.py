@@ -165,7 +165,7 @@ def wald_tests(
 def probes_of(
     way: str, drawn: Drawn, options: Options, rng: np.random.Generator
 ) -> tuple[RatioOf, RatioOf]:
-    """What gives the next probes' ratios of sequences: of persons, and of impostors."""
+    """Return what gives the next probes' ratios of sequences: of persons, and of impostors."""
     genuine = np.diag(drawn.ratios)[drawn.users]
     if way == "alike":
         some = drawn.ratios[drawn.impostors(IMPOSTORS, rng)]
@@ -226,7 +226,7 @@ def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> floa
 def watched(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """How many probes pass until the alarm, by fault and matcher; "none" is without a fault.
+    """Count how many probes pass until the alarm, by fault and matcher; "none" is without a fault.
 
     Half of the users are the reference, the others are watched.
     """
@@ -330,7 +330,7 @@ def _measure(row: Mapping[str, Any], key: str, scale: float, outcome: Outcome) -
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of a table by the names of its columns."""
+    """Return the rows of a table by the names of its columns."""
     rows: list[Any] = table.to_dict("records")
     return rows
 

@@ -19,7 +19,7 @@ class Labelled(NamedTuple):
 
 
 def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    """The ratios (n,) of probes by a matcher with a fault.
+    """Return the ratios (n,) of probes by a matcher with a fault.
 
     `steady` are the ratios of impostors and of persons before, in rising order.
     """

@@ -149,7 +149,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def recording_of(experiment: Experiment, setting: Setting) -> Path:
-    """The one folder at --data or below that has all files of the mapping."""
+    """Return the one folder at --data or below that has all files of the mapping."""
     assert setting.data is not None
     assert experiment.import_ is not None
     mapping = read_mapping(str(experiment.import_.parameters.get("mapping", "")))

@@ -65,7 +65,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def outage_of(source: MemorySource) -> Span:
-    """The outage of a drive; BadInput where it has none, or more than one."""
+    """Return the outage of a drive; BadInput where it has none, or more than one."""
     given = NavigationParameters.model_validate(source.run.parameters).gnss.outages_s
     if len(given) != 1:
         raise BadInput(
@@ -75,7 +75,7 @@ def outage_of(source: MemorySource) -> Span:
 
 
 def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
-    """How far off an estimator is (m) in every run, so many seconds after the outage began."""
+    """Return how far off an estimator is (m) in every run, so many seconds after the outage began."""
     inside = (errors.elapsed_s >= span.begin_s) & (errors.elapsed_s < span.end_s)
     plane = [errors.components.index(name) for name in ("x_m", "y_m")]
     error_m = np.linalg.norm(errors.error[inside][:, plane], axis=1)

@@ -54,7 +54,7 @@ class Window(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the window is called among the cases."""
+        """Return what the window is called among the cases."""
         return f"{self.length_s:g}s-at-{self.start_s:g}s"
 
 
@@ -104,7 +104,7 @@ def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[
 
 
 def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> MemorySource:
-    """The recording without the rows of windows, of which it tells as outages."""
+    """Return the recording without the rows of windows, of which it tells as outages."""
     gone_ns = np.concatenate([rows.time_ns[:0], *(rows.time_ns[each.rows] for each in windows)])
     streams = dict(source.streams)
     for topic in (FIX, VELOCITY):

@@ -11,7 +11,7 @@ from replay.judging.errors.evaluation import chi_square_interval
 
 
 def figures(cases: Sequence[Case], runs: int) -> dict[str, Chart]:
-    """All figures by name."""
+    """Draw all figures by name."""
     conditions = list(dict.fromkeys(case.condition for case in cases))
     by_condition = {name: [case for case in cases if case.condition == name] for name in conditions}
     first = by_condition[conditions[0]]

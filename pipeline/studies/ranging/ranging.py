@@ -61,7 +61,7 @@ def recordings(setting: Setting, pattern: str) -> list[Path]:
 
 
 def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -> Iterator[Replayed]:
-    """The recordings one by one; logs are kept of all, the timeline of the first."""
+    """Yield the recordings one by one; logs are kept of all, the timeline of the first."""
     assert experiment.import_ is not None
     delay_s, runner = setting.options.range_delay_s, Runner(experiment, setting)
     estimators = dict(experiment.estimators)
@@ -96,7 +96,7 @@ class Reference(NamedTuple):
 
 
 def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
-    """The mean NIS of single ranges within a span."""
+    """Return the mean NIS of single ranges within a span."""
     stamps = innovations.publish_time_ns
     inside = (stamps >= begin_ns) & (stamps <= end_ns)
     return float(np.mean(innovations["normalised_innovation_squared"][inside]))

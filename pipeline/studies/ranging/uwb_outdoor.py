@@ -49,7 +49,7 @@ class Place(Parameters):
     y_below_m: float | None = None
 
     def holds(self, position: Floats) -> Booleans:
-        """Which positions (n, 2) lie there."""
+        """Return which positions (n, 2) lie there."""
         above = np.array([self.x_above_m, self.y_above_m], float)
         below = np.array([self.x_below_m, self.y_below_m], float)
         outside = (position <= above) | (position > below)  # nothing is outside a limit that is none
@@ -153,7 +153,7 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
 def published_rmse(
     of: Replayed, track: str, truth: Reference, begin_ns: int, end_ns: int
 ) -> tuple[float, float]:
-    """The error in the plane, and in space, of a published track within the window."""
+    """Return the error in the plane, and in space, of a published track within the window."""
     stream = of.source.streams[f"/published/{track}"]
     inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
     error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
@@ -161,7 +161,7 @@ def published_rmse(
 
 
 def printed(folder: Path) -> dict[str, float]:
-    """The errors that a recording comes with, by their names; none without such a file."""
+    """Return the errors that a recording comes with, by their names; none without such a file."""
     path = folder / "RMSD_results.txt"
     if not path.exists():
         return {}

@@ -135,7 +135,7 @@ def _grid_errors_deg(replayed: Replayed, stated: AxisParameters, cells: int) -> 
 
 
 def error_figure(errors_deg: dict[str, dict[str, Floats]]) -> Figure:
-    """The runs' errors of every estimator, as figures 4 and 5 have them."""
+    """Draw the runs' errors of every estimator, as figures 4 and 5 have them."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     for axes, (case, found) in zip(
         figure.subplots(1, len(errors_deg), sharey=True), errors_deg.items(), strict=True

@@ -88,12 +88,12 @@ def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, f
 
 
 def draw(name: str, seed: int) -> Samples:
-    """One set in the plane."""
+    """Return one set in the plane."""
     return parse_sampling(name).at(2).draw(np.random.default_rng(seed), ())
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """How far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
+    """Return how far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
 
     The largest difference between their sorted distances from one another and from the origin, which
     no rotation changes.

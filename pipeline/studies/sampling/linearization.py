@@ -47,7 +47,7 @@ class Track(NamedTuple):
 
     @property
     def failed(self) -> int:
-        """How many runs did not reach the last step."""
+        """Count how many runs did not reach the last step."""
         return int(np.isnan(self.mean[:, -1, 0]).sum())
 
 
@@ -110,7 +110,7 @@ def rmse(difference: Floats) -> Floats:
 
 
 def error_panel(steps: pd.DataFrame, quantity: str, label: str) -> Panel:
-    """One line per estimator over the steps, averaged over the seeds."""
+    """Draw one line per estimator over the steps, averaged over the seeds."""
     mean = steps.groupby(["estimator", "step"], sort=False)[quantity].mean()
     lines = {str(name): mean[name] for name in mean.index.get_level_values("estimator").unique()}
     return Panel(

@@ -60,7 +60,7 @@ def _in_case(experiment: Experiment, case: str) -> Experiment:
 
 
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
-    """One row per estimator and step.
+    """Return one row per estimator and step.
 
     RMSE of mean and covariance against the exact moments' filter (the paper's), of the mean against
     truth, and how large the filter's own variance is beside the exact one.

@@ -248,7 +248,7 @@ def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> 
 
 
 def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Prediction:
-    """What a filter says of every hour."""
+    """Return what a filter says of every hour."""
     next_ = predicted_by(wind, run, parameters)
     variance = next_.covariance[:, 0, 0] + parameters["measurement_sigma_rad"] ** 2
     return _of_normal(wind[1:] - next_.mean[:, 0], variance)
@@ -262,7 +262,7 @@ def _of_normal(deviation: Floats, variance: Floats | float) -> Prediction:
 
 
 def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -> Prediction:
-    """The same by Bayes' rule on a grid."""
+    """Return the same by Bayes' rule on a grid."""
     measured = _measured(wind)
     prior = wrapped_normal.density(WrappedNormal(np.array([wind[0], 0.0]), _PRIOR), torus_grid(cells))
     begin = (prior / prior.sum())[None]

@@ -107,7 +107,7 @@ def _bounds(
 
 
 def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> RobotErrors:
-    """How far one robot's bearings and odometry were off, where its truth is known."""
+    """Return how far one robot's bearings and odometry were off, where its truth is known."""
     seen, truth = source.streams[f"{prefix}/range_bearing"], source.streams[f"{prefix}/truth"]
     landmarks, driven = source.streams["/landmarks"], source.streams[f"{prefix}/odometry"]
     error, look = _bearing_errors(seen, landmarks, truth, gap_limit_s)

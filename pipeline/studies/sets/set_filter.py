@@ -101,7 +101,7 @@ def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
 
 
 def compared(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of frames for which every estimator has one."""
+    """Return the rows of frames for which every estimator has one."""
     count = table.groupby(KEYS)["estimator"].transform("nunique")
     return table[count == table["estimator"].nunique()].reset_index(drop=True)
 
@@ -152,7 +152,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """How often the wrong one of a frame and the past is isolated, by the truth; by filter."""
+    """Return how often the wrong one of a frame and the past is isolated, by the truth; by filter."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())

@@ -46,7 +46,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
-    """One row per estimator, case, run and frame."""
+    """Return one row per estimator, case, run and frame."""
     parts = [
         pd.DataFrame(
             {

@@ -53,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def vessel_table(replayed: Replayed) -> pd.DataFrame:
-    """The tables of `replay.judging.tracks.tracks.track_table` of all estimators."""
+    """Return the tables of `replay.judging.tracks.tracks.track_table` of all estimators."""
     tables = [
         table.assign(estimator=each.estimator)
         for each in replayed.judged

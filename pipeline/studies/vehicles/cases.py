@@ -57,7 +57,7 @@ class Scores(NamedTuple):
     failed: int
 
     def of_first(self, runs: int) -> "Scores":
-        """The scores of the first runs."""
+        """Return the scores of the first runs."""
         by_step = (self.fixed_by_step, self.assigned_by_step, self.gospa_by_step)
         return _scores(*(part[:runs] for part in by_step))
 
@@ -72,14 +72,14 @@ class Case(NamedTuple):
 
     @property
     def parameters(self) -> VehiclesParameters:
-        """What was recorded."""
+        """Return what was recorded."""
         stated = self.sources[0].run
         assert stated is not None
         return VehiclesParameters.model_validate(stated.parameters)
 
     @property
     def has_losses(self) -> bool:
-        """Whether detections are missed or false."""
+        """Tell whether detections are missed or false."""
         network = self.parameters.network
         return network.detection_probability < 1.0 or network.clutter_per_scan > 0.0
 
@@ -145,7 +145,7 @@ def scores_of(
     labels: Iterable[str],
     sets: Sequence[SetErrors] = (),
 ) -> dict[str, Scores]:
-    """The scores of all estimators of the runs; those of sets by the network's fixes."""
+    """Return the scores of all estimators of the runs; those of sets by the network's fixes."""
     times_ns, truths = truths_of(sources)
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
     return {
@@ -159,7 +159,7 @@ def scores_of(
 def bytes_per_step(
     sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, float]:
-    """What the members of the network send per scan of the network, on average, by estimator.
+    """Return what the members of the network send per scan of the network, on average, by estimator.
 
     Fixes with identity where the association must be known, without else; of the infrastructure
     sensor nothing, its one number, or its detections.

@@ -48,7 +48,7 @@ class Clocks:
             )
 
     def notes(self) -> dict[str, str]:
-        """Both clocks and their offset, in words."""
+        """Return both clocks and their offset, in words."""
         found = {}
         for name, spans in (("header", self.header), ("bag", self.bag)):
             if spans:

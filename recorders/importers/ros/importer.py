@@ -54,12 +54,12 @@ class _Import:
     # What is read.
 
     def is_wanted(self, connection: Connection) -> bool:
-        """Whether the messages of a connection are read."""
+        """Tell whether the messages of a connection are read."""
         return connection in self._readers
 
     @property
     def is_full(self) -> bool:
-        """Whether what waits is enough for a block."""
+        """Tell whether what waits is enough for a block."""
         return self._waiting_messages >= _BLOCK_MESSAGES or self._waiting_bytes >= _BLOCK_BYTES
 
     def add(self, batch: Batch) -> None:
@@ -75,7 +75,7 @@ class _Import:
         self._waiting_messages += len(batch.begins)
 
     def block(self, *, is_last: bool = False) -> list[Stream]:
-        """The streams of all that waits."""
+        """Return the streams of all that waits."""
         for (connection, _), pending in self._pending.items():
             rows, log_time_ns = np.concatenate(pending.rows), np.concatenate(pending.log_time_ns)
             for found in self._readers[connection].type.read(np.concatenate(pending.raw), rows):
@@ -176,7 +176,7 @@ class _Import:
 
     @property
     def first_ns(self) -> int:
-        """The first publish time; zero where there is none."""
+        """Return the first publish time; zero where there is none."""
         return self._streams.first_ns or 0
 
     def check(self) -> None:
@@ -188,7 +188,7 @@ class _Import:
             raise BadInput(f"{self.path}: none of its topics could be imported: {facts}")
 
     def notes(self) -> dict[str, str]:
-        """What the bag had, by subject."""
+        """Return what the bag had, by subject."""
         notes = self._clocks.notes()
         counts: Counter[str] = Counter()
         types = {}

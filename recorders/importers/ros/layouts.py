@@ -114,7 +114,7 @@ class Messages:
         return column[:, 0] if count is None else column
 
     def text(self, path: str) -> NDArray[np.bytes_]:
-        """A text (n,), as bytes; raises KeyError where there is none."""
+        """Return a text (n,), as bytes; raises KeyError where there is none."""
         offset, length = self.layout.texts[path]
         if not length:
             return np.zeros(len(self), "S1")
@@ -199,7 +199,7 @@ class _Walk:
         self._fix(0, 2 if self._is_cdr else 0)
 
     def layout(self, name: str) -> Layout:
-        """The layout; raises Undecodable where the message does not fit its definition."""
+        """Return the layout; raises Undecodable where the message does not fit its definition."""
         self._walk("", (Nodetype.NAME, name))
         behind = len(self._raw) - self._position
         if not 0 <= behind < (4 if self._is_cdr else 1):

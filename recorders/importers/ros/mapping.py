@@ -52,7 +52,7 @@ class Mapping(Parameters):
 
 
 def read_mapping(path: Path) -> dict[str, MessageMapping]:
-    """A file of mappings; raises BadInput where it is none, or names what fuselog has not."""
+    """Return a file of mappings; raises BadInput where it is none, or names what fuselog has not."""
     found = build(Mapping, read_toml(path), str(path)).messages
     for name, mapping in found.items():
         schema_of(mapping, f"{path}: the mapping of {name}")

@@ -97,7 +97,7 @@ class StreamMaker:
                 self._put(name or self._name(sent.topic, part.kind, frame), sent, part, rows, frame)
 
     def block(self) -> list[Stream]:
-        """The streams of all that waits."""
+        """Return the streams of all that waits."""
         return [
             self._stream(topic, written) for topic, written in self._written.items() if written.pieces
         ]

@@ -28,7 +28,7 @@ def blocks_of(file: BinaryIO) -> Iterator[bytes]:
 
 
 def lines_of(file: BinaryIO) -> Iterator[bytes]:
-    """The lines one by one; raises ValueError where one is longer than a block."""
+    """Yield the lines one by one; raises ValueError where one is longer than a block."""
     while line := file.readline(BLOCK_BYTES + 1):
         if len(line) > BLOCK_BYTES:
             raise ValueError(f"it has a line of more than {BLOCK_BYTES >> 20} MB")

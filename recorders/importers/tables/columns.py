@@ -47,7 +47,7 @@ def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
 
 
 def take_axes(columns: list[GuessedColumn], *stems: str, axes: str = "xyz") -> list[GuessedColumn]:
-    """The columns of the axes of a vector whose name is one of some."""
+    """Return the columns of the axes of a vector whose name is one of some."""
     for stem in stems:
         before = f"(.*_)?{stem}_?" if stem else ""
         if found := take(columns, *(before + axis for axis in axes)):
@@ -56,14 +56,14 @@ def take_axes(columns: list[GuessedColumn], *stems: str, axes: str = "xyz") -> l
 
 
 def stated_unit(column: GuessedColumn, usual: str) -> str:
-    """The unit that a column's name states, if it is one of the usual one's kind."""
+    """Return the unit that a column's name states, if it is one of the usual one's kind."""
     return column.unit if column.unit and unit(column.unit).powers == unit(usual).powers else ""
 
 
 def unit_by_size(
     columns: Sequence[GuessedColumn], sizes: Mapping[str, tuple[float, float]]
 ) -> tuple[str, str]:
-    """The unit in which a vector's length is as it must be, else the first; and the reason."""
+    """Return the unit in which a vector's length is as it must be, else the first; and the reason."""
     usual = next(iter(sizes))
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
@@ -80,7 +80,7 @@ def length_of(columns: Sequence[GuessedColumn]) -> float:
 
 
 def unit_by_largest(column: GuessedColumn, usual: str, other: str, limit: float) -> tuple[str, str]:
-    """The unit of a column: the other one if its numbers go beyond a limit; and the reason."""
+    """Return the unit of a column: the other one if its numbers go beyond a limit; and the reason."""
     if stated := stated_unit(column, usual):
         return stated, "as its name says"
     largest = largest_of([column])
@@ -139,7 +139,7 @@ def _is_unit(text: str) -> bool:
 
 
 def underlined(name: str) -> str:
-    """A name in lower case, its English words with underlines between them."""
+    """Return a name in lower case, its English words with underlines between them."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower().translate(_UMLAUTS)).strip("_")
     return "_".join(_WORDS.get(word, word) for word in plain.split("_"))
 

@@ -68,7 +68,7 @@ class Table:
         raise BadInput(f"{self.path}: has no column '{name}'; {choices(name, self.columns)}")
 
     def batches(self, numbers: Collection[str], texts: Collection[str] = ()) -> Iterator[Batch]:
-        """The rows with these columns, block by block.
+        """Yield the rows with these columns, block by block.
 
         Empty cells are null. Raises BadInput where the file is damaged, or a cell of `numbers` is none.
         """

@@ -48,7 +48,7 @@ _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|op
 
 
 def guess(paths: Sequence[Path]) -> str:
-    """A mapping of tables, in TOML; raises BadInput where a file is no table."""
+    """Return a mapping of tables, in TOML; raises BadInput where a file is no table."""
     files = []
     for path in paths:
         if not path.exists():

@@ -175,7 +175,7 @@ class ConstantStream(Parameters):
 
     @property
     def mapping(self) -> StreamMapping:
-        """The same in the language of streams: one row, and messages for each of these."""
+        """Return the same in the language of streams: one row, and messages for each of these."""
         rows = [dict(row) for row in self.rows]
         return StreamMapping(
             becomes=self.becomes, each=rows, components=self.components, kinds=self.kinds
@@ -204,7 +204,7 @@ class LogMapping(Parameters):
 
 
 def shipped() -> list[str]:
-    """The names of the mappings that ship."""
+    """Return the names of the mappings that ship."""
     return sorted(
         each.name.removesuffix(".toml") for each in _SHIPPED.iterdir() if each.name.endswith(".toml")
     )
@@ -236,7 +236,7 @@ def adapted(
     mounting_deg: tuple[float, float, float] | None = None,
     delays_s: Mapping[str, float] | None = None,
 ) -> LogMapping:
-    """The mapping with another mounting, of all streams that it turns, and other delays by topic.
+    """Return the mapping with another mounting, of all streams that it turns, and other delays by topic.
 
     Raises BadInput where it turns none, or has no such topic.
     """

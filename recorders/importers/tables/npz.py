@@ -33,7 +33,7 @@ class _Array(NamedTuple):
 
     @property
     def width(self) -> int:
-        """How many columns it is."""
+        """Count how many columns it is."""
         return self.shape[1] if len(self.shape) == 2 else 1
 
 
@@ -52,7 +52,7 @@ class Columns(NamedTuple):
 
 
 def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
-    """The arrays as columns; those with a second axis are NAME.0, NAME.1, ...
+    """Return the arrays as columns; those with a second axis are NAME.0, NAME.1, ...
 
     Raises BadInput where they are not of one length, and ValueError where the archive is damaged, or has
     more columns or larger values than can be read.

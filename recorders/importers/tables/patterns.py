@@ -10,7 +10,7 @@ _WILD = re.compile(r"(\{\w+\}|\*|\?)")
 
 
 def names_in(pattern: str) -> list[str]:
-    """The names in braces."""
+    """Return the names in braces."""
     return [part[1:-1] for part in _WILD.split(pattern)[1::2] if part not in "*?"]
 
 

@@ -89,7 +89,7 @@ class TimeMapping(Parameters):
 
     @property
     def columns(self) -> list[str]:
-        """All columns that are read, in order."""
+        """Return all columns that are read, in order."""
         texts = [self.column] if isinstance(self.column, str) else self.column
         return [*texts, *([self.week] if self.week else [])]
 
@@ -101,7 +101,7 @@ class TimeMapping(Parameters):
 
 
 def offset_of(zone: str) -> float | ZoneInfo:
-    """How many hours a zone is ahead of UTC, or its rules where these are not always the same.
+    """Return how many hours a zone is ahead of UTC, or its rules where these are not always the same.
 
     Raises ValueError where there is no such zone.
     """
@@ -116,7 +116,7 @@ def offset_of(zone: str) -> float | ZoneInfo:
 
 
 def formats_of(cell: str) -> Iterator[str]:
-    """The formats that a date or time of day as text may have, the likeliest first.
+    """Yield the formats that a date or time of day as text may have, the likeliest first.
 
     >>> list(formats_of("05.10.2026 14:03:07,25"))
     ['%d.%m.%Y %H:%M:%S,%f']
@@ -154,7 +154,7 @@ def _date_ns(text: str) -> int:
 def stamps_ns(
     mapping: TimeMapping, columns: Mapping[str, pa.Array], first_row: int, size: int, where: str
 ) -> Stamps:
-    """The stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
+    """Return the stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
 
     `first_row` is the number of rows before these. Raises BadInput, which begins with `where`, where a
     cell holds no time, or one beyond what a log can hold.
@@ -271,14 +271,14 @@ class Counter(NamedTuple):
     cut_ns: int
 
     def stamps_ns(self, ticks_ns: Stamps) -> Stamps:
-        """The stamps (n,) of readings; one of a line that was cut off has none."""
+        """Return the stamps (n,) of readings; one of a line that was cut off has none."""
         since = np.rint((ticks_ns - self.first_ns) * self.rate).astype(np.int64)
         none = (ticks_ns < self.first_ns) | (ticks_ns == self.cut_ns)
         return np.where(none, NOT_A_TIME, self.start_ns + since)
 
 
 def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
-    """The counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
+    """Return the counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
 
     A tag has from byte 64 on a time_t and a fraction of a second, when the file was begun, and from byte
     76 on pairs of 4 bytes: ms since then, and how long the file was. `ticks_ns` are all readings.

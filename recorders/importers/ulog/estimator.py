@@ -130,7 +130,7 @@ class _Table(NamedTuple):
 
 
 def label_of(instance: int) -> str:
-    """What an instance of the filter is called as an estimator."""
+    """Return what an instance of the filter is called as an estimator."""
     return f"ekf2_{instance}" if instance else "ekf2"
 
 
@@ -151,7 +151,7 @@ class Autopilot:
         self._status: dict[int, _Table] = {}
 
     def parts(self, rows: list[Rows]) -> Iterator[Part]:
-        """The parts of a block's rows; what lacks its counterpart waits for the next block."""
+        """Yield the parts of a block's rows; what lacks its counterpart waits for the next block."""
         for each in rows:
             fields = Fields(each)
             if fields.has("control_mode_flags"):

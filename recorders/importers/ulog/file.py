@@ -96,7 +96,7 @@ class UlogFile:
             raise BadInput(f"{path}: cannot be read ({error.strerror}); give a .ulg file") from error
 
     def blocks(self, is_wanted: Callable[[str], bool]) -> Iterator[list[Rows]]:
-        """The rows of the topics that are wanted, a block for some megabytes of the file."""
+        """Yield the rows of the topics that are wanted, a block for some megabytes of the file."""
         ends = sorted({each for each in self._appended if self._begins <= each < self._size})
         if len(ends) < len(self._appended):
             self.losses["appended section that lies outside of the file"] += 1

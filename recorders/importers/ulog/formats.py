@@ -40,7 +40,7 @@ class Layout(NamedTuple):
 
 
 def parsed(text: str) -> tuple[str, list[FormatField]]:
-    """The name and the fields of a format; raises Damaged."""
+    """Return the name and the fields of a format; raises Damaged."""
     name, colon, rest = text.partition(":")
     if not colon or not name:
         raise Damaged("a format has no name")

@@ -63,7 +63,7 @@ class _Import:
         self._first_ns: int | None = None
 
     def block(self, rows: list) -> list[Stream]:
-        """The streams of a block's rows."""
+        """Return the streams of a block's rows."""
         parts: list[Part] = []
         for each in rows:
             if each.untimed:
@@ -102,7 +102,7 @@ class _Import:
         return in_plane(stream, self._origin)
 
     def last(self) -> list[Stream]:
-        """The streams that are whole only at the end: parameters, and what the logger lost."""
+        """Return the streams that are whole only at the end: parameters, and what the logger lost."""
         file = self._file
         streams = []
         if file.parameters:
@@ -139,7 +139,7 @@ class _Import:
 
     @property
     def epoch_ns(self) -> int:
-        """The first stamp."""
+        """Return the first stamp."""
         return self._first_ns or 0
 
     def check(self) -> None:
@@ -152,7 +152,7 @@ class _Import:
             )
 
     def notes(self) -> dict[str, str]:
-        """What the file had, by subject."""
+        """Return what the file had, by subject."""
         file = self._file
         notes = {
             "frames": "north, east, down became east, north, up; forward, right, down became forward, "

@@ -164,7 +164,7 @@ def _stated_size(region: bytes) -> int:
 
 
 def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
-    """The small records in `data`, those of other kinds left out.
+    """Yield the small records in `data`, those of other kinds left out.
 
     Raises Damaged where one is not whole or cannot be understood.
     """

@@ -89,7 +89,7 @@ class _Place(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Where the next one starts."""
+        """Return where the next one starts."""
         return self.offset + self.length
 
 
@@ -107,7 +107,7 @@ class _Index(NamedTuple):
     message_counts: Counter[int]
 
     def chunk(self, place: _Place) -> records.ChunkIndex | None:
-        """The entry of the chunk that stands there, where an index has it right and not empty."""
+        """Return the entry of the chunk that stands there, where an index has it right and not empty."""
         entry = self.chunks.get(place.offset)
         if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
             return None
@@ -134,7 +134,7 @@ def open_container(path: Path, *, use_index: bool = True) -> Container:
 
 
 def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
-    """The `length` bytes of `file` from `offset` on, which were there when it was opened."""
+    """Return the `length` bytes of `file` from `offset` on, which were there when it was opened."""
     file.seek(offset)
     found = file.read(length)
     if len(found) < length:

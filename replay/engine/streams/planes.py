@@ -56,7 +56,7 @@ class Movement(NamedTuple):
 
 
 def between(origin: Origin, other: Origin) -> Movement:
-    """The transform from the plane of an origin into that of another one."""
+    """Return the transform from the plane of an origin into that of another one."""
     axes, others = (tangent_axes(*each[:2]) for each in (origin, other))
     return Movement(others @ axes.T, np.array(into_tangent_plane(origin, other), float))
 
@@ -92,7 +92,7 @@ def moved_states(
 
 
 def into_plane_of(stream: Stream, origin: Origin) -> Stream:
-    """A stream that states the origin of its plane, in the plane of another one.
+    """Return a stream that states the origin of its plane, in the plane of another one.
 
     Latitudes and longitudes stay: what is stated of them is the plane that they are taken into. Raises
     BadInput where it is not known how such messages are taken into another plane.

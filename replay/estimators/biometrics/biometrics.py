@@ -128,7 +128,7 @@ def learn_classifier(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """A classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
+    """Return a classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
 
     QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
     """

@@ -72,7 +72,7 @@ RULES: dict[str, Callable[..., Floats]] = {
 
 
 def all_pairs(users: int) -> Pairs:
-    """Every probe with every gallery entry."""
+    """Return every probe with every gallery entry."""
     return Pairs(np.repeat(np.arange(users), users), np.tile(np.arange(users), users))
 
 
@@ -90,7 +90,7 @@ def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
 
 
 def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
-    """The fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
+    """Return the fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
     if users < 2 * folds:
         fewer = f", or at most {users // 2} folds" if users >= 4 else ""
         raise BadInput(

@@ -93,7 +93,7 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
 def run_bingham_filter(
     noise: BinghamNoise, state: Bingham, steps: Steps, rotations: Floats | None = None
 ) -> tuple[Bingham, Bingham]:
-    """The recursive Bingham filter: algorithms 1 and 2.
+    """Run the recursive Bingham filter: algorithms 1 and 2.
 
     Args:
         noise: see there.

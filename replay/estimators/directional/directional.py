@@ -150,7 +150,7 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
 
 
 def as_bingham(noise: DirectionalNoise) -> Bingham:
-    """The Bingham distribution, or that with the second moment of the projected Gaussian."""
+    """Return the Bingham distribution, or that with the second moment of the projected Gaussian."""
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
         return make_bingham(np.eye(d), noise.diagonal)
@@ -161,7 +161,7 @@ def as_bingham(noise: DirectionalNoise) -> Bingham:
 
 
 def as_covariance(noise: DirectionalNoise) -> Floats:
-    """The Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
+    """Return the Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)
     return bingham.hemisphere_covariance(as_bingham(noise))
@@ -205,7 +205,7 @@ def _widened(state: Any, runs: int) -> Any:
 
 
 def heading_model(given: Given[Any], topic: str = "headings") -> HeadingModel:
-    """The model that parameters and channel state."""
+    """Return the model that parameters and channel state."""
     stated = {name: given.stated(topic, name) for name in HeadingsFilterParameters.model_fields}
     system, measurement = (
         equal_sigmas(stated[f"{which}_sigma_rad"], stated[f"{which}_correlation"])

@@ -69,7 +69,7 @@ class Detections(NamedTuple):
     position_m: Floats
 
     def take(self, rows: NDArray[np.intp]) -> "Detections":
-        """The runs `rows`."""
+        """Return the runs `rows`."""
         return Detections(*(column[rows] for column in self))
 
 

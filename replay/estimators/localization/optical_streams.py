@@ -83,7 +83,7 @@ def _find(
 
 
 def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
-    """The known biases (sensors, 3) in rad, NaN where wanted."""
+    """Return the known biases (sensors, 3) in rad, NaN where wanted."""
     if not isinstance(parameters, BiasesParameters):
         return np.zeros((len(sensors), 3))
     names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]

@@ -77,7 +77,7 @@ class LocalizationParameters(DeadReckoningParameters):
 
 
 def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:
-    """The pose at the end of an arc."""
+    """Return the pose at the end of an arc."""
     forward, turn = velocity
     true = (
         parameters.forward_scale * forward,
@@ -134,7 +134,7 @@ def bearing_noise(parameters: Any) -> Components:
 
 
 def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
-    """Where the antenna is."""
+    """Return where the antenna is."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     forward, left = parameters.lever_x_m, parameters.lever_y_m
     return pose[0] + cosine * forward - sine * left, pose[1] + sine * forward + cosine * left
@@ -189,7 +189,7 @@ def read_heading_covariance(stream: Stream) -> Floats:
 def align(
     path: Floats, places: Floats, covariances: Floats, span_s: float, parameters: Any
 ) -> tuple[Floats, Floats] | None:
-    """The pose at the last of some fixes: the path, turned and shifted to them by least squares.
+    """Return the pose at the last of some fixes: the path, turned and shifted to them by least squares.
 
     To the covariance of the solution is added what the odometry errs by: the mean of a random walk over
     a span, seen from its end, has a third of the variance that it has grown to. None while the heading

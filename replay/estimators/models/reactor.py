@@ -37,7 +37,7 @@ def move(pressures: Components, control: Any, duration_s: Any, parameters: Any) 
 
 
 def process_noise(pressures: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variance of each pressure's noise in a step."""
+    """Return the variance of each pressure's noise in a step."""
     return parameters.process_variance, parameters.process_variance
 
 

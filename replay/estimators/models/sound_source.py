@@ -71,7 +71,7 @@ def read_variances(stream: Stream) -> Floats:
 
 
 def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """The place that fits the differences of the first stamp best, sought from all sides.
+    """Return the place that fits the differences of the first stamp best, sought from all sides.
 
     Raises BadInput where they are fewer than the coordinates that they have to tell.
     """

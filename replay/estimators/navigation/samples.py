@@ -36,7 +36,7 @@ class GnssMotion(NamedTuple):
     covariance: Floats
 
     def first_above(self, row: int, limit_mps: float) -> int | None:
-        """The first row from this one on with a greater horizontal speed."""
+        """Return the first row from this one on with a greater horizontal speed."""
         faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
         return row + int(faster[0]) if len(faster) else None
 
@@ -48,7 +48,7 @@ def mounted(sample: Any, parameters: Any) -> Any:
 
 
 def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
-    """The finite samples at the times at which they were measured."""
+    """Return the finite samples at the times at which they were measured."""
     columns = [
         np.stack(mounted(inertial[name].T, parameters), axis=1)
         for name in ("specific_force_mps2", "turn_rate_radps")
@@ -68,7 +68,7 @@ def stated_or(sigma: float | None, otherwise: Any) -> Any:
 
 
 def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | None:
-    """The velocities that are finite; None where there are none."""
+    """Return the velocities that are finite; None where there are none."""
     stream = streams.get("velocity")
     if stream is None:
         return None

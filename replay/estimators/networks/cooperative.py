@@ -120,7 +120,7 @@ Cooperating = Given[CooperativeParameters]
 
 
 def start(given: Cooperating) -> tuple[Cooperating, CooperativeState]:
-    """All robots at their priors, and the maps.
+    """Return all robots at their priors, and the maps.
 
     A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
     that is so for all, or the map is not planar.

@@ -220,7 +220,7 @@ def fuse_together(
 
 
 def rule_number(name: str) -> int:
-    """The number of a rule of RULES; raises BadInput for another name."""
+    """Return the number of a rule of RULES; raises BadInput for another name."""
     if name not in RULES:
         raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
     return RULES.index(name)

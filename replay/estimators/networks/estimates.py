@@ -74,7 +74,7 @@ def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats)
 
 
 def determinant(matrix: Floats) -> float:
-    """The determinant of a matrix that is positive definite, else 0."""
+    """Return the determinant of a matrix that is positive definite, else 0."""
     size = len(matrix)
     factor = np.zeros((size, size))
     if not cholesky(factor, matrix, size):

@@ -299,7 +299,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: NetworkParameters) ->
 
 
 def state_of(prior: Topic) -> list[str]:
-    """A prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
+    """Return a prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
 
     Raises BadInput where they are not these.
     """

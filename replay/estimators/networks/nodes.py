@@ -195,7 +195,7 @@ def observe_all(
 
 
 def squared_distance(difference: Floats, covariance: Floats) -> float:
-    """The squared Mahalanobis distance; infinity where the covariance is singular."""
+    """Return the squared Mahalanobis distance; infinity where the covariance is singular."""
     information = np.empty_like(covariance)
     if not inverted(covariance, information):
         return np.inf
@@ -207,7 +207,7 @@ def squared_distance(difference: Floats, covariance: Floats) -> float:
 
 
 def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
-    """The Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
+    """Return the Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
     size = len(mean)
     information, difference = np.empty_like(covariance), np.empty(size)
     if not inverted(of_covariance, information):

@@ -176,12 +176,12 @@ def follow_mahony(
 
 
 def unit_vectors(value: Floats) -> Any:
-    """The directions of force and field, and the turn rate between them."""
+    """Return the directions of force and field, and the turn rate between them."""
     return unit(value[:3]), (value[3], value[4], value[5]), unit(value[6:])
 
 
 def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
-    """The orientation so far; of the first sample that of its force and field."""
+    """Return the orientation so far; of the first sample that of its force and field."""
     q = state.orientation[run]
     if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
         q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])
@@ -208,7 +208,7 @@ def keep(
 
 
 def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
-    """The library's estimate of every sample; samples are taken to be evenly spaced.
+    """Return the library's estimate of every sample; samples are taken to be evenly spaced.
 
     Raises BadInput where the library is not installed.
     """

@@ -53,7 +53,7 @@ class InertialParameters(Parameters):
 
     @property
     def model(self) -> InertialModel:
-        """The same in radians."""
+        """Return the same in radians."""
         return InertialModel(
             rest_s=self.rest_s,
             block_s=self.block_s,
@@ -93,7 +93,7 @@ def of_inertial_samples(
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
 ) -> Estimator[Any]:
-    """An estimator of orientation from nine-axis samples; see `recursive`."""
+    """Return an estimator of orientation from nine-axis samples; see `recursive`."""
     return recursive(
         summary,
         parameters=parameters,

@@ -138,7 +138,7 @@ class Anchor:
 
 
 def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
-    """The motion between two stamps (2,) by the poses (2, 3) that odometry has there."""
+    """Return the motion between two stamps (2,) by the poses (2, 3) that odometry has there."""
     span_s = float(time_ns[1] - time_ns[0]) * 1e-9
     *displacement, turn = relative_pose(*poses)
     return Motion(
@@ -149,7 +149,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 def narrowed(
     headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
-    """The headings from which landmarks are seen as they were; None where there are none."""
+    """Return the headings from which landmarks are seen as they were; None where there are none."""
     left: Headings | None = headings
     for place, bearing in zip(*seen, strict=True):
         if left is not None:
@@ -165,7 +165,7 @@ def follow(
     bounds: Bounds,
     parameters: SetFilterParameters,
 ) -> list[SetStep]:
-    """The estimates of one run, from its first frame with a set on."""
+    """Return the estimates of one run, from its first frame with a set on."""
     anchor: Anchor | None = None
     steps = []
     for frame, seen in found:
@@ -261,7 +261,7 @@ def _area(parts: Sequence[shapely.Geometry]) -> float:
 
 
 def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
-    """A set at every frame of every run; see `replay.engine.api.functions.batch`."""
+    """Return a set at every frame of every run; see `replay.engine.api.functions.batch`."""
     known, bounds = given.setup
     stated = map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad))
     metadata = {

@@ -85,7 +85,7 @@ Filtering = Given[PhdParameters]
 
 
 def start(given: Filtering) -> tuple[Filtering, Mixture]:
-    """A component of weight 1 at each prior; without one nothing is known yet.
+    """Return a component of weight 1 at each prior; without one nothing is known yet.
 
     Raises BadInput where there is no room for all.
     """
@@ -118,7 +118,7 @@ def no_components(runs: int, most: int) -> Mixture:
 
 
 def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[Mixture, Sets]:
-    """The mixtures after the scans, and the sets that each scan leads to."""
+    """Return the mixtures after the scans, and the sets that each scan leads to."""
     columns: Any = before
     mixture = Mixture(*(column.copy() for column in columns))
     runs, most = mixture.weight.shape

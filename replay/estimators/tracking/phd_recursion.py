@@ -210,7 +210,7 @@ def update(
 
 
 def squared_distance(work: PhdMemory, member: int, other: int) -> float:
-    """The Mahalanobis distance, squared, of two means by the member's covariance."""
+    """Return the Mahalanobis distance, squared, of two means by the member's covariance."""
     squared = 0.0
     for row in range(STATES):
         value = work.mean[member, row] - work.mean[other, row]

@@ -114,7 +114,7 @@ def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, lis
 
 
 def covariances(spread: Floats) -> Floats:
-    """The covariances (n, 4, 4) of spreads (n, 3)."""
+    """Return the covariances (n, 4, 4) of spreads (n, 3)."""
     found = np.zeros((len(spread), 4, 4))
     for axis in (0, 2):
         found[:, axis, axis] = spread[:, 0]
@@ -181,7 +181,7 @@ def _memory(reports: int, places: int) -> ReportMemory:
 
 
 def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
-    """The parameters as the kernel has them; births per m^2 and s.
+    """Return the parameters as the kernel has them; births per m^2 and s.
 
     Raises BadInput where the last level is not the widest: gates are made with that.
     """

@@ -43,7 +43,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Sequence[Any]) -> Errors:
-    """The errors that settings give their sensors a sigma for."""
+    """Return the errors that settings give their sensors a sigma for."""
     names: list[str] = []
     sigmas, times, shared = [], [], 0
     places = [{f"{sort}_at_{i}": -1.0 for sort in BY_SORT for i in range(2)} for _ in sensors]

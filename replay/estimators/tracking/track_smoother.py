@@ -21,7 +21,7 @@ class TrackSmootherState(NamedTuple):
 
 
 def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
-    """The tracker, which keeps what it says until the end and says its tracks smoothed.
+    """Return the tracker, which keeps what it says until the end and says its tracks smoothed.
 
     Raises BadInput where the motion of its targets is not linear, or they have several.
     """

@@ -70,7 +70,7 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
 
 def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """The most probable map of every run, vehicles taken as independent (Hungarian method)."""
+    """Return the most probable map of every run, vehicles taken as independent (Hungarian method)."""
     runs, vehicles, detections = log_likelihood.shape
     gain = log_likelihood + scanning.log_odds_of_detection
     chosen = np.full((runs, vehicles), MISSED)
@@ -94,7 +94,7 @@ def _assigned(gain: Floats) -> Integers:
 
 
 def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """All maps of every run inside the gates, but for those of next to no weight.
+    """Return all maps of every run inside the gates, but for those of next to no weight.
 
     Where a scan is whole and clean, no vehicle is missed, unless nothing is left for it.
     """

@@ -74,7 +74,7 @@ def bounds(
 
 
 def exact_total_error(vehicles: int, fix_variance_m2: float, steps: int, *, stochastic: bool) -> float:
-    """The Kalman filter's root of the expected squared total error over so many steps, in m."""
+    """Return the Kalman filter's root of the expected squared total error over so many steps, in m."""
     axis = follow_axis(fix_variance_m2, steps=steps)
     squared = axis.stochastic if stochastic else axis.deterministic
     return float(np.sqrt(2 * vehicles * squared.mean()))

@@ -100,7 +100,7 @@ class Method(NamedTuple):
 
 
 def parse_method(method: str, seed: int) -> Method:
-    """A method from its name; raises BadInput for another."""
+    """Return a method from its name; raises BadInput for another."""
     found = re.fullmatch(r"([a-z]+)-([1-9]\d*)(-topology)?", method)
     if found is None or found[1] not in KINDS:
         known = ", ".join(f"{kind}-1000" for kind in KINDS)

@@ -94,7 +94,7 @@ def split_method(method: str) -> tuple[str, str]:
 
 
 def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
-    """The joint states with those of some rows changed."""
+    """Return the joint states with those of some rows changed."""
     if len(rows) == len(joint.mean):
         return changed
     mean, covariance = joint.mean.copy(), joint.covariance.copy()
@@ -103,7 +103,7 @@ def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
 
 
 def where(chosen: Booleans, joint: Joint, change: Callable[[Joint], Joint]) -> Joint:
-    """The joint states, changed where chosen."""
+    """Return the joint states, changed where chosen."""
     rows = np.flatnonzero(chosen)
     return put(joint, rows, change(joint.of(rows))) if len(rows) else joint
 

@@ -29,7 +29,7 @@ class Joint(NamedTuple):
     covariance: Floats
 
     def of(self, rows: Integers) -> "Joint":
-        """Some of the runs."""
+        """Return some of the runs."""
         return Joint(self.mean[rows], self.covariance[rows])
 
 
@@ -46,7 +46,7 @@ class Motion(NamedTuple):
 
 
 def positions(motion: Motion, mean: Floats) -> Floats:
-    """The vehicles' positions (runs, vehicles, 2) in means (runs, n)."""
+    """Return the vehicles' positions (runs, vehicles, 2) in means (runs, n)."""
     count = motion.vehicles
     return mean[:, : STATES * count].reshape(-1, count, STATES)[..., 0::2]
 
@@ -60,7 +60,7 @@ def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) ->
 
 
 def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
-    """The joint state after `duration_s`: coordinated turns and white accelerations."""
+    """Return the joint state after `duration_s`: coordinated turns and white accelerations."""
     states = joint.mean.shape[1]
     transition, noise = np.eye(states), np.zeros((states, states))
     for vehicle in range(motion.vehicles):
@@ -127,7 +127,7 @@ class Weighed(NamedTuple):
 def weigh(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Weighed:
-    """The likelihood of every hypothesis, by all vehicles together.
+    """Return the likelihood of every hypothesis, by all vehicles together.
 
     Args:
         joint: before the measurement.
@@ -152,7 +152,7 @@ def weigh(
 def collapse(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Joint:
-    """The Gaussian with the moments of the mixture over all associations of an unordered set.
+    """Return the Gaussian with the moments of the mixture over all associations of an unordered set.
 
     Exact weights: those of all maps of a set without loss are the terms of a permanent, so that this
     is what an exact symmetric measurement equation filter collapses to. Args as for `weigh`.
@@ -197,7 +197,7 @@ def normalised(score: Floats, run: Integers) -> Floats:
 
 
 def spread_of(places: Floats) -> Floats:
-    """The sum of squared distances from the mean, (...,), of places (..., vehicles, 2)."""
+    """Return the sum of squared distances from the mean, (...,), of places (..., vehicles, 2)."""
     return np.sum((places - places.mean(axis=-2, keepdims=True)) ** 2, axis=(-2, -1))
 
 
@@ -227,7 +227,7 @@ class Scalar(NamedTuple):
 
 
 def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
-    """The topology of scans (runs, vehicles, 2), whatever their frame and order.
+    """Return the topology of scans (runs, vehicles, 2), whatever their frame and order.
 
     The innovation is NaN where it is too improbable: something was missed and something else taken for
     a vehicle.

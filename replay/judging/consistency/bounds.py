@@ -123,7 +123,7 @@ class Bounds:
 
     @property
     def complaint(self) -> str:
-        """Why there is no mean over the ensemble; empty where there is."""
+        """Say why there is no mean over the ensemble; empty where there is."""
         if self.reason or self.sums is None:
             return self.reason
         if self.sums.width > 1:

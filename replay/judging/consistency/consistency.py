@@ -13,7 +13,7 @@ CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is w
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:
-    """Each component's own normalized squared error, (..., n)."""
+    """Return each component's own normalized squared error, (..., n)."""
     return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)
 
 

@@ -67,7 +67,7 @@ def fused_of(stream: Stream) -> Fused:
 
 
 def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None) -> Roc:
-    """The rates at every distinct score; `weight` (n,) counts comparisons more than once."""
+    """Return the rates at every distinct score; `weight` (n,) counts comparisons more than once."""
     order = np.argsort(-score, kind="stable")
     falling = score[order]
     counts = np.ones(len(score)) if weight is None else weight[order]
@@ -78,13 +78,13 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
 
 
 def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
-    """The greatest genuine accept rate whose false accept rate is not above that given."""
+    """Return the greatest genuine accept rate whose false accept rate is not above that given."""
     last = np.searchsorted(curve.false_accept, false_accept, side="right") - 1
     return curve.genuine_accept[last]
 
 
 def equal_error_rate(curve: Roc) -> float:
-    """The mean of false accepts and false rejects where they are closest: scores may be tied."""
+    """Return the mean of false accepts and false rejects where they are closest: scores may be tied."""
     reject = 1 - curve.genuine_accept
     closest = int(np.argmin(np.abs(curve.false_accept - reject)))
     return float(curve.false_accept[closest] + reject[closest]) / 2

@@ -35,7 +35,7 @@ class Alignment(Movement):
 
 
 def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
-    """The transform that brings positions (n, 3) of an estimate nearest to the truth's (n, 3).
+    """Return the transform that brings positions (n, 3) of an estimate nearest to the truth's (n, 3).
 
     Args:
         estimate_m: positions of the estimate.
@@ -80,7 +80,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
 
 
 def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
-    """The trajectory in the truth's frame."""
+    """Return the trajectory in the truth's frame."""
     turned = alignment.scale * trajectory.position_m @ alignment.rotation.T
     rotation = trajectory.rotation
     return replace(

@@ -91,7 +91,7 @@ def target_of(quantity: str) -> Target:
 def paired_difference(
     first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
-    """The second's difference to the first.
+    """Return the second's difference to the first.
 
     Args:
         first: (n,) the metric in every run.
@@ -162,7 +162,7 @@ def _direction(first: Floats, second: Floats, target: Target, difference: float)
 
 
 def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Where the mean of runs (n,) lies with 95 %, by Student's distribution; NaN of few runs."""
+    """Return where the mean of runs (n,) lies with 95 %, by Student's distribution; NaN of few runs."""
     from scipy.special import stdtrit
 
     runs = len(values)

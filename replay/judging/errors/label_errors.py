@@ -24,12 +24,12 @@ def total_error(squared: Floats) -> Floats:
 
 
 def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
-    """The summed squared errors (...,) where every estimate keeps its label."""
+    """Return the summed squared errors (...,) where every estimate keeps its label."""
     return np.asarray(np.sum((estimates - truths) ** 2, axis=(-2, -1)))
 
 
 def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = np.inf) -> Floats:
-    """The least summed squared errors (...,) that any labelling of the estimates gives.
+    """Return the least summed squared errors (...,) that any labelling of the estimates gives.
 
     None counts for more than the squared cutoff: then it is GOSPA (alpha = 2, order 2) squared, since
     there are as many estimates as truths.

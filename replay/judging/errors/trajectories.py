@@ -144,7 +144,7 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
 def associate(
     estimate: Trajectory, truth: Trajectory, comparison: Comparison
 ) -> tuple[Trajectory, Trajectory]:
-    """The poses of both that belong together; by their places where one has no stamps."""
+    """Return the poses of both that belong together; by their places where one has no stamps."""
     times, true_times = estimate.time_ns, truth.time_ns
     if times is None or true_times is None:
         if len(estimate) != len(truth):

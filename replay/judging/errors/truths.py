@@ -52,7 +52,7 @@ class Truths:
         self._reached: dict[tuple[str, str], int] = {}
 
     def around(self, topic: str, time_ns: Integers, gap_limit_s: float, reader: str = "") -> Stream:
-        """The messages of a topic about some stamps: no later ones would change the truth there.
+        """Return the messages of a topic about some stamps: no later ones would change the truth there.
 
         `reader` is who asks; what all readers have passed is forgotten, and read anew where one that was
         not there yet asks for it.

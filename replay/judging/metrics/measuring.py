@@ -162,7 +162,7 @@ class Measurement:
                     ours[name] = self._metrics[name].merge(ours[name], state) if name in ours else state
 
     def finish(self, of: Callable[[str], bool] | None = None) -> dict[str, float]:
-        """The numbers, as `estimator.quantity[.case]`, of all keys or of some.
+        """Return the numbers, as `estimator.quantity[.case]`, of all keys or of some.
 
         Errors come first, then innovations. Raises BadInput where a metric raises.
         """

@@ -216,7 +216,7 @@ def coverage(sums: Sums) -> dict[str, float]:
 
 
 def estimated_share(sums: Sums) -> float | None:
-    """The share of the runs' spans for which there are estimates; None where there is no span."""
+    """Return the share of the runs' spans for which there are estimates; None where there is no span."""
     return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
 
 

@@ -68,7 +68,7 @@ def gospa(
 def gospa_pairs(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0
 ) -> tuple[Integers, Integers]:
-    """The pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
+    """Return the pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
 
     Raises BadInput as `gospa` does.
     """

@@ -53,7 +53,7 @@ class JudgedSets:
 
 
 def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
-    """The rings (n, 2) of every frame; none where its set is empty."""
+    """Return the rings (n, 2) of every frame; none where its set is empty."""
     ends = np.cumsum(sizes["elements"].astype(np.int64))
     ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
     frames = []
@@ -64,14 +64,14 @@ def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
 
 
 def areas_of(frames: Sequence[Sequence[Floats]]) -> Floats:
-    """The area (n,) inside the rings of every frame; holes run the other way round."""
+    """Return the area (n,) inside the rings of every frame; holes run the other way round."""
     return np.array([abs(sum(map(signed_area, rings))) for rings in frames])
 
 
 def judge_sets(
     outputs: dict[str, Ragged], sources: Sequence[Source], gap_limit_s: float
 ) -> list[JudgedSets]:
-    """Every set estimate of a replay against the truth that its channel names."""
+    """Judge every set estimate of a replay against the truth that its channel names."""
     found = []
     for topic, sizes in outputs.items():
         if sizes.stream.schema.full_name == schemas.ESTIMATE_SIZE.full_name and topic.endswith("/size"):

@@ -56,7 +56,7 @@ class JudgedFilter:
 def judge_filter(
     outputs: Mapping[str, Ragged], sources: Sequence[Source], gap_limit_s: float
 ) -> list[JudgedFilter]:
-    """All outputs of set filters against the truth that their channels name."""
+    """Judge all outputs of set filters against the truth that their channels name."""
     found = []
     for topic in outputs:
         base = topic.removesuffix("step")

@@ -157,7 +157,7 @@ def track_errors(
 
 
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
-    """The means over the instants, and of each target, from 1 on, RMSE and coverage.
+    """Return the means over the instants, and of each target, from 1 on, RMSE and coverage.
 
     Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed.
     """

@@ -129,7 +129,7 @@ def reports_of(output: Output) -> Reports:
 
 
 def track_tables(reports: Reports) -> "list[pd.DataFrame]":
-    """A table per run; none where a run has no reports."""
+    """Return a table per run; none where a run has no reports."""
     if not all(reports.values()):
         return []
     return [

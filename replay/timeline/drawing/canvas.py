@@ -155,7 +155,7 @@ class Dates:
     later_ns: Times
 
     def of(self, time_ns: Times) -> Times:
-        """The dates of stamps (n,)."""
+        """Return the dates of stamps (n,)."""
         first_ns = self.later_ns[0]
         drift_ns = np.interp(time_ns, self.stamps_ns, self.later_ns - first_ns)
         found: Times = time_ns + first_ns + np.rint(drift_ns).astype(np.int64)
@@ -163,7 +163,7 @@ class Dates:
 
 
 def dates_of(stream: Stream) -> Dates | None:
-    """The dates of a stream's stamps, when they were logged; None where the stamps are dates."""
+    """Return the dates of a stream's stamps, when they were logged; None where the stamps are dates."""
     stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
     if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
         return None
@@ -228,7 +228,7 @@ class Timeline:
 def draw_cases(
     scene: Scene, draw_case: Callable[[str], rrb.Container | rrb.View]
 ) -> rrb.Container | rrb.View:
-    """The layouts of all cases, in tabs where there are several."""
+    """Return the layouts of all cases, in tabs where there are several."""
     layouts = [draw_case(case) for case in scene.cases]
     if len(layouts) == 1:
         return layouts[0]
@@ -236,13 +236,13 @@ def draw_cases(
 
 
 def beside(board: rrb.Container, plots: Sequence[rrb.View | rrb.Container], case: str) -> rrb.Container:
-    """A case's board, and to its right its plots if there are any."""
+    """Return a case's board, and to its right its plots if there are any."""
     columns = [board, rrb.Vertical(*plots)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
 
 
 def entity_path(*parts: str) -> str:
-    """An entity from its parts; empty ones, such as the case of a log with one, are left out."""
+    """Return an entity from its parts; empty ones, such as the case of a log with one, are left out."""
     return "/".join(part for part in parts if part)
 
 
@@ -252,7 +252,7 @@ def escaped(entity: str) -> str:
 
 
 def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """The rows to draw: all, or the last of each of `rows` equal spans of time."""
+    """Return the rows to draw: all, or the last of each of `rows` equal spans of time."""
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     of_span = _spans(time_ns, rows)
@@ -260,14 +260,14 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """The rows of a curve to draw: all, or the least and the greatest of each span of time."""
+    """Return the rows of a curve to draw: all, or the least and the greatest of each span of time."""
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     return extremes(_spans(time_ns, rows // 2), values)
 
 
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
-    """The rows of the least and of the greatest value of every span, the first where several are.
+    """Return the rows of the least and of the greatest value of every span, the first where several are.
 
     `of_span` (n,) is the number of each value's span, from zero on and sorted; NaN is no extreme.
     """
@@ -292,12 +292,12 @@ def gap_limit_ns(time_ns: Times) -> int:
 
 
 def usual_interval_ns(time_ns: Times) -> float:
-    """The median between distinct times, sorted; zero where there is only one."""
+    """Return the median between distinct times, sorted; zero where there is only one."""
     intervals = np.diff(np.unique(time_ns))
     return float(np.median(intervals)) if len(intervals) else 0.0
 
 
 def nice(value: float) -> float:
-    """The smallest of 1, 2 and 5 times a power of ten that is not below a positive value."""
+    """Return the smallest of 1, 2 and 5 times a power of ten that is not below a positive value."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value))

@@ -207,7 +207,7 @@ def _mark_above(
 
 
 def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """The probabilities of all modes, a plot for each estimator and for those given all data."""
+    """Draw the probabilities of all modes, a plot for each estimator and for those given all data."""
     views = []
     for estimator, stream in scene.outputs_of(case, schemas.MODE_PROBABILITIES):
         name = stream.topic.rpartition("/")[2]

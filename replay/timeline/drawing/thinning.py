@@ -204,27 +204,27 @@ class Held:
 
     @property
     def name(self) -> str:
-        """The source's."""
+        """Return the source's."""
         return self.of.name
 
     @property
     def run(self) -> RunMetadata | None:
-        """The source's."""
+        """Return the source's."""
         return self.of.run
 
     @property
     def epoch_ns(self) -> int:
-        """The source's."""
+        """Return the source's."""
         return self.of.epoch_ns
 
     @property
     def start_ns(self) -> int | None:
-        """The source's."""
+        """Return the source's."""
         return self.of.start_ns
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """The source's, held or not."""
+        """Return the source's, held or not."""
         return self.of.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
@@ -235,7 +235,7 @@ class Held:
         }
 
     def empty(self, topic: str) -> Stream:
-        """The topic without its messages."""
+        """Return the topic without its messages."""
         return self.of.empty(topic)
 
     def blocks(
@@ -293,7 +293,7 @@ class Sensed:
         return stated.schema_name == schemas.LANDMARK.full_name or stated.messages == 1
 
     def all(self) -> Held:
-        """All of it, thinned."""
+        """Return all of it, thinned."""
         self.advance(np.iinfo(np.int64).max)
         kept = {topic: kept.rows for topic, kept in self._kept.items()}
         return Held(self.source, {**self._lasting, **kept})

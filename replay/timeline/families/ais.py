@@ -67,7 +67,7 @@ def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) 
 
 
 def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """A colour (n, 3) for every track number; neighbours in number are far apart in hue."""
+    """Return a colour (n, 3) for every track number; neighbours in number are far apart in hue."""
     hue = numbers * GOLDEN % 1.0
     value = np.where(numbers % 2 == 0, 1.0, 0.75)
     colours = hsv_to_rgb(np.stack([hue, np.full(len(hue), 0.7), value], axis=1))

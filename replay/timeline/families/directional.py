@@ -138,7 +138,7 @@ def draw_triads(
 
 
 def space_view(root: str, name: str) -> rrb.Spatial3DView:
-    """A view of triads about one origin, x towards the eye."""
+    """Return a view of triads about one origin, x towards the eye."""
     return rrb.Spatial3DView(
         origin=escaped(root),
         name=name,

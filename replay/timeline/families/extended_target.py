@@ -15,7 +15,7 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The plane beside sizes, errors and consistency."""
+    """Return the plane beside sizes, errors and consistency."""
     turn_up(canvas)
     shown = [np.empty((0, 2))]
     points = f"{ROOT}/points"

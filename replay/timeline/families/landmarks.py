@@ -63,7 +63,7 @@ class Track(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A map and plots for each robot."""
+    """Return a map and plots for each robot."""
     landmarks = landmarks_of(scene)
     turn_up(canvas)
     draw_points(canvas, f"{ROOT}/landmarks", landmarks.index.to_numpy(), landmarks.to_numpy())
@@ -96,7 +96,7 @@ def _draw_robot(
 
 
 def tracks_of(scene: Scene, robot: str) -> list[Track]:
-    """The truth and every estimate that says where the robot is, thinned to what is drawn."""
+    """Return the truth and every estimate that says where the robot is, thinned to what is drawn."""
     found = [("truth", Stroke(TRUTH, 2.0), each, each["state"]) for each in scene.truths_of(robot)]
     for estimator, stream in scene.outputs_of(robot, schemas.GAUSSIAN_ESTIMATE):
         found.append((estimator, Stroke(scene.colour(estimator)), stream, stream["mean"]))

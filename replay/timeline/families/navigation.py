@@ -68,7 +68,7 @@ class Body(NamedTuple):
     covariance: Floats | None
 
     def columns(self, names: Sequence[str]) -> Floats:
-        """The columns (n, k) of components."""
+        """Return the columns (n, k) of components."""
         return self.values[:, [self.names.index(name) for name in names]]
 
 

@@ -51,7 +51,7 @@ APART = 0.05
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The graph, the maps of all rules and the events beside NEES and errors of the nodes."""
+    """Return the graph, the maps of all rules and the events beside NEES and errors of the nodes."""
     turn_up(canvas)
     links = scene.read("/links")
     nodes = _nodes(scene, links)

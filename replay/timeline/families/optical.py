@@ -50,7 +50,7 @@ class Sensor(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The scene in space beside NEES and the errors of all components."""
+    """Return the scene in space beside NEES and the errors of all components."""
     canvas.fix(ROOT, rr.ViewCoordinates.RIGHT_HAND_Y_UP)
     sensors = list(_sensors(scene))
     targets = _targets(scene)

@@ -39,7 +39,7 @@ SHOWN_SHARE = 0.9
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The plane and events beside the areas, for each robot."""
+    """Return the plane and events beside the areas, for each robot."""
     turn_up(canvas)
     landmarks = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
     if landmarks is not None:

@@ -47,7 +47,7 @@ SCANS = "scans"
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A map for each tracker, in tabs, with all sensors; plots of all trackers beside them."""
+    """Return a map for each tracker, in tabs, with all sensors; plots of all trackers beside them."""
     turn_up(canvas)
     ground, paths, places = f"{ROOT}/ground", [], []
     for topic, place, stroke in _ways(scene):

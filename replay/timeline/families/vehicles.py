@@ -75,7 +75,7 @@ class Vehicles(NamedTuple):
         return self.places.shape[1]
 
     def rows(self, time_ns: Times) -> NDArray[np.int64]:
-        """The steps of stamps; the next one where a stamp lies between."""
+        """Return the steps of stamps; the next one where a stamp lies between."""
         return np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
 
 
@@ -87,7 +87,7 @@ class Points(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The map above the close-up, beside errors, GOSPA and NEES."""
+    """Return the map above the close-up, beside errors, GOSPA and NEES."""
     turn_up(canvas)
     vehicles = _truths(scene)
     tracks = {name: _tracks(scene, name, vehicles) for name in scene.estimators}

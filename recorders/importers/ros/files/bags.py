@@ -34,7 +34,7 @@ class Bag:
     is_packed: bool = False
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, file by file."""
+        """Yield the messages of the wanted connections, file by file."""
         for file in self.files:
             for batch in file.batches(wanted):
                 yield _unpacked(batch) if self.is_packed else batch

@@ -48,7 +48,7 @@ class McapFile:
         return Connection(channel.topic, name, channel.message_encoding, definition, count)
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, a chunk of the file at a time."""
+        """Yield the messages of the wanted connections, a chunk of the file at a time."""
         chosen = {number: each for number, each in self._by_id.items() if wanted(each)}
         regions = [
             region

@@ -41,7 +41,7 @@ class _Record(NamedTuple):
 
     @property
     def kind(self) -> int:
-        """What it is; 0 where it does not say."""
+        """Return what it is; 0 where it does not say."""
         return int.from_bytes(self.header.get("op", b""), "little")
 
 
@@ -140,7 +140,7 @@ class Ros1File:
         )
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, a chunk of the file at a time."""
+        """Yield the messages of the wanted connections, a chunk of the file at a time."""
         chosen = {number: each for number, each in self._by_id.items() if wanted(each)}
         with self.path.open("rb") as file:
             reads = ((record, _read(file, record)) for record in self._chunks)

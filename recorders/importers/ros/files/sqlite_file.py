@@ -66,7 +66,7 @@ class SqliteFile:
         return database
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, some thousand rows at a time."""
+        """Yield the messages of the wanted connections, some thousand rows at a time."""
         chosen = [number for number, each in self._by_id.items() if wanted(each)]
         with closing(self._open()) as database:
             for found in _some_at_a_time(self._rows(database, chosen)):
