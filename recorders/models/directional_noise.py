@@ -38,6 +38,14 @@ def sample_bingham(
     Exact rejection sampling under an angular central Gaussian envelope (Kent, Ganeiban, Mardia, "A new
     unified approach for the simulation of a wide class of directional distributions", JCGS 27, 2018);
     at least 44 % of the proposals are taken. For many samples of one distribution broadcast it.
+
+    Args:
+        axes: (..., d, d), the principal axes as columns.
+        concentrations: (..., d), those along the axes, finite.
+        generator: draws the proposals.
+
+    Returns:
+        (..., d), of unit length.
     """
     axes, concentrations = np.asarray(axes, float), np.asarray(concentrations, float)
     if not np.all(np.isfinite(concentrations)):
@@ -71,7 +79,17 @@ def sample_projected_gaussian(
     shape: tuple[int, ...],
     generator: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Samples (*shape, d) of a Gaussian in R^d, each scaled to unit length."""
+    """Draw (*shape, d) of a Gaussian in R^d, each scaled to unit length.
+
+    Args:
+        mean: (d,).
+        covariance: (d, d).
+        shape: how many are drawn.
+        generator: draws them.
+
+    Returns:
+        (*shape, d), of unit length.
+    """
     drawn = generator.multivariate_normal(mean, covariance, shape, method="eigh")
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 

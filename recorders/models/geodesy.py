@@ -25,7 +25,7 @@ def earth_centred(
 
 
 def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
-    """East, north and up at places (...,) as the rows of rotations (..., 3, 3) of earth-centred axes."""
+    """Return east, north and up at places (...,) as rows (..., 3, 3), in earth-centred axes."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     zero = np.zeros_like(latitude)
     rows = (

@@ -37,7 +37,7 @@ def right_matrix(right: ArrayLike) -> NDArray[np.float64]:
 
 
 def compose(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
-    """The complex product (24) of left and right (..., 2), or Hamilton's product (34) of (..., 4)."""
+    """Multiply left and right (..., 2) as complex numbers (24), (..., 4) as quaternions (34)."""
     return np.einsum("...ij,...j->...i", left_matrix(left), np.asarray(right, float))
 
 
@@ -70,9 +70,17 @@ def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 
 
 def require_unit(x: ArrayLike, what: str, tolerance: float = 1e-6) -> NDArray[np.float64]:
-    """`x` (..., d) with every vector scaled to exactly unit length.
+    """Scale every vector of `x` (..., d) to exactly unit length.
 
     Raises BadInput where d is not 2 or 4, or a length differs from 1 by more than `tolerance`.
+
+    Args:
+        x: (..., d), with d = 2 or 4.
+        what: what messages call it.
+        tolerance: how far a length may differ from 1.
+
+    Returns:
+        (..., d).
     """
     x = np.asarray(x, float)
     if x.ndim == 0 or x.shape[-1] not in (2, 4):

@@ -52,7 +52,16 @@ class Comparisons(NamedTuple):
 def score_stream(
     matchers: Sequence[Matcher], scores: NDArray[np.float64], arrival_ns: ArrayLike
 ) -> Stream:
-    """Return the stream of scores (users, users, matchers), probe by probe as they arrive (users,)."""
+    """Return the stream of scores (users, users, matchers), probe by probe as they arrive (users,).
+
+    Args:
+        matchers: the matchers, in the order of the scores' last axis.
+        scores: (users, users, matchers), by probe and gallery entry.
+        arrival_ns: (users,), when each probe arrives.
+
+    Returns:
+        The stream, whose metadata describe the matchers.
+    """
     users = len(scores)
     metadata = {
         "matchers": ",".join(each.name for each in matchers),

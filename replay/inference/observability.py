@@ -284,7 +284,7 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(information: Floats, scales: Floats) -> Spectrum:
-    """Rank and eigenvalues of D W D, and the direction D e of the least, of length one in state units.
+    """Return rank and eigenvalues of D W D, and D e of the least, of length one in state units.
 
     A component whose scale is zero, as something known exactly, has no part: its eigenvalue is infinite.
     """

@@ -64,10 +64,18 @@ def between(origin: Origin, other: Origin) -> Movement:
 def moved_states(
     components: Mapping[str, str], mean: Floats, movement: Movement
 ) -> tuple[Floats, Floats]:
-    """States (n, d) in another frame, and the Jacobian (t, t) of this in the tangent space.
+    """Move states (n, d) into another frame, with the Jacobian (t, t) of this in the tangent space.
 
     Positions and velocities turn, headings and orientations as well; the latter have their covariance in
     the body's frame, where it stays. All other components are taken to be of the body.
+
+    Args:
+        components: those of the state by name, with their kinds.
+        mean: (n, d).
+        movement: from the frame of the states to the other one.
+
+    Returns:
+        The states (n, d), and the Jacobian (t, t).
     """
     names, kinds = list(components), list(components.values())
     tangent = [name for name, _ in tangent_components(names, kinds)]

@@ -235,7 +235,16 @@ def _likelihood(stage: Stage, number: int) -> Function:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
 ) -> float:
-    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v."""
+    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v.
+
+    Args:
+        states: (N, n), not read: the differences are known.
+        i: which particle.
+        data: (width,), of the event; not read.
+        parameters: the sensor's row, for `inflation`.
+        own: the sensor's memory, with differences and the factors of noise.
+        size: how many components are used.
+    """
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):
@@ -254,6 +263,10 @@ def reweigh(weight: Floats, likelihood: Floats) -> float:
 
     Returns log sum w p. Where a likelihood is NaN, the particle gets the mean of the others. NaN, and
     weights of no use, where none is above zero.
+
+    Args:
+        weight: (N,), changed in place.
+        likelihood: (N,), log p.
     """
     best = -np.inf
     for i in range(len(weight)):

@@ -27,5 +27,14 @@ def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
 
 
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:
-    """GDOP, position error by range and noise of both angles (..., 2); Belfadel et al. 2014, eq (32)."""
+    """Compute GDOP: position error by range and noise of both angles; Belfadel et al. 2014, eq (32).
+
+    Args:
+        position_error_m: (...,).
+        range_m: (...,), the distance to the target.
+        sigma_rad: (..., 2), standard deviations of azimuth and elevation.
+
+    Returns:
+        (...,).
+    """
     return np.asarray(position_error_m) / (range_m * np.linalg.norm(sigma_rad, axis=-1))

@@ -67,7 +67,16 @@ def fused_of(stream: Stream) -> Fused:
 
 
 def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None) -> Roc:
-    """Return the rates at every distinct score; `weight` (n,) counts comparisons more than once."""
+    """Return the rates at every distinct score; `weight` (n,) counts comparisons more than once.
+
+    Args:
+        score: (n,), greater for more alike.
+        genuine: (n,), whether both are of one person.
+        weight: (n,), how often each comparison counts; once by default.
+
+    Returns:
+        Rates from nothing accepted to everything.
+    """
     order = np.argsort(-score, kind="stable")
     falling = score[order]
     counts = np.ones(len(score)) if weight is None else weight[order]
@@ -91,7 +100,15 @@ def equal_error_rate(curve: Roc) -> float:
 
 
 def cost_of_ratio(ratio: Floats, genuine: NDArray[np.bool_]) -> float:
-    """Cllr in bits: 0 for perfect log-likelihood ratios, 1 for ones that tell nothing."""
+    """Compute Cllr in bits: 0 for perfect log-likelihood ratios, 1 for ones that tell nothing.
+
+    Args:
+        ratio: (n,), log-likelihood ratios.
+        genuine: (n,), whether both are of one person.
+
+    Returns:
+        Bits, at least 0.
+    """
     same = np.logaddexp(0, -ratio[genuine]).mean()
     other = np.logaddexp(0, ratio[~genuine]).mean()
     return float((same + other) / (2 * np.log(2)))
@@ -117,7 +134,7 @@ def verification_rate(fused: Fused) -> float:
 
 
 def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, float]:
-    """Absolute and relative increase of a rate over the mean of the single matchers' (eq. 3)."""
+    """Compute how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3)."""
     mean = float(np.mean(np.asarray(rates, float)))
     increase = fused_rate - mean
     return increase, increase / (1 - mean)

@@ -122,7 +122,7 @@ PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
-    """Return some rows of errors."""
+    """Select some rows of errors."""
     columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
     heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
     return replace(errors, **columns, heading_rad=heading_rad)

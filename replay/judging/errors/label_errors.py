@@ -24,7 +24,12 @@ def total_error(squared: Floats) -> Floats:
 
 
 def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
-    """Return the summed squared errors (...,) where every estimate keeps its label."""
+    """Return the summed squared errors (...,) where every estimate keeps its label.
+
+    Args:
+        estimates: (..., things, axes).
+        truths: likewise.
+    """
     return np.asarray(np.sum((estimates - truths) ** 2, axis=(-2, -1)))
 
 
@@ -33,6 +38,11 @@ def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = 
 
     None counts for more than the squared cutoff: then it is GOSPA (alpha = 2, order 2) squared, since
     there are as many estimates as truths.
+
+    Args:
+        estimates: (..., things, axes).
+        truths: likewise, as many.
+        cutoff_m: no distance counts as longer.
     """
     count = estimates.shape[-2]
     distance = np.sum((estimates[..., :, None, :] - truths[..., None, :, :]) ** 2, axis=-1)

@@ -23,7 +23,13 @@ def squares(errors: Errors) -> Sums:
 
 
 def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:
-    """Sums of squares (n, d) by the name of their RMSE, see `squares`."""
+    """Sum squares (n, d) by the name of their RMSE, see `squares`.
+
+    Args:
+        squared: (n, d), in the squares of the components' units.
+        components: the names of the d components.
+        kinds: their kinds.
+    """
     found: Sums = {}
     totals = np.sum(squared, axis=0)
     position = [index for index, name in enumerate(components) if name in POSITION]

@@ -26,9 +26,15 @@ class Gospa(NamedTuple):
 
 
 def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 1.0) -> float:
-    """OSPA of point sets (n, d) and (m, d); between 0 and the cutoff, in the unit of the points.
+    """Compute OSPA of point sets (n, d) and (m, d); between 0 and the cutoff, in the points' unit.
 
     Raises BadInput as `gospa` does.
+
+    Args:
+        estimates: (n, d).
+        truths: (m, d).
+        cutoff: no distance counts as longer.
+        order: of the mean, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
     most = max(costs.estimates, costs.truths)
@@ -41,13 +47,20 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 
 def gospa(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0, alpha: float = 2.0
 ) -> Gospa:
-    """GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
+    """Compute GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
 
     With alpha = 2 a pair as far apart as the cutoff is no pair: it counts as one missed and one false.
     With another alpha only what exceeds the other set in number is missed or false.
 
     Raises BadInput where the points are not finite or have different dimensions, the cutoff is not
     positive, the order is below 1, or alpha is not in (0, 2].
+
+    Args:
+        estimates: (n, d).
+        truths: (m, d).
+        cutoff: no distance counts as longer, in the unit of the points.
+        order: of the sum, at least 1.
+        alpha: by which a surplus point costs cutoff^order / alpha.
     """
     if not 0.0 < alpha <= 2.0:
         raise BadInput(f"alpha {alpha:g}: give one above 0 and up to 2")
@@ -71,6 +84,12 @@ def gospa_pairs(
     """Return the pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
 
     Raises BadInput as `gospa` does.
+
+    Args:
+        estimates: (n, d).
+        truths: (m, d).
+        cutoff: no pair is farther apart.
+        order: of the sum, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
     near = costs.pairs < cutoff**order

@@ -120,7 +120,13 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Tell whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
+    """Tell whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames).
+
+    Args:
+        sizes: the sets of one run, a message per frame.
+        source: the run.
+        places: (frames, 2), true positions in m.
+    """
     measured = sizes.metadata["measured"]
     streams = source.read(["/landmarks", measured])
     hold = np.zeros((2, len(places)), bool)

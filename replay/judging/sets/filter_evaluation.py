@@ -124,7 +124,15 @@ def _judge(
 def odometry_error(
     odometry: Odometry, first_ns: Integers, last_ns: Integers, first: Floats, last: Floats
 ) -> Floats:
-    """Errors (n, 2) of displacements (m) and turns (rad) between true poses (n, 3)."""
+    """Compute errors (n, 2) of displacements (m) and turns (rad) between true poses (n, 3).
+
+    Args:
+        odometry: of the robot.
+        first_ns: (n,), when each span begins.
+        last_ns: (n,), when it ends.
+        first: (n, 3), the true pose then.
+        last: (n, 3), the true pose at the end.
+    """
     true = relative_pose(first, last)
     stated = relative_pose(odometry.pose_at(first_ns), odometry.pose_at(last_ns))
     away = np.hypot(*(true - stated)[:, :2].T)

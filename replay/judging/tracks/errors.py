@@ -99,10 +99,16 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
 
 
 def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
-    """The tracks of one run at instants: the last ones told until then, moved on by their velocities.
+    """Return a run's tracks at instants: the last told until then, moved on by their velocities.
 
     `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
     of each one `delay_ns` after its stamp.
+
+    Args:
+        sizes: of the sets of tracks, a message per scan.
+        tracks: all tracks after each scan.
+        at_ns: (k,), the instants.
+        delay_ns: how long after its stamp a scan is told of.
     """
     names = tracks.components
     place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
@@ -125,7 +131,14 @@ def track_errors(
     cutoff_m: float = CUTOFF_M,
     unreferenced_m: float = UNREFERENCED_M,
 ) -> TrackErrors:
-    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there."""
+    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there.
+
+    Args:
+        tracks: those at each of the k instants.
+        truths: (targets, k, 2), in m.
+        cutoff_m: of GOSPA.
+        unreferenced_m: a track farther from all targets is of none that has a truth.
+    """
     targets_in_all, instants, _ = truths.shape
     present = np.asarray(np.isfinite(truths).all(axis=2))
     found = TrackErrors(

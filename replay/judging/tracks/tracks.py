@@ -82,6 +82,11 @@ def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[In
     """Count the numbers that spoke within the last `live_s`: times (m,) of changes, counts (m,).
 
     Times (n,) are sorted.
+
+    Args:
+        time_ns: (n,), sorted.
+        numbers: (n,), who spoke.
+        live_s: how long one counts after it spoke.
     """
     order = np.lexsort((time_ns, numbers))
     sorted_ns, sorted_numbers = time_ns[order], numbers[order]
