@@ -36,9 +36,13 @@ class Bingham(NamedTuple):
 
 
 def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """A checked distribution from axes (..., d, d) and concentrations (..., d) in any order and offset.
+    """Make a checked distribution of axes and concentrations in any order and offset.
 
     Raises BadInput where d is not 2 or 4, a number is not finite, or the axes are not orthonormal.
+
+    Args:
+        axes: (..., d, d), orthonormal, as columns.
+        concentrations: (..., d), along these; only their differences count.
     """
     axes, z = np.asarray(axes, float), np.asarray(concentrations, float)
     d = z.shape[-1] if z.ndim else 0
@@ -59,10 +63,14 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
 
 
 def around(mode: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """Distributions about modes (..., d) with concentrations (..., d - 1) along mode (+) e_2, ..., e_d.
+    """Make distributions about modes, with concentrations along mode (+) e_2, ..., e_d.
 
     Small errors of an orientation about its own axis i have the standard deviation sigma_rad for the
     concentration -2 / sigma_rad^2, half angles being what a quaternion holds.
+
+    Args:
+        mode: (..., d), unit vectors.
+        concentrations: (..., d - 1), at most 0.
     """
     mode = require_unit(mode, "mode of a Bingham distribution")
     z = np.asarray(concentrations, float)
@@ -103,7 +111,12 @@ def covariance(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
-    """The log density (...) at unit vectors x (..., d); F stands for 1 / F in the print's (10)-(11)."""
+    """Compute the log density (...) at unit vectors; F stands for 1 / F in the print's (10)-(11).
+
+    Args:
+        bingham: the distributions, batch axes (...).
+        x: (..., d), unit vectors.
+    """
     along = np.einsum("...ij,...i->...j", bingham.axes, np.asarray(x, float))
     exponent = (bingham.concentrations * along**2).sum(-1)
     return exponent - log_normaliser(bingham.concentrations)
@@ -142,6 +155,10 @@ def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
     """Return the density of x given z = x (+) v, v ~ `noise`, alone: the factor of an update, (52)-(53).
 
     M is z (+) (D M^v), where (53) and algorithm 2 misprint M^p, and the left factor in (52) is Q_z.
+
+    Args:
+        noise: of the measurement.
+        measurement: z (..., d), unit vectors.
     """
     z = require_unit(measurement, "measurement")
     mirrored = np.swapaxes(conjugate(np.swapaxes(noise.axes, -1, -2)), -1, -2)
@@ -149,7 +166,12 @@ def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
 
 
 def rotate(bingham: Bingham, increment: ArrayLike) -> Bingham:
-    """Return the distributions of x (+) u for known unit increments u (..., d), such as a gyro's."""
+    """Return the distributions of x (+) u for known unit increments u (..., d), such as a gyro's.
+
+    Args:
+        bingham: the distributions, batch axes (...).
+        increment: u (..., d), unit vectors.
+    """
     turned = right_matrix(require_unit(increment, "increment")) @ bingham.axes
     return Bingham(turned, np.broadcast_to(bingham.concentrations, turned.shape[:-1]))
 
@@ -187,10 +209,14 @@ def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> Bingham:
-    """The Bingham distribution with the second moment of g / |g|, g ~ N(mean, covariance), mean (d,).
+    """Fit the Bingham distribution with the second moment of g / |g|, g ~ N(mean, covariance).
 
     Exact up to rounding: 1 / |g|^2 = int exp(-t |g|^2) dt leaves one integral over t > 0, and the
     trapezoidal rule in log t converges geometrically.
+
+    Args:
+        mean: (d,), with d = 2 or 4.
+        gaussian_covariance: (d, d).
     """
     variance, axes = np.linalg.eigh(_symmetric(gaussian_covariance, "Gaussian covariance"))
     if variance[0] < -1e-12 * variance[-1]:

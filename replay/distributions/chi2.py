@@ -13,7 +13,15 @@ from replay.engine.compiling.notices import done_once
 
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
-    """Return what is exceeded with one minus this probability, by that many degrees of freedom."""
+    """Return what is exceeded with one minus this probability, by that many degrees of freedom.
+
+    Args:
+        probability: (...), from 0 to 1.
+        degrees: (...), of freedom.
+
+    Returns:
+        (...), or one number.
+    """
     with done_once():
         from scipy.special import gammaincinv
 
@@ -21,7 +29,15 @@ def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
 
 
 def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
-    """Return what is exceeded with this probability."""
+    """Return what is exceeded with this probability.
+
+    Args:
+        probability: (...), from 0 to 1.
+        degrees: (...), of freedom.
+
+    Returns:
+        (...), or one number.
+    """
     with done_once():
         from scipy.special import chdtri
 
@@ -29,7 +45,15 @@ def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
 
 
 def sf(value: ArrayLike, degrees: ArrayLike) -> Any:
-    """The probability with which a value, which is not negative, is exceeded."""
+    """Return the probability with which a value, which is not negative, is exceeded.
+
+    Args:
+        value: (...), not negative.
+        degrees: (...), of freedom.
+
+    Returns:
+        (...), or one number.
+    """
     with done_once():
         from scipy.special import chdtrc
 

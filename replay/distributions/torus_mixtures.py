@@ -70,6 +70,11 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
 
     With one component it is the maximum-likelihood fit of a wrapped normal. Raises BadInput where there
     are fewer than ten angles a component.
+
+    Args:
+        angles: (n, 2), in rad.
+        components: how many densities are fitted.
+        iterations: of the search, at most.
     """
     if len(angles) < 10 * components:
         raise BadInput(
@@ -120,7 +125,13 @@ def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[F
 def fit_von_mises_mixture(
     angles: Floats, interaction: Interaction, start: WrappedMixture
 ) -> VonMisesMixture:
-    """The most likely von Mises densities, as many as the wrapped normals that the search begins at."""
+    """Fit the most likely von Mises densities, as many as the wrapped normals of the start.
+
+    Args:
+        angles: (n, 2), in rad.
+        interaction: how the two angles of a density depend on each other.
+        start: where the search begins.
+    """
     k = len(start.weights)
     precision = np.linalg.inv(start.covariance)
     third = -precision[:, 0, 1]

@@ -50,7 +50,7 @@ class Samples(NamedTuple):
 
 
 def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal:
-    """A checked distribution; BadInput where the covariance is not finite and positive definite."""
+    """Make a checked distribution; BadInput where the covariance is not finite, positive definite."""
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
         raise BadInput(
@@ -70,7 +70,12 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
 
 
 def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
-    """Return the density (...) at angles x (..., 2)."""
+    """Return the density (...) at angles x (..., 2).
+
+    Args:
+        distribution: with batch axes (...).
+        x: (..., 2), in rad.
+    """
     deviation = np.asarray(x, float) - distribution.mean
     batch = np.broadcast_shapes(deviation.shape[:-1], distribution.covariance.shape[:-2])
     covariance = flatten(distribution.covariance, batch, 2, 2)

@@ -58,6 +58,12 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
 
     Raises BadInput where shapes differ, a number is not finite, two landmarks coincide, or the bound is
     not above 0 and below pi / 2 (from there on the set is no longer an intersection).
+
+    Args:
+        first: (n, 2), a landmark of each pair, in m.
+        second: (n, 2), the other one.
+        angle_rad: (n,), from the first to the second.
+        bound_rad: the largest error of an angle.
     """
     pairs = Pairs(
         np.asarray(first, float).reshape(-1, 2),
@@ -92,6 +98,13 @@ def excess_rad(pairs: Pairs, points: Floats) -> Floats:
     """Compute how far each pair's bound is exceeded at points (..., 2): (..., n), feasible where <= 0.
 
     The exact membership test, (4). NaN on a landmark itself, where the angle has no value.
+
+    Args:
+        pairs: the relative bearings of a frame.
+        points: (..., 2), in m.
+
+    Returns:
+        (..., n), in rad.
     """
     seen = relative_bearing((points[..., None, 0], points[..., None, 1]), pairs.first.T, pairs.second.T)
     excess: Floats = np.abs(wrap_angle(seen - pairs.angle_rad)) - pairs.bound_rad
@@ -107,6 +120,10 @@ def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
     D(g) holds sin(gamma - g) >= 0: its circle passes through both landmarks and, on one side of their
     chord, sees it at the angle g. The sign of (20) needs Delta_perp turned by +90 degrees, which the
     paper does not say. A sine of zero gives the half-plane.
+
+    Args:
+        pairs: the n relative bearings of a frame.
+        angle_rad: g (n,).
     """
     sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
     sine = np.where(np.abs(sine) < 1e-15, 0.0, sine)
@@ -140,7 +157,12 @@ def half_planes(arena: Arena) -> Floats:
 
 
 def evaluate(constraints: Floats, points: Floats) -> Floats:
-    """Return the values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k)."""
+    """Return the values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k).
+
+    Args:
+        constraints: (k, 4), a, b_x, b_y, c.
+        points: x (..., 2).
+    """
     squared = np.sum(points**2, axis=-1)[..., None]
     linear = points @ constraints[:, 1:3].T
     return constraints[:, 0] * squared + linear + constraints[:, 3]
@@ -153,7 +175,12 @@ def exact_set(pairs: Pairs, arena: Arena) -> Arcs:
 
 
 def intersection(constraints: Floats, arena: Arena) -> Arcs:
-    """Return the border of an intersection of generalised discs (k, 4), the arena's sides among them."""
+    """Return the border of an intersection of generalised discs (k, 4), the arena's sides among them.
+
+    Args:
+        constraints: (k, 4), a, b_x, b_y, c.
+        arena: whose sides are among the constraints.
+    """
     pieces = _cut(constraints, arena)
     middle = pieces.at(0.5 * pieces.length)
     tolerance = 1e-11 * float(np.linalg.norm(arena.high - arena.low))

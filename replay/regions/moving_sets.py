@@ -83,7 +83,12 @@ class Motion(NamedTuple):
 
 
 def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
-    """Poses from the origin on, by velocities (n, 2) that each hold until the next stamp."""
+    """Compute poses from the origin on, by velocities that each hold until the next stamp.
+
+    Args:
+        time_ns: (n,), the stamps.
+        velocity: (n, 2), forward in m/s and turn in rad/s.
+    """
     duration_s = np.diff(time_ns, append=time_ns[-1:]) * 1e-9
     heading = np.concatenate([[0.0], np.cumsum(velocity[:, 1] * duration_s)])[:-1]
     x, y, _ = drive((0.0, 0.0, heading), velocity.T, duration_s)
@@ -96,7 +101,15 @@ def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
 
 
 def relative_pose(first: Floats, second: Floats) -> Floats:
-    """The second of two poses (..., 3) as seen from the first: displacement and turn, not wrapped."""
+    """Return the second of two poses as seen from the first: displacement and turn, not wrapped.
+
+    Args:
+        first: (..., 3), x, y in m and heading in rad.
+        second: (..., 3), likewise.
+
+    Returns:
+        (..., 3), in the axes of the first.
+    """
     away = second[..., :2] - first[..., :2]
     cosine, sine = np.cos(first[..., 2]), np.sin(first[..., 2])
     ahead = cosine * away[..., 0] + sine * away[..., 1]
@@ -156,7 +169,7 @@ def moved(
 
 
 def directions(places: shapely.Geometry, target: Floats) -> Headings:
-    """The directions in which a point is seen from a set; all of them where it is in the set's hull."""
+    """Return directions in which a point is seen from a set; all of them where it is in its hull."""
     hull = places.convex_hull
     if hull.covers(shapely.Point(target)):
         return ALL_HEADINGS

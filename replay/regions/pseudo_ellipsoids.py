@@ -55,7 +55,12 @@ class Outline(NamedTuple):
 
 
 def monomials(points: Floats, order: Order) -> Floats:
-    """T(x) of (9), (25): points (..., 2) to (..., order)."""
+    """Compute T(x) of (9), (25): points (..., 2) to (..., order).
+
+    Args:
+        points: (..., 2), scaled.
+        order: how many monomials there are.
+    """
     x, y = points[..., 0], points[..., 1]
     squared = x**2 + y**2
     columns = [x, y, x**2, y**2]
@@ -122,7 +127,7 @@ def slack(ring: Floats, points: Floats, order: Order) -> Floats:
 
 
 def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
-    """H (m, order), z (m,) and V (m, m) of a ring, such that e'V^-1 e = 1 - slack with e = z - H T."""
+    """Return H (m, order), z (m,) and V (m, m) of a ring: e'V^-1 e = 1 - slack with e = z - H T."""
     a, bx, by, c = ring
     row = np.array([bx, by, a, a])
     if order == 4:
@@ -144,7 +149,7 @@ def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
 
 
 def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid:
-    """The filter step (18) in information form: one sum per parameter; `ring` in scaled positions."""
+    """Filter by (18) in information form: one sum per parameter; `ring` in scaled positions."""
     rows, value, size = measurement(ring, order_of(prior))
     weighted = weight * np.linalg.inv(size)
     return prior._replace(
@@ -160,7 +165,15 @@ def order_of(ellipsoid: PseudoEllipsoid) -> Order:
 
 
 def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
-    """Return the fused slack at points (..., 2): the set is where it is >= 0."""
+    """Return the fused slack at points (..., 2): the set is where it is >= 0.
+
+    Args:
+        ellipsoid: the set.
+        points: (..., 2), in m.
+
+    Returns:
+        (...).
+    """
     raised = monomials((points - ellipsoid.origin) / ellipsoid.scale_m, order_of(ellipsoid))
     quadratic = np.einsum("...i,...i->...", raised @ ellipsoid.information, raised)
     return 2 * raised @ ellipsoid.vector - quadratic - ellipsoid.constant
