@@ -302,7 +302,7 @@ def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
 def fused_stream(
     compared: Comparisons, pairs: Pairs, fused: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Fused scores (n,) as score vectors of one, in the order of arrival; topic and name come later."""
+    """Make score vectors of one of fused scores (n,), in arrival order; topic and name come later."""
     order = np.lexsort((pairs.gallery, pairs.probe, compared.arrival_ns[pairs.probe]))
     return make_stream(
         "",

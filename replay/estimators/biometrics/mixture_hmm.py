@@ -46,6 +46,11 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     The means start at the k-means of the vector that has the state's number.
 
     Raises BadInput where there are fewer sequences than components.
+
+    Args:
+        sequences: (count, n, m), NaN where a score is missing.
+        how: the model's sizes, and how it is fitted.
+        rng: of the k-means.
     """
     whole = sequences[~np.isnan(sequences).any(axis=(1, 2))]
     if len(whole) <= how.components:
@@ -64,7 +69,15 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
 
 def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
-    """The log-likelihood (count,) of sequences (count, n, m); missing (NaN) scores integrate out."""
+    """Compute the log-likelihood (count,) of sequences; missing (NaN) scores integrate out.
+
+    Args:
+        model: the fitted model.
+        sequences: (count, n, m), NaN where a score is missing.
+
+    Returns:
+        (count,).
+    """
     count, length, size = sequences.shape
     vectors = sequences.reshape(-1, size)
     emission = np.empty((len(vectors), *model.weights.shape))

@@ -31,10 +31,14 @@ class Pairs(NamedTuple):
 
 
 def normalise(scores: Floats, how: str) -> Floats:
-    """Scores (users, users, matchers) on a common scale; missing ones (NaN) stay missing.
+    """Bring scores to a common scale; missing ones (NaN) stay missing.
 
     `tanh` is Jain, Nandakumar & Ross 2005 with mean and deviation for Hampel's estimates. A gallery
     column whose scores are all equal becomes 0. Raises BadInput where z has no deviation to divide by.
+
+    Args:
+        scores: (users, users, matchers), NaN where missing.
+        how: the name of the normalisation.
     """
     match how:
         case "z" | "tanh":
@@ -102,9 +106,16 @@ def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
 def cross_validate(
     vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
 ) -> Floats:
-    """Fused scores (n,) of vectors (n, m), each learnt without the users of its gallery user's fold.
+    """Fuse scores (n,), each learnt without the users of its gallery user's fold.
 
     `limit` bounds how many impostor vectors are learnt from.
+
+    Args:
+        vectors: (n, m), a score of each matcher.
+        pairs: the users of each vector, and the folds of users.
+        learner: makes a fusion of the vectors that it learns from.
+        limit: how many impostor vectors are learnt from at most.
+        rng: draws these.
     """
     fused = np.empty(len(vectors))
     genuine = pairs.probe == pairs.gallery

@@ -125,6 +125,12 @@ def solve(model: Model, start: Floats, *, tolerance: float = 1e-6, max_iteration
     next full step is shorter than `tolerance` standard deviations in the metric of its own information;
     that step is still taken. A row of `start` that is not finite is a run without a starting point.
     Raises BadInput for a wrong shape only.
+
+    Args:
+        model: (parameters (k, n), rows (k,)) -> the linearisation of these runs.
+        start: (runs, n), not finite for a run without a starting point.
+        tolerance: in standard deviations.
+        max_iterations: how many steps there are at most.
     """
     if start.ndim != 2 or 0 in start.shape:
         raise BadInput(f"least squares: start has shape {start.shape}; give (runs, parameters)")
@@ -311,7 +317,12 @@ def describe_direction(names: Sequence[str], direction: Floats) -> str:
 
 
 def mask_missing(at: Linearization, present: Booleans) -> Linearization:
-    """Take out the measurements that are not `present` (runs, m): they then carry no information."""
+    """Take out the measurements that are not `present` (runs, m): they then carry no information.
+
+    Args:
+        at: the linearisation of runs.
+        present: (runs, m).
+    """
     if present.all():
         return at
     kept, slope = present, at.covariance_jacobian

@@ -87,7 +87,13 @@ class Gain(NamedTuple):
 
 
 def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
-    """Kalman's gain for measurement matrices (m, n) or (runs, m, n) and noises (runs, m, m)."""
+    """Compute Kalman's gain, and what it makes of the covariance.
+
+    Args:
+        covariance: (runs, n, n).
+        rows: (m, n), or (runs, m, n).
+        noise: (runs, m, m).
+    """
     cross = covariance @ rows.swapaxes(-1, -2)
     innovation = rows @ cross + noise
     inverse: Floats = np.asarray(np.linalg.inv(innovation), np.float64)
@@ -98,7 +104,14 @@ def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
 
 
 def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joint:
-    """Kalman's update by innovations (runs, m) with noises (runs, m, m); a NaN was not measured."""
+    """Update by Kalman's filter; an innovation of NaN was not measured.
+
+    Args:
+        joint: the Gaussians of all runs.
+        rows: (m, n), or (runs, m, n).
+        innovation: (runs, m), NaN where not measured.
+        noise: (runs, m, m).
+    """
     missing = np.isnan(innovation)
     if missing.any():
         there = ~missing
@@ -189,7 +202,7 @@ def _sums(values: Floats, group: Integers, groups: int) -> Floats:
 
 
 def normalised(score: Floats, run: Integers) -> Floats:
-    """exp(score), scaled to sum one in each run; runs are sorted."""
+    """Return exp(score), scaled to sum one in each run; runs are sorted."""
     first = np.flatnonzero(np.append(True, run[1:] != run[:-1]))
     count = np.diff(np.append(first, len(run)))
     weight = np.exp(score - np.repeat(np.maximum.reduceat(score, first), count))
