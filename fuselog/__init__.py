@@ -1,4 +1,4 @@
-"""The public interface: what programs, notebooks and plug-ins import; docs/python.md shows how.
+"""Offers the public interface that programs, notebooks and plug-ins import; docs/python.md shows how.
 
 Names are imported when they are first asked for, from the places that the stub beside this file lists:
 `import fuselog` is quick, and editors and type checkers see everything.
@@ -47,8 +47,8 @@ __all__ = list(_NAMES)
 def __getattr__(name: str) -> Any:
     if name in _RENAMED:
         new = _RENAMED[name]
-        said = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
-        warnings.warn(said, FutureWarning, stacklevel=2)
+        message = f"fuselog.{name} is called fuselog.{new} now; the old name goes in the next release"
+        warnings.warn(message, FutureWarning, stacklevel=2)
         return getattr(sys.modules[__name__], new)
     if name not in _NAMES:
         raise AttributeError(f"module 'fuselog' has no attribute '{name}'")

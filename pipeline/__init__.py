@@ -1,1 +1,1 @@
-"""The command line, experiments, Monte Carlo execution and reports; begin with `api`, then `runs`."""
+"""Holds the command line, experiments, Monte Carlo runs and reports; begin with `api`, then `runs`."""

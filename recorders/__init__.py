@@ -1,4 +1,4 @@
-"""The log, the sensor and motion models, the simulators and the importers of real data.
+"""Holds the log, sensor and motion models, the simulators and the importers of real data.
 
 Begin with `recording`, which says what a recorder is, and `log`.
 """

@@ -1,4 +1,4 @@
-"""The streams of a sound that microphones heard: differences of its arrivals, and where they are."""
+"""Makes the streams of a sound that microphones heard: differences of arrivals, and their places."""
 
 from typing import NamedTuple
 
@@ -37,7 +37,7 @@ def difference_stream(
     speed_of_sound_mps: float,
     weighting: Weighting = "phat",
 ) -> Stream:
-    """The arrivals of one sound at several microphones.
+    """Return the arrivals of one sound at several microphones.
 
     Args:
         prefix: of the topic, which ends with `/differences`.

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all.
+"""Writes files and folders that appear whole or not at all.
 
 What is being written lies in a working folder of its own, beside its place:
 

@@ -1,4 +1,4 @@
-"""The one exception for what a user can mend, and how its sentences are worded and shown."""
+"""Defines the one exception for what a user can mend, and how its sentences are worded and shown."""
 
 from collections.abc import Collection
 from itertools import islice
@@ -8,7 +8,7 @@ _NAMED, _COMPARED = 50, 2000
 
 
 class BadInput(Exception):
-    """Input that no run can use: one sentence with the file, topic, field or option, and the mend.
+    """States why input cannot be used: one sentence with the file, topic, field or option, and the mend.
 
     The command line prints the sentence and exits with 2; it never shows a traceback for it.
     """

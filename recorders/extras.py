@@ -27,7 +27,7 @@ def extra(name: str, what: str) -> Iterator[None]:
 
 
 class AtFirstUse(ModuleType):
-    """A module of an extra that is imported when its first attribute is asked for."""
+    """Represents a module of an extra, imported when its first attribute is asked for."""
 
     def __init__(self, module: str, name: str, what: str) -> None:
         super().__init__(module)

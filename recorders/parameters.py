@@ -1,4 +1,4 @@
-"""Parameters of scenarios, estimators and experiments: typed, bounded, and refused with one sentence."""
+"""Reads parameters of scenarios, estimators, experiments: typed, bounded, refused with a sentence."""
 
 import math
 import re
@@ -20,7 +20,7 @@ _POINTED = re.compile(r"\s*[+-]?(\d+\.|\.\d+)([eE][+-]?\d+)?\s*")  # numbers tha
 
 
 class Parameters(BaseModel):
-    """Base of all parameter types: immutable, no unknown names, no NaN and no infinity.
+    """Is the base of all parameter types: immutable, no unknown names, no NaN and no infinity.
 
     A default is of the declared type as what is given is: `sigma_m: float = 1` is 1.0.
 
@@ -125,7 +125,7 @@ MOST_WORDS = 8  # of a name
 
 
 def unit_of(name: str) -> str:
-    """The unit of a parameter, as the end of its name says it; empty where it says none.
+    """Return the unit of a parameter, as the end of its name says it; empty where it says none.
 
     >>> unit_of("turn_bias_radps"), unit_of("clutter_per_m2"), unit_of("gate_probability")
     ('rad/s', '1/m^2', '')
@@ -141,7 +141,7 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
     An entry is `name: meaning`, or `name, name: meaning` where several mean alike. Raises BadInput where
     one names no parameter.
     """
-    told: dict[str, str] = {}
+    meaning_of: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         own = base.__doc__ if issubclass(base, Parameters) else None
         section = _ATTRIBUTES.search(cleandoc(own or ""))
@@ -152,8 +152,8 @@ def meanings(kind: type[BaseModel]) -> dict[str, str]:
                         f"{base.__name__}: its docstring says what '{name}' means, and it has no such "
                         f"parameter; {choices(name, kind.model_fields)}"
                     )
-                told[name] = " ".join(entry["meaning"].split())
-    return told
+                meaning_of[name] = " ".join(entry["meaning"].split())
+    return meaning_of
 
 
 def in_few_words(meaning: str) -> str:
@@ -171,12 +171,12 @@ def in_few_words(meaning: str) -> str:
 
 def _prose(kind: type[BaseModel]) -> str:
     """What a type and its bases say of their parameters as a whole."""
-    told = [
+    texts = [
         _ATTRIBUTES.sub("", cleandoc(each.__doc__ or "")).strip()
         for each in reversed(kind.__mro__)
         if issubclass(each, Parameters) and each is not Parameters
     ]
-    return "\n\n".join(filter(None, dict.fromkeys(told)))
+    return "\n\n".join(filter(None, dict.fromkeys(texts)))
 
 
 class Described(NamedTuple):
@@ -210,8 +210,8 @@ def explain(kind: type[BaseModel]) -> dict[str, str]:
     schema = kind.model_json_schema()
     places: dict[str, list[str]] = {}
     for place, table in _tables("", schema, schema.get("$defs", {})):
-        if told := table.get("description"):
-            places.setdefault(told, []).append(place)
+        if description := table.get("description"):
+            places.setdefault(description, []).append(place)
     return {", ".join(names): text for text, names in places.items()}
 
 
@@ -316,7 +316,7 @@ _OTHERS = "additionalProperties"  # of a table whose names are the user's
 
 
 def nested(name: str, value: Any) -> dict[str, Any]:
-    """The tables in which a value of this full name stands.
+    """Return the tables in which a value of this full name stands.
 
     >>> nested("range.rate_hz", 5.0)
     {'range': {'rate_hz': 5.0}}

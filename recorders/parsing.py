@@ -1,4 +1,4 @@
-"""JSON and TOML from outside: parsed, or refused as the one kind of error that says why.
+"""Parses JSON and TOML from outside, or refuses them as the one kind of error that says why.
 
 The parsers of the standard library also raise RecursionError, and accept what is nested so deeply that
 any code that walks it would.
@@ -33,14 +33,14 @@ def parse_json(text: str, *, constants: bool = False) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The values of a TOML text; raises ValueError where it is malformed or too deep."""
+    """Return the values of a TOML text; raises ValueError where it is malformed or too deep."""
     if _DOTTED_TOO_DEEP.search(text):
         raise ValueError(_TOO_DEEP)
     return _shallow(_toml, text)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file's values; raises BadInput where it is missing or malformed."""
+    """Return a TOML file's values; raises BadInput where it is missing or malformed."""
     try:
         return parse_toml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

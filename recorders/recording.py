@@ -21,10 +21,13 @@ SIMULATION_EPOCH_NS = 1_767_225_600_000_000_000
 
 
 def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
-    """Stamps in ns of times in s since the epoch of simulations, of the same shape.
+    """Compute the stamps of times since the epoch of simulations.
 
     Args:
         elapsed_s: of any shape, in s.
+
+    Returns:
+        The stamps, of the same shape, in ns.
 
     Raises BadInput where a stamp would be beyond what a log can hold.
     """
@@ -42,7 +45,7 @@ def simulation_stamps_ns(elapsed_s: ArrayLike) -> NDArray[np.int64]:
 def named_generator(
     rng: np.random.Generator, name: str, numbers: Mapping[str, int] | None = None
 ) -> np.random.Generator:
-    """A generator of its own for what has this name: one more name changes no other's numbers.
+    """Return a generator of its own for what has this name: one more name changes no other's numbers.
 
     Args:
         rng: of the run, or of a part of it; it is not drawn from.
@@ -60,7 +63,7 @@ def named_generator(
 
 @dataclass(frozen=True)
 class Recording:
-    """Streams in memory, before they are a log: one for every topic.
+    """Holds streams in memory, before they are a log: one for every topic.
 
     Attributes:
         streams: one for every topic.
@@ -82,7 +85,7 @@ class Recording:
 
 @dataclass
 class Blocks:
-    """Streams that come block by block, so that they may be more than memory holds.
+    """Yields streams block by block, so that they may be more than memory holds.
 
     Attributes:
         blocks: the streams of each; a topic may come again in every block.

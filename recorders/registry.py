@@ -1,4 +1,4 @@
-"""Recorders, estimators, metrics and studies by name.
+"""Finds recorders, estimators, metrics and studies by name.
 
 All register in one way, ours and third parties' alike: as entry points of an installed distribution
 (groups `fuselog.recorders`, `fuselog.estimators`, `fuselog.metrics`, `fuselog.studies`,
@@ -25,7 +25,7 @@ def available(kind: str) -> dict[str, EntryPoint]:
 
 
 def load(kind: str, name: str, expected: type = object) -> Any:
-    """The object registered under `name`.
+    """Return the object registered under `name`.
 
     Raises BadInput where there is none, with the names there are, where it does not import, or where it
     is not of the `expected` type.

@@ -1,4 +1,4 @@
-"""Trajectory files as benchmarks exchange them: TUM, KITTI and EuRoC.
+"""Reads and writes trajectories as benchmarks exchange them: TUM, KITTI and (read only) EuRoC.
 
 A line of a TUM file is time (s), position and quaternion x, y, z, w; of a KITTI file the upper three
 rows of a pose's matrix, without a stamp; of a EuRoC file, with commas, time (ns), position, quaternion
@@ -29,7 +29,7 @@ FARTHEST_M = 1e100
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses of a body along its way, in the order of time.
+    """Holds poses of a body along its way, in the order of time.
 
     Attributes:
         name: what to call it in a message.
@@ -65,7 +65,7 @@ class Trajectory:
         return len(self.position_m)
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Trajectory":
-        """Return the poses of these rows."""
+        """Return the poses of `rows`."""
         return Trajectory(
             self.name,
             self.position_m[rows],
@@ -76,7 +76,7 @@ class Trajectory:
 
 
 class _Layout(NamedTuple):
-    """What a line holds: a word for it, how many numbers at least and at most, and which is the time."""
+    """Describes what a line holds: a word for it, its least and most numbers, and which is the time."""
 
     columns: str
     least: int
@@ -109,6 +109,9 @@ def read_trajectory(path: str | Path, format: str | None = None) -> Trajectory: 
     Args:
         path: the file; lines that are empty or begin with # are passed over.
         format: one of `Format`; by default the content tells.
+
+    Returns:
+        The poses in the order of time; `notes` of them say what was mended.
 
     Raises BadInput that names the line where the file holds no trajectory.
     """
@@ -179,9 +182,9 @@ def _recognised(path: object, number: int, line: str) -> Format:
     for name in ("tum", "kitti"):
         if len(fields) == LAYOUTS[name].least:
             return name
-    told = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
+    layouts = "; ".join(f"{name} has {layout.columns}" for name, layout in LAYOUTS.items())
     raise BadInput(
-        f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {told}; "
+        f"{path}: line {number} is not a pose: it has {len(fields)} columns, where {layouts}; "
         "fuselog import table makes a log of a table with other columns"
     )
 

@@ -1,4 +1,4 @@
-"""Faults of logs, put into streams or taken out of them: each is a function of streams and one number.
+"""Puts faults into streams, or takes them out: each is a function of streams and one number.
 
 With the opposite number a fault is undone, but for what is lost. So one set of functions says what a
 diagnosis supposes, and what the experiment puts into logs to be found.
@@ -21,7 +21,7 @@ _BLOCKS = {"position_m": "covariance_m2", "velocity_mps": "covariance_m2ps2"}  #
 
 
 def altered(source: MemorySource, topic: str, alteration: Alteration, value: float) -> MemorySource:
-    """The run with one topic altered."""
+    """Return the run with one topic altered."""
     stream = alteration(source.streams[topic], value)
     return replace(source, streams={**source.streams, topic: stream})
 
@@ -201,7 +201,7 @@ def _renumbered(field: str, first: int, second: int, stream: Stream, _: float) -
 
 
 def exchanged(source: MemorySource, first: str, second: str) -> MemorySource:
-    """The run with the messages of two topics exchanged."""
+    """Return the run with the messages of two topics exchanged."""
     streams: Mapping[str, Stream] = {
         first: replace(source.streams[second], topic=first),
         second: replace(source.streams[first], topic=second),

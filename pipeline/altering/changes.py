@@ -44,7 +44,7 @@ _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*?)\s*
 
 
 class _Setting(NamedTuple):
-    """One setting of a topic: as it was written, and its parts."""
+    """Holds one setting of a topic: as it was written, and its parts."""
 
     key: str
     what: str
@@ -52,11 +52,11 @@ class _Setting(NamedTuple):
     empty: Stream
 
     def refused(self, expected: str) -> BadInput:
-        """The sentence on a value that makes no sense."""
+        """Return the sentence on a value that makes no sense."""
         return BadInput(f"--set {self.key}={self.value}: expected {expected}")
 
     def number(self, name: str, example: str) -> float:
-        """The value in the unit that `name` ends with, or in a unit of its own, as `300 ms`."""
+        """Return the value in the unit that `name` ends with, or in a unit of its own, as `300 ms`."""
         found = _NUMBER.fullmatch(str(self.value))
         if isinstance(self.value, bool) or found is None:
             raise self.refused(example)
@@ -70,7 +70,7 @@ class _Setting(NamedTuple):
         return number
 
     def several(self, counts: Sequence[int], example: str) -> list[str]:
-        """The value as a list, which may be written with commas."""
+        """Return the value as a list, which may be written with commas."""
         is_list = isinstance(self.value, list | tuple)
         parts = list(self.value) if is_list else str(self.value).strip("[] ").split(",")
         if len(parts) not in counts:
@@ -101,7 +101,7 @@ class Change:
 
     @property
     def is_moving(self) -> bool:
-        """Whether its stamps move."""
+        """Tell whether its stamps move."""
         return self.gain != 0.0 or self.delay_ns != 0.0
 
     def moved(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -110,16 +110,16 @@ class Change:
         return self.first_ns + np.rint(since_ns).astype(np.int64)
 
     def before(self, stamp_ns: int) -> int:
-        """A stamp that is moved to this one, but for rounding."""
+        """Return a stamp that is moved to this one, but for rounding."""
         since_ns = (stamp_ns - self.first_ns + self.delay_ns) * alter.pace(self.gain)
         return self.first_ns + round(since_ns)
 
     def stated(self, topic: Topic) -> Topic:
-        """The topic as it is altered, from the one that is stored."""
+        """Return the topic as it is altered, from the one that is stored."""
         return replace(topic, name=self.topic, metadata={**topic.metadata, **self.metadata})
 
     def altered(self, stream: Stream) -> Stream:
-        """The topic's messages altered, from those of the one that is stored.
+        """Return the topic's messages altered, from those of the one that is stored.
 
         Messages that would be before 1970 are left out: no log has such stamps.
         """
@@ -134,23 +134,23 @@ class Change:
 
 
 def is_of_topic(key: str) -> bool:
-    """Whether a setting is of a topic, and not of an estimator or experiment."""
+    """Tell whether a setting is of a topic, and not of an estimator or experiment."""
     return key.startswith("/")
 
 
 def bare(name: str) -> str:
-    """The name of a field or component without its unit: `x` of `x_m`."""
+    """Return the name of a field or component without its unit: `x` of `x_m`."""
     return name.rpartition("_")[0] if unit_of(name) else name
 
 
 def entry_of(field_: str, place: int) -> str:
-    """What an entry of a vector is called: `position_x_m` of `position_m`."""
+    """Return what an entry of a vector is called: `position_x_m` of `position_m`."""
     stem, _, unit = field_.rpartition("_")
     return f"{stem}_{AXES[place]}_{unit}"
 
 
 def changes_of(source: LogSource | MemorySource, settings: Mapping[str, Any]) -> dict[str, Change]:
-    """What settings of topics do to a run, by topic; several of one topic in their order.
+    """Return what settings of topics do to a run, by topic; several of one topic in their order.
 
     What can be set is in `WHATS`. A field is named in full, or without its unit, or by its beginning
     where that is clear; an entry of a vector with its axis, as `position_x_bias`; one of a state by its
@@ -190,8 +190,8 @@ def _of_one_topic(
             yield key, value
             continue
         for name, topic in source.topics.items():
-            is_told = stated_in(name, topic.metadata) or f"{name}.plane" in settings
-            if is_planar(topic.schema_name, topic.metadata) and not is_told:
+            is_stated = stated_in(name, topic.metadata) or f"{name}.plane" in settings
+            if is_planar(topic.schema_name, topic.metadata) and not is_stated:
                 yield f"{name}.plane", value
 
 

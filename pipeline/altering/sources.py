@@ -1,4 +1,4 @@
-"""Runs with some of their topics altered, as `--set /fix.delay_s=0.3` says; the files stay as they are.
+"""Alters topics of runs, as `--set /fix.delay_s=0.3` says; the files stay as they are.
 
 A log is altered block by block. A topic whose stamps move is read for itself, and merged with the others
 by its new stamps: memory holds a block of each, however far the stamps move.
@@ -31,7 +31,7 @@ def alter(source: MemorySource, settings: Settings) -> MemorySource: ...
 @overload
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource: ...
 def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | MemorySource:
-    """A run with topics altered; of one that is altered already, more so.
+    """Return a run with topics altered; of one that is altered already, more so.
 
     Where its topics state different planes, it is read in one of them; see `in_one_plane`.
 
@@ -92,7 +92,7 @@ def _before_1970(source: "AlteredLog | AlteredRecording") -> dict[str, tuple[int
 
 
 def alterations_of(source: Source) -> dict[str, Any]:
-    """How a run was altered, by `/TOPIC.WHAT`."""
+    """Return how a run was altered, by `/TOPIC.WHAT`."""
     return dict(source.alterations) if isinstance(source, AlteredLog | AlteredRecording) else {}
 
 
@@ -102,7 +102,7 @@ def note_of(source: Source) -> dict[str, str]:
 
 
 def setting_of(source: Source) -> dict[str, dict[str, Any]]:
-    """What the settings of a result say of the alterations; nothing where there are none."""
+    """Return what the settings of a result say of the alterations; nothing where there are none."""
     applied = alterations_of(source)
     return {NOTE: applied} if applied else {}
 
@@ -133,7 +133,7 @@ def split_settings(settings: Settings) -> tuple[dict[str, Any], dict[str, Any]]:
 
 @dataclass(frozen=True, repr=False)
 class AlteredRecording(MemorySource):
-    """A recording in memory whose streams are altered; `before` is what it was."""
+    """Represents a recording in memory whose streams are altered; `before` is what it was."""
 
     before: MemorySource = field(kw_only=True)
     alterations: Settings = field(kw_only=True)
@@ -160,19 +160,19 @@ def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
 
 @dataclass(frozen=True, repr=False)
 class AlteredLog(LogSource):
-    """A log file whose topics are altered as they are read."""
+    """Represents a log file whose topics are altered as they are read."""
 
     alterations: Settings = field(default_factory=dict)
 
     @cached_property
     def changes(self) -> dict[str, Change]:
-        """What is done to topics."""
+        """Return what is done to topics."""
         changes = changes_of(LogSource(self.log), self.alterations)
         return in_one_plane(self.name, self.log.topics, changes)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
-        """The log's topics as they are altered."""
+        """Return the log's topics as they are altered."""
         of_log = self.log.topics
         return {
             name: self.changes[name].stated(of_log[self.changes[name].stored])

@@ -47,6 +47,9 @@ def record(scenario: str | Path, /, *, seed: int = 0, run: int = 0, **parameters
         run: which run of the seed; scenario, parameters, seed and run give the same streams.
         parameters: what differs from the scenario's own.
 
+    Returns:
+        The recording, which maps every topic to its stream.
+
     Raises BadInput for an unknown scenario or parameter.
 
     >>> record("landmarks", seed=7, duration_s=2.0)["/robot1/odometry"].topic
@@ -157,6 +160,9 @@ def run(
             `{"duration_s": 20, "ekf": {"gate_probability": 0.99}}`.
         progress: is told how it goes.
 
+    Returns:
+        The folder, with the metrics, claims and tables in it.
+
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """
     stated = _stated(experiment)
@@ -212,6 +218,9 @@ def sweep(
         executor: as for `run`.
         set: as for `run`.
         progress: as for `run`.
+
+    Returns:
+        The folder, whose table `sweep` has a row per point, estimator and metric.
 
     Raises BadInput where it cannot be run, or the folder holds something else than a result.
     """

@@ -171,7 +171,7 @@ def _model(name: str, model: Model) -> Entry:
 
 
 def stated_of(model: Model) -> set[str]:
-    """The parameters of a model that a log's channels state where they are not given."""
+    """Return the parameters of a model that a log's channels state where they are not given."""
     own = model.parameters.model_fields.keys() - ModelParameters.model_fields.keys()
     return own & {*number_fields(model.parameters)}
 

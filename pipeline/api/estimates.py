@@ -1,4 +1,4 @@
-"""Estimates logs judged by the truth of the logs that they are of, as `fuselog evaluate` prints it."""
+"""Judges estimates logs by the truth of the logs that they are of, as `fuselog evaluate` prints it."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -32,7 +32,7 @@ from replay.judging.metrics.measuring import find_metrics
 
 @dataclass(frozen=True)
 class JudgedLogs:
-    """What estimates logs are worth.
+    """Holds the errors of estimates logs, judged by the truth.
 
     Attributes:
         sources: the estimates logs, and then the logs with the truth.

@@ -1,4 +1,4 @@
-"""Lints a log: what is wrong with it as it is written, before any filter."""
+"""Lints a log: finds what is wrong with it as it is written, before any filter."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +21,10 @@ def lint(log: Log, *, set: Mapping[str, Any] | None = None) -> list[Finding]:  #
     Args:
         log: a path, a log or a recording.
         set: alterations of topics, such as {"/imu.delay_s": 0.1}, with which it is looked at.
+
+    Returns:
+        The findings, each with its topic, the evidence in a sentence, and what to do; none where all
+        is well.
 
     Raises BadInput where the log cannot be read, or not be altered so.
 

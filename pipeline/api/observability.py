@@ -1,4 +1,4 @@
-"""Observability of logs: a table for Python, and the command that prints it."""
+"""Measures the observability of logs: makes a table for Python, and the command prints it."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -42,9 +42,11 @@ def observability(
         end_s: where the runs end, in seconds since each one's epoch.
         parameters: of the model.
 
-    Returns a row per run, case and window: its span, how many measurements it has, the rank and the
-    eigenvalues of the local Gramian, ascending, the direction of the least in state units and of length
-    one, and what that means in words.
+    Returns:
+        A row per run, case and window: its span, how many measurements it has, the rank and the
+        eigenvalues of the local Gramian, ascending, the direction of the least in state units and of
+        length one, and what that means in words.
+
     Raises BadInput where no model fits, or nothing is measured.
 
     >>> from pipeline.api.api import record

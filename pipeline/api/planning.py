@@ -30,7 +30,7 @@ Named = str | Estimator[Any] | Mapping[str, Kind]
 
 @dataclass(frozen=True)
 class Plan:
-    """A replay that can begin.
+    """Holds a replay that can begin.
 
     Attributes:
         sources: the spans of the runs.
@@ -125,6 +125,9 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
         path: an MCAP file.
         recover: read what is whole of a log that was cut off or damaged; a warning says what is missing.
 
+    Returns:
+        The log, which maps every topic to its stream.
+
     Raises BadInput where the file is missing or no MCAP, or is not whole and `recover` is False.
 
     >>> from pipeline.api.api import record, write
@@ -144,7 +147,7 @@ def open(path: str | Path, *, recover: bool = False) -> LogSource:  # noqa: A001
 def sources_of(
     logs: Log | Iterable[Log], alterations: Mapping[str, Any] | None = None
 ) -> list[LogSource | MemorySource]:
-    """One log or several as sources, with topics altered where that is asked for.
+    """Return one log or several as sources, with topics altered where that is asked for.
 
     Raises BadInput where there is none, or one is no log, or cannot be altered so.
     """
@@ -167,7 +170,7 @@ def _source(log: Log) -> LogSource | MemorySource:
 def settings_of(
     estimators: Named | Iterable[Named],
 ) -> dict[str, dict[str, Any]]:
-    """The settings of each estimator by its label; raises BadInput where they are none."""
+    """Return the settings of each estimator by its label; raises BadInput where they are none."""
     are_several = isinstance(estimators, Iterable) and not isinstance(estimators, str | Mapping)
     listed: list[Any] = [*estimators] if are_several else [estimators]  # type: ignore[misc]
     chosen: dict[str, dict[str, Any]] = {}

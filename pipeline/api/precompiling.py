@@ -63,7 +63,9 @@ def precompile(
         workers: processes, as many as there are cores by default; a script guards its own work with `if
             __name__ == "__main__":`, as they import it.
 
-    Returns a row for every model, method and scenario; of scenarios with the same sensors, the first.
+    Returns:
+        A row for every model, method and scenario; of scenarios with the same sensors, the first.
+
     Raises BadInput for an unknown name, a method that cannot estimate a model, or a cache where nothing
     would be kept.
     """
@@ -79,7 +81,7 @@ def precompile(
 
 
 def precompile_pairs(pairs: Iterable[Pair], *, workers: int | None = None) -> list[Precompiled]:
-    """The same for these pairs of a model and a method."""
+    """Return the same for these pairs of a model and a method."""
     pairs = list(dict.fromkeys(pairs))
     for model, method in pairs:
         modelled(load("models", model, Model), method)

@@ -1,4 +1,4 @@
-"""A replay as a function: logs and estimators in, and all that can be asked of what they gave.
+"""Replays as a function: takes logs and estimators, and answers all that can be asked of the result.
 
 The estimates lie in a scratch folder for as long as the replay is referred to: memory holds the metrics'
 sums, and what is asked for.
@@ -76,6 +76,9 @@ def replay(
         set: parameters of all estimators that have them, and how topics are altered before they are
             replayed: `{"gate_probability": 1.0, "/fix.delay_s": 0.3}`.
         metrics: which ones; none stands for all.
+
+    Returns:
+        The estimates of every run, and as tables their metrics, errors and innovations.
 
     Raises BadInput where no run can be replayed by one of the estimators.
 
@@ -213,7 +216,7 @@ class Replay:
         return coverage_table(self.done.coverage)
 
     def figure(self, case: str | None = None) -> "Figure":
-        """RMSE and NEES over time, of the first case (`robot1`, say) where none is named.
+        """Draw RMSE and NEES over time of a `case` such as `robot1`, by default of the first.
 
         Raises BadInput where there is no such case, or nothing was judged.
         """
@@ -258,7 +261,7 @@ class Replay:
             judge_logs([self.estimates[run]], [log], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write metrics, tables and figures as a result folder, for `fuselog report` and others.
+        """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -286,7 +289,7 @@ class Replay:
 
     @property
     def input_sha256(self) -> str:
-        """SHA-256 of what was replayed: of logs their files, of recordings their columns."""
+        """Return the SHA-256 of what was replayed: of logs their files, of recordings their columns."""
         digest = hashlib.sha256()
         for log in self.logs:
             if isinstance(log, MemorySource):

@@ -1,4 +1,4 @@
-"""Trajectories evaluated: of two files, or of the estimates that logs hold; numbers, tables, figures."""
+"""Evaluates trajectories, of two files or of the estimates that logs hold: numbers, tables, figures."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -60,7 +60,7 @@ class Evaluation:
 
     @cached_property
     def metrics(self) -> dict[str, float]:
-        """APE and RPE, as `ape_translation_rmse_m`; how many poses and pairs they are of."""
+        """Return APE and RPE, as `ape_translation_rmse_m`; how many poses and pairs they are of."""
         return trajectory_metrics([self.compared])
 
     @property
@@ -115,7 +115,7 @@ class Evaluation:
         return error_along_path(self.compared)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write metrics, tables and figures as a result folder, for `fuselog report` and others.
+        """Write metrics, tables and figures to the result folder `folder`, for `fuselog report`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -180,6 +180,9 @@ def evaluate(
         format: of the estimate's file: "tum", "kitti", "euroc"; by default its content tells.
         truth_format: of the truth's.
 
+    Returns:
+        Both trajectories and their errors, absolute (APE) and relative (RPE), in m and degrees.
+
     Raises BadInput where a file holds no trajectory, or the two cannot be compared.
 
     >>> way = np.array([[0.0, 0, 0], [1, 0, 0], [2, 1, 0], [3, 3, 0]])
@@ -198,7 +201,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class ComparedLogs:
-    """The estimates of logs as trajectories.
+    """Holds the estimates of logs as trajectories, compared with the truth.
 
     Attributes:
         estimates: of every run, aligned with its truth.
@@ -326,7 +329,7 @@ def _places(done: Compared) -> np.ndarray:
 
 
 def error_along_path(done: Compared) -> "Figure":
-    """The aligned path, its APE as colours, and the true one."""
+    """Draw the aligned path, its APE as colours, and the true one."""
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Calibration: how sensors are mounted, scaled, biased and delayed, by the search of `tune`.
+"""Calibrates by the search of `tune`: how sensors are mounted, scaled, biased and delayed.
 
 A model says which of its parameters these are, see `replay.inference.model.model.Model`.
 """
@@ -43,6 +43,9 @@ def calibrate(
         fixed: parameters of the calibration that are known, and stay as they are set.
         next_motion: also say which manoeuvre to record next, of a robot with wheels and fixes.
         options: as for `tune`, but for `free` and `by`.
+
+    Returns:
+        The parameters with 95 % intervals, and the logs replayed with the values before and after.
 
     Raises BadInput where the model marks none, nothing in the logs depends on what it marks, or a next
     motion is asked of logs without wheels and fixes.

@@ -1,4 +1,4 @@
-"""A car whose calibration is to be found: wheels, fixes of an antenna, a compass; each errs.
+"""Simulates a car whose calibration is to be found: wheels, fixes of an antenna, a compass; each errs.
 
 Scales and the bias are of the readings by the motion here; the model's, of the motion by the readings,
 are in `OURS`.
@@ -42,7 +42,7 @@ def changing_speed(time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def circle(time_s: Floats) -> tuple[Floats, Floats]:
-    """A circle of 20 m."""
+    """Return a circle of 20 m."""
     return np.full_like(time_s, SPEED_MPS), np.full_like(time_s, 0.4)
 
 
@@ -53,7 +53,7 @@ def circles(time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def slalom(time_s: Floats) -> tuple[Floats, Floats]:
-    """A slalom at 8 m/s."""
+    """Return a slalom at 8 m/s."""
     return np.full_like(time_s, SPEED_MPS), 0.4 * np.sin(0.8 * time_s)
 
 
@@ -68,7 +68,7 @@ MOTIONS: dict[str, Motion] = {
 
 
 class Steps(NamedTuple):
-    """The times between messages of wheels, fixes and compass, in s."""
+    """States the times between messages of wheels, fixes and compass, in s."""
 
     odometry_s: float = 0.1
     fix_s: float = 0.5
@@ -79,7 +79,7 @@ STEPS = Steps()
 
 
 class Measured(NamedTuple):
-    """What the car's log has, each with its stamps: odometry (n, 2), fixes (m, 2), compass."""
+    """Holds what the car's log has, each with its stamps: odometry (n, 2), fixes (m, 2), compass."""
 
     odometry_s: Floats
     odometry: Floats
@@ -125,7 +125,7 @@ def drive(
 
 
 def recorded(car: Measured, sigmas: tuple[float, float, float] = (10.0, 10.0, 0.1)) -> MemorySource:
-    """The car as a log, whose prior is about the origin."""
+    """Return the car as a log, whose prior is about the origin."""
     half, zero = 0.5 * car.compass_rad, np.zeros_like(car.compass_rad)
     streams = [
         make_stream(

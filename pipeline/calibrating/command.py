@@ -1,4 +1,4 @@
-"""The commands `fuselog calibrate` and `ellipsoid`: what is printed and written."""
+"""Prints and writes what `fuselog calibrate` and `ellipsoid` find."""
 
 from collections.abc import Sequence
 from functools import partial

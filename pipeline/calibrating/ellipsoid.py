@@ -1,4 +1,4 @@
-"""The calibration of a magnetometer or an accelerometer by turning it: offsets, scales, cross terms.
+"""Calibrates a magnetometer or an accelerometer by turning it: offsets, scales, cross terms.
 
 The field of the Earth and gravity have one length, whichever way a unit is turned. So corrected readings
 lie on a sphere, and readings on an ellipsoid, see `ellipsoid_fit`.
@@ -59,23 +59,23 @@ class Ellipsoid:
 
     @property
     def offset(self) -> Floats:
-        """(3,) in the field's unit; a magnetometer's hard iron, an accelerometer's bias."""
+        """Return (3,) in the field's unit; a magnetometer's hard iron, an accelerometer's bias."""
         return self.unit * self.fitted.numbers[:3]
 
     @property
     def matrix(self) -> Floats:
-        """(3, 3), symmetric; a magnetometer's soft iron, an accelerometer's scales and misalignment."""
+        """Return (3, 3), symmetric: a magnetometer's soft iron, else scales and misalignment."""
         return matrix_of(self.fitted.numbers) * self.length / self.unit
 
     @property
     def left_open(self) -> list[str]:
-        """What the readings do not determine: all, where they are of too few sides for any ellipsoid."""
+        """Say what the readings do not determine: all, where too few sides give no ellipsoid."""
         places = self.fitted.lacking.places
         return [NAMES[place] for place in places] if self.fitted.turned_about or not places else [*NAMES]
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row per number: value and 95 % interval; none of what is not determined."""
+        """Return a row per number: value and 95 % interval; none of what is not determined."""
         factors = np.where(np.arange(len(NAMES)) < 3, self.unit, self.length / self.unit)
         values = self.fitted.numbers * factors
         reach = QUANTILE * np.sqrt(np.diagonal(self.fitted.covariance)) * factors
@@ -86,7 +86,7 @@ class Ellipsoid:
 
     @property
     def settings(self) -> dict[str, str]:
-        """What corrects the readings of a log, for `set`; nothing where something is not determined."""
+        """Return what corrects a log's readings, for `set`; none where something is not determined."""
         if self.left_open:
             return {}
         stem, _, unit = self.field.rpartition("_")
@@ -99,13 +99,13 @@ class Ellipsoid:
 
     @property
     def lengths(self) -> tuple[Floats, Floats]:
-        """The lengths (n,) of readings as they are, and corrected."""
+        """Return the lengths (n,) of readings as they are, and corrected."""
         corrected = (self.readings - self.offset) @ self.matrix
         return np.linalg.norm(self.readings, axis=1), np.linalg.norm(corrected, axis=1)
 
     @property
     def notes(self) -> list[str]:
-        """Sentences: what is not determined, how well it fits, how it is applied."""
+        """Say what is not determined, how well it fits, how it is applied: a sentence each."""
         unit, fitted = unit_of(self.field), self.fitted
         before, after = (float(np.sqrt(np.mean((each - self.length) ** 2))) for each in self.lengths)
         sentences = []
@@ -139,7 +139,7 @@ class Ellipsoid:
 
     @property
     def chart(self) -> Chart:
-        """The lengths of the readings, as they are and corrected."""
+        """Draw the lengths of the readings, as they are and corrected."""
         rows = np.linspace(0, len(self.readings) - 1, min(_DRAWN, len(self.readings))).astype(int)
         before, after = (each[rows] for each in self.lengths)
         panel = Panel(
@@ -154,7 +154,7 @@ class Ellipsoid:
         return Chart(title=f"{self.topic}.{self.field}", panels=[panel])
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write the table and the figure as a result folder.
+        """Write the table and the figure to the result folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -184,6 +184,9 @@ def ellipsoid(logs: Log | Iterable[Log], field: str, *, length: float | None = N
         field: which, as `/imu.magnetic_field_ut`.
         length: of the vector, in the field's unit; by default gravity's of a specific force, else what
             makes the mean of the scales one.
+
+    Returns:
+        Offset (3,) and matrix (3, 3) with 95 % intervals, and how well they fit.
 
     Raises BadInput where a log has no such field, or too few readings.
     """

@@ -1,4 +1,4 @@
-"""The ellipsoid on which readings of a constant vector lie, however the unit is turned.
+"""Fits the ellipsoid on which readings of a constant vector lie, however the unit is turned.
 
 A sensor reads m = A^-1 u + b + n of a vector u of known length, with noise n that is alike in all
 directions. The length tells b and the symmetric A, by maximum likelihood; it does not tell a rotation
@@ -52,7 +52,7 @@ class Fit(NamedTuple):
 
 
 def matrix_of(values: Floats) -> Floats:
-    """The symmetric matrix A (3, 3) of values (9,)."""
+    """Return the symmetric matrix A (3, 3) of values (9,)."""
     matrix = np.diag(values[3:6])
     for (row, column), value in zip(PAIRS, values[6:], strict=True):
         matrix[row, column] = matrix[column, row] = value
@@ -60,7 +60,7 @@ def matrix_of(values: Floats) -> Floats:
 
 
 def middle(readings: Floats) -> tuple[Floats, float]:
-    """The middle (3,) of readings (n, 3), and their median distance from there."""
+    """Return the middle (3,) of readings (n, 3), and their median distance from there."""
     place = 0.5 * (readings.min(axis=0) + readings.max(axis=0))
     return place, float(np.median(np.linalg.norm(readings - place, axis=1)))
 

@@ -1,4 +1,4 @@
-"""The study of ellipsoids: how often their intervals hold the truth.
+"""Studies ellipsoids: how often their intervals hold the truth.
 
 A magnetometer is turned steadily, an accelerometer put down in many positions; both err by offsets,
 scales and cross terms.
@@ -34,7 +34,7 @@ STEP_S, HELD_S, MOVED_S, POSITIONS = 0.02, 2.0, 1.0, 40
 
 
 class EllipsoidOptions(Parameters):
-    """Which units are calibrated.
+    """States which units are calibrated.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.
@@ -76,13 +76,13 @@ def _held(unit: str, seed: int) -> dict[str, bool]:
 
 
 def calibrated(unit: str, seed: int) -> Ellipsoid:
-    """What is found of a simulated unit."""
+    """Return what is found of a simulated unit."""
     name, length = (FIELD, FIELD_UT) if unit == "magnetometer" else (FORCE, None)
     return ellipsoid(recorded(unit, seed), name, length=length)
 
 
 def recorded(unit: str, seed: int) -> MemorySource:
-    """A log of a simulated unit; its other sensors say zero."""
+    """Return a log of a simulated unit; its other sensors say zero."""
     draw, truth = UNITS[unit]
     rng = np.random.Generator(np.random.Philox(key=seed))
     vectors, noise = draw(rng)
@@ -102,7 +102,7 @@ def recorded(unit: str, seed: int) -> MemorySource:
 
 
 def turned(rng: np.random.Generator) -> tuple[Floats, float]:
-    """The field (n, 3) in a unit that is turned steadily for a minute, and the noise."""
+    """Return the field (n, 3) in a unit that is turned steadily for a minute, and the noise."""
     time_s = STEP_S * np.arange(3000)
     across, up = 1.1 * time_s, 1.5 * np.sin(0.13 * time_s)
     across, up = across + 6.0 * rng.random(), up + 0.05 * rng.random()

@@ -1,4 +1,4 @@
-"""A calibration as Kalibr writes one: mountings, time shifts and errors of sensors, in YAML.
+"""Writes a calibration as Kalibr does: mountings, time shifts and errors of sensors, in YAML.
 
 T_sensor_body takes a point from the body's axes to the sensor's, and a message was measured at its stamp
 plus timeshift_sensor_body; Kalibr has both of a camera as T_cam_imu and timeshift_cam_imu.

@@ -1,4 +1,4 @@
-"""Which manoeuvre to record next: what each would add to what logs tell of a calibration.
+"""Says which manoeuvre to record next: what each would add to what logs tell of a calibration.
 
 Wheeled manoeuvres are simulated without noise, with the sensors, steps and noise of the log and the
 values that were found, and asked for their information. Which is best depends on what is wanted: the
@@ -46,12 +46,12 @@ class Gain(NamedTuple):
 
     @property
     def widest(self) -> float:
-        """The largest standard deviation, in useful units."""
+        """Return the largest standard deviation, in useful units."""
         return float(self.sigmas.max())
 
 
 def gain(known: Floats, added: Floats) -> Gain:
-    """What an information (m, m), in useful units, adds to what is known (m, m).
+    """Return what an information (m, m), in useful units, adds to what is known (m, m).
 
     >>> found = gain(np.diag([4.0, 1.0]), np.diag([0.0, 3.0]))
     >>> round(found.nats, 3), found.sigmas.tolist()
@@ -62,7 +62,7 @@ def gain(known: Floats, added: Floats) -> Gain:
 
 
 def manoeuvres(found: Tuning) -> pd.DataFrame:
-    """A row per manoeuvre of 20 s, the one first after which the widest interval is narrowest.
+    """Return a row per manoeuvre of 20 s, the one first after which the widest interval is narrowest.
 
     Columns: manoeuvre, nats that it gains, and per parameter the standard deviation with it, in its own
     unit; the row "none" is what the logs tell already.

@@ -1,4 +1,4 @@
-"""The study of calibration: how often its intervals hold the truth, and what each motion leaves open.
+"""Studies calibration: how often its intervals hold the truth, and what each motion leaves open.
 
 Cars are calibrated one by one, from a start that knows nothing. What a motion determines is asked of a
 log without noise, under a prior so wide that it tells nothing.
@@ -25,7 +25,7 @@ NOISE = {"forward_noise_density": 0.05 * TRUTH[0], "turn_noise_density": 0.01 * 
 
 
 class CalibrationOptions(Parameters):
-    """Which cars are calibrated.
+    """States which cars are calibrated.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.

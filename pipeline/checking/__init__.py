@@ -1,1 +1,1 @@
-"""Checking: estimators against stored replays, field by field; begin with `checking`."""
+"""Checks estimators against stored replays, field by field; begin with `checking`."""

@@ -1,4 +1,4 @@
-"""Checking logs and results against a golden: what is replayed, and what is said of it."""
+"""Checks logs and results against a golden: what is replayed, and what is said of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ Runs = Mapping[str, LogSource | MemorySource]
 
 @dataclass(frozen=True)
 class Checked:
-    """A replay against its golden.
+    """Holds how a replay compares with its golden.
 
     Attributes:
         fields: how many fields of the golden's streams and metrics were compared, by run and topic.
@@ -60,7 +60,7 @@ def check(runs: Runs, golden: Golden, estimators: Settings | None = None) -> Che
 
 
 def compared(golden: Golden, replayed: Replayed) -> Checked:
-    """A replay, or what else was made again, against a golden."""
+    """Return a replay, or what else was made again, against a golden."""
     found = list(discrepancies(golden, replayed))
     fields = {("", "metrics"): len(golden["metrics"])} if golden["metrics"] else {}
     for name, run in golden["runs"].items():
@@ -69,7 +69,7 @@ def compared(golden: Golden, replayed: Replayed) -> Checked:
 
 
 def runs_of(path: Path) -> Runs:
-    """The runs of a log, of a folder of logs, or those whose logs a result kept.
+    """Return the runs of a log, of a folder of logs, or those whose logs a result kept.
 
     Raises BadInput where there are none.
     """

@@ -26,7 +26,7 @@ from replay.judging.errors.evaluation import split_topic
 
 
 class Discrepancy(NamedTuple):
-    """A part of a replay that is not the golden's.
+    """Describes a part of a replay that is not the golden's.
 
     Attributes:
         run: whose.
@@ -53,7 +53,7 @@ class Discrepancy(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """All of it in words."""
+        """Return all of it in words."""
         where = " ".join(filter(None, (self.run, self.topic, self.part)))
         detail = ""
         if self.row is not None:

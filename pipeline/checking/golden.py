@@ -1,4 +1,4 @@
-"""Goldens: small stored replays that later ones are checked against, field by field.
+"""Makes goldens: small stored replays that later ones are checked against, field by field.
 
 A golden is packed JSON: settings, a hash of every input, tolerances, and of every output stream the
 number of rows, the metadata, hashes of both clocks, a checksum of each row, and of every column some
@@ -35,7 +35,7 @@ Outputs = Mapping[str, Stream]
 
 
 class Tolerance(NamedTuple):
-    """A difference that is allowed: how large relative to a column's size, and why."""
+    """States by how much a column may differ, relative to its size, and why."""
 
     relative: float
     reason: str = ""
@@ -108,7 +108,7 @@ def golden_of(
     metrics: Mapping[str, Any] | None = None,
     tolerances: Tolerances | None = None,
 ) -> Golden:
-    """A golden of these parts, as reading gives it back."""
+    """Return a golden of these parts, as reading gives it back."""
     found = {
         "format": FORMAT,
         "arithmetic": arithmetic(),
@@ -161,7 +161,7 @@ def kept_rows(count: int, most: int) -> NDArray[np.int64]:
 
 
 def checksums(columns: Mapping[str, Floats]) -> NDArray[np.uint16]:
-    """A checksum (rows,) of each row's bits: which tells where the first that differs is."""
+    """Return a checksum (rows,) of each row's bits: which tells where the first that differs is."""
     parts = [
         column.reshape(len(column), math.prod(column.shape[1:])) for _, column in sorted(columns.items())
     ]

@@ -1,4 +1,4 @@
-"""Goldens as files: packed JSON, which a reader believes nothing but what it has looked at."""
+"""Reads and writes goldens: packed JSON, of which the reader believes only what it has checked."""
 
 import base64
 import json
@@ -46,11 +46,13 @@ Numbers = Annotated[Any, AfterValidator(_numbers)]
 
 
 class _Part(BaseModel):
+    """Refuses a part of a golden that has more names than its type."""
+
     model_config = ConfigDict(extra="forbid")
 
 
 class _Column(_Part):
-    """Some rows of a column, and over all rows how many are missing, their sum and that of squares."""
+    """Holds some rows of a column, and over all rows how many are missing, their sums and squares."""
 
     kept: Numbers
     missing: Numbers
@@ -68,6 +70,8 @@ class _Column(_Part):
 
 
 class _Stream(_Part):
+    """Holds what is kept of one topic: its stamps, and a checksum of every row."""
+
     rows: NonNegativeInt
     publish_times: str
     log_times: str
@@ -87,18 +91,24 @@ class _Stream(_Part):
 
 
 class _Run(_Part):
+    """Holds what is kept of one run: which log it was, and its outputs by topic."""
+
     input: str
     recorded: bool
     streams: dict[str, _Stream]
 
 
 class _Tolerance(_Part):
+    """States by how much numbers may differ, and why."""
+
     relative: NonNegativeFloat
     reason: str = ""
     elsewhere: bool = False
 
 
 class _Settings(_Part):
+    """Holds what the runs were replayed with."""
+
     estimators: dict[str, dict[str, Any]] = {}
     late: str | None = None
     arrival_order: bool = False
@@ -106,6 +116,8 @@ class _Settings(_Part):
 
 
 class _Golden(_Part):
+    """Holds all that the file of a golden has."""
+
     format: int
     arithmetic: str
     settings: _Settings

@@ -1,4 +1,4 @@
-"""The command `fuselog`: its commands and their options, and what they do.
+"""Defines the command `fuselog`: its commands and their options, and what they do.
 
 Commands import what they need when they run, so that `--help` answers at once. Begin with `group`.
 """

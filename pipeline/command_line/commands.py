@@ -96,7 +96,7 @@ def replay_logs(
     _state_losses(source.log for source in plan.sources if isinstance(source, LogSource))
     if tells_parameters and not as_json:
         print_parameters(done.parameters, done.stated)
-    told = {
+    details = {
         "seconds": dict(done.seconds),
         "parameters": done.parameters,
         "parameters_of_log": done.stated,
@@ -110,7 +110,7 @@ def replay_logs(
         alarms,
         as_json=as_json,
         written=paths,
-        told=told,
+        details=details,
         unused=unused,
     )
 
@@ -183,7 +183,7 @@ def evaluate_logs(
         alarms_of(found.judge, found.estimators, found.coverage),
         as_json=as_json,
         written=[out] if out else [],
-        told={"coverage": [row._asdict() for row in found.coverage]},
+        details={"coverage": [row._asdict() for row in found.coverage]},
         more=found.compared.metrics,
         unused=sentences(found.coverage),
     )
@@ -244,7 +244,7 @@ def _print_outcome(
     *,
     as_json: bool,
     written: Sequence[Path],
-    told: Mapping[str, Any] | None = None,
+    details: Mapping[str, Any] | None = None,
     more: Mapping[str, float] | None = None,
     unused: Sequence[str] = (),
 ) -> None:
@@ -263,7 +263,7 @@ def _print_outcome(
             "losses": [*judge.notes_of_coverage, *unused],
             "written": [str(path) for path in written],
         }
-        print_json(outcome | dict(told or {}))
+        print_json(outcome | dict(details or {}))
         return
     print_worst(alarms)
     runs = judge.runs_table if judge.runs >= FEWEST_RUNS else None  # of fewer it says nothing
@@ -277,8 +277,8 @@ def _print_outcome(
         )
     for sentence in [*judge.notes_of_coverage, *unused]:
         say(sentence)
-    if told and "seconds" in told:
-        print_table(("estimator", "time (s)"), list(told["seconds"].items()))
+    if details and "seconds" in details:
+        print_table(("estimator", "time (s)"), list(details["seconds"].items()))
     for path in written:
         say(str(path))
 

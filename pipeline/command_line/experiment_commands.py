@@ -94,9 +94,9 @@ def run_named(
     for cause in result.causes:
         say(f"likeliest cause of {cause.estimator}: {cause.words} {cause.mended}".rstrip())
     if result.claims or has_many_cases(result.metrics):
-        from pipeline.output.report.kinds import said  # it takes long to import
+        from pipeline.output.report.kinds import run_sentences  # it takes long to import
 
-        say(" ".join(said(result, done.folder)))
+        say(" ".join(run_sentences(result, done.folder)))
     runs = done.folder / RUNS
     details = done.folder / (
         "tables/summary.csv" if "tables/summary.csv" in result.files else RESULT_FILE

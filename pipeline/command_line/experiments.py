@@ -1,4 +1,4 @@
-"""Commands for experiments: running one, running it at many points, reporting results."""
+"""Has the commands for experiments: run one, run it at many points, report results."""
 
 from pathlib import Path
 from typing import Any

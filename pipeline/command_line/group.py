@@ -1,4 +1,4 @@
-"""The group `fuselog`: which commands there are, by what they are for."""
+"""Defines the group `fuselog`: which commands there are, by what they are for."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""A command's help: its docstring, and below it commands to try."""
+"""Makes a command's help: its docstring, and below it commands to try."""
 
 import inspect
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import click
 
 
 def with_examples(text: str, *examples: str) -> str:
-    """A help text that ends with commands to try, which click does not wrap."""
+    """Return a help text that ends with commands to try, which click does not wrap."""
     return "\n".join([inspect.cleandoc(text), "", "\b", *(f"    {each}" for each in examples)])
 
 

@@ -1,4 +1,4 @@
-"""Commands that judge estimates: against the truth, against others, and why they are inconsistent."""
+"""Has the commands that judge estimates: against the truth, against others, and why they differ."""
 
 from pathlib import Path
 from typing import Any

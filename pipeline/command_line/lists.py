@@ -1,4 +1,4 @@
-"""Commands that list what there is: scenarios, estimators, metrics, experiments, models, the cache."""
+"""Has the commands that list what there is: scenarios, estimators, metrics, models and more."""
 
 import click
 

@@ -1,4 +1,4 @@
-"""Commands on a log as it is: what it holds, in the viewer or other formats, cut, merged, renamed."""
+"""Has the commands on a log as it is: describe, view, export, cut, merge, rename."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Types of options, and the options that several commands have."""
+"""Defines types of options, and the options that several commands have."""
 
 import os
 from collections.abc import Callable
@@ -24,13 +24,13 @@ class Output(click.Path):
 
 
 class OutputFile(Output):
-    """A file to write: a new one, or a regular one that is replaced; never a device or a folder."""
+    """Accepts a file to write: a new one, or a regular one to replace; never a device or a folder."""
 
     def __init__(self, suffix: str) -> None:
         super().__init__(suffix, dir_okay=False)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        """The path."""
+        """Return the path."""
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if path.exists() and not path.is_file():
             self.fail(f"{path} is not a regular file", param, ctx)
@@ -38,7 +38,7 @@ class OutputFile(Output):
 
 
 class Seconds(click.ParamType):
-    """A time in seconds that fits the stamps of a log."""
+    """Reads a time in seconds that fits the stamps of a log."""
 
     name = "seconds"
 
@@ -46,7 +46,7 @@ class Seconds(click.ParamType):
         self._minimum = minimum
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number."""
+        """Return the number."""
         seconds = float(click.FLOAT.convert(value, param, ctx))
         if not self._minimum <= seconds <= 1e9:
             self.fail(
@@ -56,20 +56,20 @@ class Seconds(click.ParamType):
 
 
 class TimeOffset(Seconds):
-    """A time in seconds, or the word that asks to find it."""
+    """Reads a time in seconds, or the word that asks to find it."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The number or the word."""
+        """Return the number or the word."""
         return value if value == "estimate" else super().convert(value, param, ctx)
 
 
 class Place(click.ParamType):
-    """A place on the earth: latitude and longitude in deg, and perhaps the height in m."""
+    """Reads a place on the earth: latitude and longitude in deg, and perhaps the height in m."""
 
     name = "place"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The place as a list of numbers."""
+        """Return the place as a list of numbers."""
         from recorders.log.planes import EXAMPLE, origin_of
 
         found = origin_of(str(value).split(","))
@@ -89,7 +89,7 @@ FORMAT = click.Choice(["tum", "kitti", "euroc"])
 
 
 def settings_option(function: Callable[..., None]) -> Callable[..., None]:
-    """The option --settings, and that on programs which files such as that one name."""
+    """Return the option --settings, and that on programs which files such as that one name."""
 
     def allow(context: click.Context, parameter: click.Parameter, value: bool) -> None:  # noqa: ARG001
         allow_programs_of_files(value)
@@ -170,7 +170,7 @@ foxglove_option = click.option(
 
 
 def set_option(takes: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """The option --set of a command whose settings this takes, see `pipeline.api.asking.TAKERS`.
+    """Return the option --set of a command whose settings this takes, see `pipeline.api.asking.TAKERS`.
 
     Where it asks, NAME=?, the command prints what that parameter means, and does nothing else. A command
     that replays logs has --origin too, which is a setting of all their topics.

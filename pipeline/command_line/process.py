@@ -1,4 +1,4 @@
-"""The command line as a process: its exit code, what stops it, what it says of errors."""
+"""Runs the command line as a process: its exit code, what stops it, what it says of errors."""
 
 import io
 import logging
@@ -62,7 +62,7 @@ _LONGEST = 10_000
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the process to end: what holds for Ctrl-C holds for it."""
+    """Says that a signal asked the process to end, which is treated as Ctrl-C is."""
 
     def __init__(self, number: int) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Commands that make logs: of simulated scenarios, and of real data."""
+"""Has the commands that make logs: of simulated scenarios, and of real data."""
 
 import shlex
 from pathlib import Path

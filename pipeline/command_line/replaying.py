@@ -1,4 +1,4 @@
-"""Commands that replay estimators over logs: for their estimates, their parameters, or a check."""
+"""Has the commands that replay estimators over logs: for estimates, parameters, or a check."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The candidates of a comparison: what an estimator gave of every run, wherever that comes from.
+"""Reads the candidates of a comparison: what each gave of every run, wherever that comes from.
 
 A candidate's estimates are in logs, as `fuselog replay` writes them, or are made by a replay from what a
 result says of itself. What comes of a trajectory file is an estimate stream like any other.
@@ -82,7 +82,7 @@ class Candidate:
     coverage: Sequence[Row] = ()
 
     def estimates(self, run: str) -> Renamed:
-        """The estimates of a run that can be drawn, under this candidate's name."""
+        """Return the estimates of a run that can be drawn, under this candidate's name."""
         return Renamed(self.pairs[run][1], self.label, self.name)
 
 
@@ -159,7 +159,7 @@ def settings_of(source: Source, label: str, stated: Mapping[str, Any]) -> dict[s
 
 
 def parameters(label: str, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """An estimator's parameters, defaults included where this version knows it."""
+    """Return an estimator's parameters, defaults included where this version knows it."""
     try:
         return dict(configure(label, stated)[1].model_dump(mode="json", exclude_none=True))
     except BadInput:
@@ -178,13 +178,13 @@ def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
 
 
 def name_of(path: Path) -> str:
-    """A path's name as a label, which holds neither dot nor slash."""
+    """Return a path's name as a label, which holds neither dot nor slash."""
     stem = path.resolve().name.removesuffix(".estimates.mcap").removesuffix(path.suffix)
     return re.sub(r"[^\w:=+-]+", "-", stem).strip("-") or "side"
 
 
 def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[str] = ()) -> Given:
-    """The estimators of a replay, after those whose estimates its logs have already."""
+    """Return the estimators of a replay, after those whose estimates its logs have already."""
     runs = list(map(key_of, done.logs))
     for run in runs:
         if runs.count(run) > 1:
@@ -205,7 +205,7 @@ def of_replay(name: str, done: Replay, gap_limit_s: float, recorded: Sequence[st
 
 
 def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
-    """The estimators of an estimates log, or of a folder of them: a run each.
+    """Return the estimators of an estimates log, or of a folder of them: a run each.
 
     Raises BadInput where there are none, or a log that they are of is not there.
     """
@@ -246,7 +246,7 @@ def of_estimates(path: Path, gap_limit_s: float, *, recover: bool) -> Given:
 
 
 def of_result(folder: Path, progress: Progress) -> Given:
-    """The estimators of a result folder, replayed from its settings.
+    """Return the estimators of a result folder, replayed from its settings.
 
     A result holds RMSE and NEES of every run, but not every metric. Where a replay by this version gives
     the same rows, it gives the other metrics too; where it does not, the rows of the result count.
@@ -377,7 +377,7 @@ def _row_that_differs(kept: Candidate, again: Candidate) -> str:
 
 
 def of_trajectory(path: Path, source: Source, truth_topic: str, gap_limit_s: float) -> Given:
-    """A trajectory file as the estimates of a run, judged by one of its truths."""
+    """Return a trajectory file as the estimates of a run, judged by one of its truths."""
     trajectory = read_trajectory(path)
     name = name_of(path)
     truth = source.read([truth_topic])[truth_topic]

@@ -1,4 +1,4 @@
-"""Comparing estimators: paired differences of every metric over the same runs, with a verdict each."""
+"""Compares estimators: paired differences of every metric over the same runs, with a verdict each."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -51,7 +51,7 @@ SPANS = 32
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Differences:
-    """Estimators compared: the first of each group with every other one.
+    """Holds how estimators differ: the first of each group against every other one.
 
     Attributes:
         groups: the candidates.
@@ -109,7 +109,7 @@ class Differences:
         }
 
     def draw(self, save: Path) -> None:
-        """Write a timeline of the first run that both candidates of the first group have: side by side.
+        """Write to the .rrd file `save` the first run that both candidates of the first group have.
 
         Raises BadInput where no such run can be drawn.
         """
@@ -127,7 +127,7 @@ class Differences:
             judge_logs([estimates], [source], {}, gap_limit_s=self.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write tables, figures and the timeline as a result folder, for `fuselog report` and `view`.
+        """Write tables, figures and timeline to the result folder `folder`, for `fuselog report`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -229,6 +229,9 @@ def compare(
         stress: withhold verdicts on differences below what changes do that should not matter; see
             `stress`. It takes logs and `estimators`.
         progress: is told how a replay of results goes.
+
+    Returns:
+        The difference of every metric for every pair, with its interval and a verdict.
 
     Raises BadInput where there are not two candidates, or they have nothing in common.
 

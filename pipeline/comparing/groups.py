@@ -82,14 +82,14 @@ def inputs_of(
 
 
 def recorded_labels(paths: Sequence[Path], *, recover: bool) -> list[str]:
-    """The estimators of which all of some logs brought estimates along, as an autopilot's."""
+    """Return the estimators of which all of some logs brought estimates along, as an autopilot's."""
     logs = [path for path in paths if kind_of(path, recover=recover) in IN_LOGS and path.is_file()]
     found = [recorded_estimators(open_log(path, recover=recover)) for path in logs]
     return [label for label in found[0] if all(label in each for each in found)] if found else []
 
 
 def kind_of(path: Path, labels: Sequence[str] = (), *, recover: bool) -> str:
-    """What stands at a path: "result", "estimates", "log" or "trajectory".
+    """Return what stands at a path: "result", "estimates", "log" or "trajectory".
 
     A recording with estimates of its own is a log to whoever asks for `labels` that it lacks.
     """
@@ -208,7 +208,7 @@ def unlike_runs(first: Candidate, second: Candidate) -> Iterator[str]:
 
 
 def table_of_runs(groups: Sequence[Sequence[Candidate]]) -> pd.DataFrame:
-    """A row per candidate, case and run, with all its metrics."""
+    """Return a row per candidate, case and run, with all its metrics."""
     keys = ["case", "run"]
     found = {each.name: each.rows for group in groups for each in group}
     tables = [

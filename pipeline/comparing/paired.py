@@ -1,4 +1,4 @@
-"""A metric of two candidates, and the verdict on it; withheld where stress moves it further."""
+"""Judges a metric of two candidates; the verdict is withheld where stress moves it further."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -14,7 +14,7 @@ DECIDED = ("worse", "better", "higher", "lower")
 
 
 class Paired(NamedTuple):
-    """A metric of two candidates.
+    """Holds a metric of two candidates, run by run, with the verdict on it.
 
     Attributes:
         first, second: the candidates' names.
@@ -37,12 +37,12 @@ class Paired(NamedTuple):
 
     @property
     def is_withheld(self) -> bool:
-        """Whether changes that should not matter move the metric further than the difference."""
+        """Tell whether changes that should not matter move the metric further than the difference."""
         return self.found.verdict in DECIDED and abs(self.found.difference) < self.stressed
 
     @property
     def sentence(self) -> str:
-        """The verdict in words."""
+        """Return the verdict in words."""
         found = self.found
         of = f" of {self.case}" if self.case else ""
         values = f"{found.second:.4g} against {found.first:.4g}"
@@ -70,7 +70,7 @@ class Paired(NamedTuple):
 
 
 def under_stress(paired: Sequence[Paired], verdicts: Mapping[str, Stressing]) -> list[Paired]:
-    """Each metric with the largest change that stress makes to it, of either candidate."""
+    """Return each metric with the largest change that stress makes to it, of either candidate."""
     found = []
     for each in paired:
         key = each.quantity if each.case in ("", ALL) else f"{each.quantity}.{each.case}"

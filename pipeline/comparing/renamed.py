@@ -1,4 +1,4 @@
-"""The estimates of one label as a source of its own, under the name that a comparison has for it."""
+"""Gives the estimates of one label as a source, under the name that a comparison has for it."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from replay.engine.streams.sources import Source
 
 @dataclass(frozen=True)
 class Renamed:
-    """The estimates of one label alone, under another name: a source that is read as it is needed."""
+    """Represents the estimates of one label under another name, as a source that is read when needed."""
 
     estimates: Source
     label: str
@@ -28,7 +28,7 @@ class Renamed:
 
     @property
     def epoch_ns(self) -> int:
-        """The run's time zero."""
+        """Return the run's time zero."""
         return self.estimates.epoch_ns
 
     @property
@@ -38,7 +38,7 @@ class Renamed:
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:
-        """The label's topics."""
+        """Return the label's topics."""
         return {
             self._new(name): replace(topic, name=self._new(name))
             for name, topic in self.estimates.topics.items()
@@ -50,7 +50,7 @@ class Renamed:
         return self._renamed(self.estimates.read([self._old(topic) for topic in topics]))
 
     def empty(self, topic: str) -> Stream:
-        """The topic without its messages."""
+        """Return the topic without its messages."""
         return replace(self.estimates.empty(self._old(topic)), topic=topic)
 
     def blocks(
@@ -61,7 +61,7 @@ class Renamed:
         return map(self._renamed, self.estimates.blocks(own, order, block_messages))
 
     def whole(self) -> "Renamed":
-        """The run without a span."""
+        """Return the run without a span."""
         return replace(self, estimates=self.estimates.whole())
 
     def _renamed(self, streams: Mapping[str, Stream]) -> dict[str, Stream]:

@@ -9,7 +9,7 @@ from replay.engine.streams.sources import MemorySource, Source
 
 
 def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, MemorySource]:
-    """The log of a run, and what all candidates estimated of it, each under its name."""
+    """Return the log of a run, and what all candidates estimated of it, each under its name."""
     source = candidates[0].pairs[run][0]
     streams = {
         topic: stream
@@ -21,7 +21,7 @@ def side_by_side(candidates: Sequence[Candidate], run: str) -> tuple[Source, Mem
 
 
 def scene_of(candidates: Sequence[Candidate], run: str, gap_limit_s: float) -> dict[str, Chart]:
-    """A run from above, and a lens where errors are small; nothing without places in the plane."""
+    """Draw a run from above, and a lens where errors are small; nothing without places in the plane."""
     from pipeline.output.report.first_run import seen_from_above  # which takes long to import
     from pipeline.output.report.scene import lens, plan
 

@@ -1,4 +1,4 @@
-"""A filter as C99 for a robot: `fuselog deploy`.
+"""Writes a filter as C99 for a robot: `fuselog deploy`.
 
 Begin reading in `deploying`, which chooses and writes. `c_source` writes the filter itself; `c_replay`
 lets fuselog replay it, and `c_test` makes a recorded log its test.

@@ -1,4 +1,4 @@
-"""A recorded log as a test of a filter in C: what it is handed, and what ours makes of it."""
+"""Makes a recorded log a test of a filter in C: what it is handed, and what ours makes of it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
@@ -49,7 +49,7 @@ def vectors_of(source: LogSource, bound: Recursive, filtering: Filter) -> Vector
     begun: list[Any] = []
 
     class Listening(Filter):
-        """A filter that keeps both."""
+        """Filters, and keeps what it is handed and what it gives."""
 
         def filtered(self, state: Any, events: Any) -> Any:
             found = super().filtered(state, events)

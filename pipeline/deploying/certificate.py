@@ -114,7 +114,7 @@ def _compiled(made: CFilter, files: Mapping[str, str]) -> tuple[Memory | None, S
         return memory, _single(compiler, folder, made.name) if made.precision.ending else None
 
 
-def _said(folder: Path, *command: str | Path, check: bool = True) -> str:
+def _output_of(folder: Path, *command: str | Path, check: bool = True) -> str:
     return subprocess.run(
         command, cwd=folder, capture_output=True, text=True, check=check, encoding="utf-8"
     ).stdout
@@ -123,12 +123,12 @@ def _said(folder: Path, *command: str | Path, check: bool = True) -> str:
 def _memory(compiler: str, folder: Path, name: str) -> Memory | None:
     """Compile a filter; None where GCC, before 10, does not tell what its functions call and need."""
     try:
-        _said(folder, compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
+        _output_of(folder, compiler, *OPTIONS, "-fcallgraph-info=su", "-c", f"{name}.c")
         version, target = (
-            _said(folder, compiler, "-dumpfullversion"),
-            _said(folder, compiler, "-dumpmachine"),
+            _output_of(folder, compiler, "-dumpfullversion"),
+            _output_of(folder, compiler, "-dumpmachine"),
         )
-        sizes = _said(folder, "size", f"{name}.o").splitlines()[1].split()
+        sizes = _output_of(folder, "size", f"{name}.o").splitlines()[1].split()
         calls = next(folder.glob("*.ci")).read_text(encoding="utf-8")
     except (OSError, subprocess.CalledProcessError, IndexError, StopIteration):
         return None
@@ -139,12 +139,12 @@ def _single(compiler: str, folder: Path, name: str) -> Single | None:
     """Run a filter's test; None where it cannot be built here."""
     program = folder / "tried"
     try:
-        _said(folder, compiler, *OPTIONS, f"test_{name}.c", f"{name}.c", "-lm", "-o", program)
-        said = _said(folder, program, check=False)
+        _output_of(folder, compiler, *OPTIONS, f"test_{name}.c", f"{name}.c", "-lm", "-o", program)
+        output = _output_of(folder, program, check=False)
     except (OSError, subprocess.CalledProcessError):
         return None
-    compared = re.search(r"(\d+) estimates: furthest ([^,]+),", said)
-    lost = re.search(r"event (\d+), after ([^ ]+) s: the covariance is no longer", said)
+    compared = re.search(r"(\d+) estimates: furthest ([^,]+),", output)
+    lost = re.search(r"event (\d+), after ([^ ]+) s: the covariance is no longer", output)
     return Single(
         int(compared[1]) if compared else 0,
         float(compared[2]) if compared else math.inf,

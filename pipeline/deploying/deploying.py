@@ -62,6 +62,9 @@ def deploy(
         single: use single precision, `float`.
         parameters: of the estimator, such as `model="robot"`.
 
+    Returns:
+        The folder that was written.
+
     Raises BadInput where the filter cannot be written so, and where the folder is not empty.
 
     >>> from pipeline.api.api import record, write

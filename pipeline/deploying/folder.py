@@ -48,7 +48,7 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
     rows["worst case: `predict` and the costliest update"] = certificate.worst
     table = "\n".join(f"| {name} | {' | '.join(map(str, cost))} |" for name, cost in rows.items())
     memory = certificate.memory
-    bytes_said = (
+    bytes_in_words = (
         "No GCC was there to tell the bytes of code and stack."
         if memory is None
         else f"{memory.compiler}, {' '.join(OPTIONS)}: {memory.text} bytes of code and\nconstants, "
@@ -70,7 +70,7 @@ def _costs(made: CFilter, certificate: Certificate) -> str:
 
 At most: both sides of every condition count{iterated}.{saved}
 
-{bytes_said}"""
+{bytes_in_words}"""
 
 
 def _single(made: CFilter, certificate: Certificate, log: str) -> str:

@@ -1,4 +1,4 @@
-"""Diagnosing: why an estimator is inconsistent, by the faults without which it would not be.
+"""Diagnoses why an estimator is inconsistent, by the faults without which it would not be.
 
 Begin with `diagnosis`; `hypotheses` has the faults.
 """

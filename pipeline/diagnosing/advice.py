@@ -25,7 +25,7 @@ class Advice(NamedTuple):
 
     @classmethod
     def of(cls, setting: str) -> "Advice":
-        """A setting as `--set` takes it."""
+        """Return a setting as `--set` takes it."""
         key, _, text = setting.partition("=")
         try:
             return cls(key, float(text))
@@ -34,12 +34,12 @@ class Advice(NamedTuple):
 
     @property
     def settings(self) -> dict[str, float | str]:
-        """What is set, by its key."""
+        """Return what is set, by its key."""
         return {self.key: self.value, **dict(self.more)}
 
     @property
     def setting(self) -> str:
-        """The settings as `--set` takes them, one or several."""
+        """Return the settings as `--set` takes them, one or several."""
         return " ".join(f"{key}={value}" for key, value in self.settings.items())
 
 
@@ -58,7 +58,7 @@ class Trying:
     is_own: bool
 
     def over(self, advice: Advice) -> Advice:
-        """The advice with what is set already, which it would replace."""
+        """Return the advice with what is set already, which it would replace."""
         before, now = self.applied.get(advice.key), advice.value
         if isinstance(before, bool) or not isinstance(before, int | float) or isinstance(now, str):
             return advice
@@ -66,7 +66,7 @@ class Trying:
         return advice._replace(value=precise(before * now if is_factor else before + now))
 
     def words(self, advice: Advice) -> str:
-        """What to type."""
+        """Return what to type."""
         if self.is_own:
             line = f"set={json.dumps(advice.settings)}"
             tuning = f'fl.tune(LOG, {{"{self.label}": ...}}, "{advice.free}")'
@@ -80,12 +80,12 @@ class Trying:
 
 
 def rounded(value: float) -> float:
-    """A number in three digits, as a setting states it."""
+    """Return a number in three digits, as a setting states it."""
     return float(f"{value:.3g}")
 
 
 def precise(value: float) -> float:
-    """A number in four digits, as a setting of a topic states it."""
+    """Return a number in four digits, as a setting of a topic states it."""
     return float(f"{value:.4g}")
 
 

@@ -1,4 +1,4 @@
-"""The likeliest causes of an inconsistent filter: the hypotheses that gain most, one after the other."""
+"""Finds the likeliest causes of an inconsistent filter: the hypotheses that gain most, in turn."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -29,8 +29,8 @@ GROSS = float(np.log(20.0))  # a noise stated so many times too small is a sign 
 LEADING = 10  # of the likeliest faults: each is tried beside all others
 
 
-class Told(NamedTuple):
-    """A number that is told: the component or parameter it is of, and its 95 % interval."""
+class Estimated(NamedTuple):
+    """Holds a number of a cause: the component or parameter it is of, and its 95 % interval."""
 
     part: str
     value: float
@@ -39,7 +39,7 @@ class Told(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """A hypothesis with the number that gains most.
+    """Holds a hypothesis with the number that gains most.
 
     Attributes:
         hypothesis: what may be wrong.
@@ -58,37 +58,37 @@ class Cause(NamedTuple):
     of_halves: tuple[float, float] = (np.inf, np.inf)
 
     @property
-    def said(self) -> str:
-        """What is wrong, and by how much."""
+    def statement(self) -> str:
+        """Return what is wrong, and by how much."""
         return self.hypothesis.words(self.value, *self.ends)
 
     @property
-    def numbers(self) -> "list[Told]":
-        """The numbers with their intervals, as they are told: factors, not their logarithms."""
+    def numbers(self) -> "list[Estimated]":
+        """The numbers with their intervals, as they are reported: factors, not their logarithms."""
         of, (low, high) = self.hypothesis, self.ends
         if not isinstance(self.value, tuple):
-            return [Told(of.part, *(of.told(each) for each in (self.value, low, high)))]
+            return [Estimated(of.part, *(of.reported(each) for each in (self.value, low, high)))]
         names = [of.topic, *of.part.split(", ")][-of.size :]
-        return [Told(*each) for each in zip(names, self.value, low, high, strict=True)]
+        return [Estimated(*each) for each in zip(names, self.value, low, high, strict=True)]
 
     @property
     def words(self) -> str:
-        """What is wrong, by how much, and what that is known by."""
+        """Return what is wrong, by how much, and what that is known by."""
         or_else = "".join(
-            f"; this log does not determine it: as likely, {each.said}"
+            f"; this log does not determine it: as likely, {each.statement}"
             if each.hypothesis is self.hypothesis
-            else f"; or else, which this log does not tell from it, {each.said}"
+            else f"; or else, which this log does not tell from it, {each.statement}"
             for each in self.others
         )
         first, second = self.of_halves
         half, worst = ("first", first) if first < second else ("second", second)
         but = f"; but over the {half} half of the log it loses {number(-worst, 4)}: there it is not so"
         gained = f"; without this the log-likelihood gains {number(self.gain, 4)}"
-        return f"{self.said}{or_else}{gained}{but if worst < -DROP_95 else ''}"
+        return f"{self.statement}{or_else}{gained}{but if worst < -DROP_95 else ''}"
 
 
 class Tried(NamedTuple):
-    """A hypothesis that was tried on the log as it is, and the greatest gain that was found."""
+    """Holds a hypothesis that was tried on the log as it is, and the greatest gain that was found."""
 
     hypothesis: Hypothesis
     at: Peak
@@ -97,19 +97,19 @@ class Tried(NamedTuple):
     def row(self) -> tuple[str, str, str, str, float]:
         """Its kind, topic and part; the number, or numbers, that gain most; and that gain."""
         of, at = self.hypothesis, self.at.value
-        values = at if isinstance(at, tuple) else (of.told(at),)
+        values = at if isinstance(at, tuple) else (of.reported(at),)
         return of.kind, of.topic, of.part, ", ".join(number(each) for each in values), self.at.gain
 
 
 def tried_table(tried: Sequence[Tried]) -> pd.DataFrame:
-    """A row per hypothesis, the one that gains most first, less what its numbers cost."""
+    """Return a row per hypothesis, the one that gains most first, less what its numbers cost."""
     ranked = sorted(tried, key=lambda each: -each.at.score(each.hypothesis))
     names = ("kind", "topic", "part", "value", "gain")
     return pd.DataFrame([each.row for each in ranked], columns=names)
 
 
 def least_gain(count: int, size: int = 1) -> float:
-    """What the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
+    """Return what the best of so many hypotheses gains by chance in FALSE_ALARMS of all logs.
 
     Twice the gain is chi-square with as many degrees of freedom as there are numbers (Wilks), shared
     among them (Bonferroni).
@@ -198,13 +198,13 @@ def _likeliest(
 
 
 class _Supposed(NamedTuple):
-    """A fault with a number."""
+    """Holds a fault with a number."""
 
     of: Hypothesis
     value: Number
 
     def without(self, trial: Trial) -> Trial:
-        """The trial without it."""
+        """Return the trial without it."""
         return self.of.without(trial, self.value)
 
 

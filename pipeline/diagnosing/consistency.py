@@ -45,7 +45,7 @@ def unseen_errors(done: Replay, label: str, *, has_causes: bool) -> Iterator[Fin
 
 def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) -> dict[str, str]:
     """Find truths that are the very positions that the filter used, with a sentence on each."""
-    said = {}
+    sentences = {}
     for topic, about in source.topics.items():
         if about.schema_name != schemas.TRUTH_STATE.full_name or topic.startswith("/estimates/"):
             continue
@@ -60,11 +60,11 @@ def judged_by_itself(source: LogSource | MemorySource, streamed: Sequence[str]) 
             )
             apart = np.abs(stream["position_m"][here, :2] - truth["state"][there][:, columns])
             if len(here) >= SAME * len(stream) and np.mean((apart < 1e-6).all(axis=1)) >= SAME:
-                said[topic] = (
+                sentences[topic] = (
                     f"{topic} is what {used} says, which the filter used: it is no judge of errors and "
                     "NEES; give a reference of its own"
                 )
-    return said
+    return sentences
 
 
 def unnamed(

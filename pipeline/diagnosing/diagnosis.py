@@ -20,7 +20,7 @@ from pipeline.api.api import ResultFolder
 from pipeline.api.planning import Log, Named, settings_of, sources_of
 from pipeline.api.replays import Replay, replay
 from pipeline.diagnosing.advice import Advice, Trying
-from pipeline.diagnosing.causes import Sought, Told, least_gain, seek, tried_table
+from pipeline.diagnosing.causes import Estimated, Sought, least_gain, seek, tried_table
 from pipeline.diagnosing.consistency import (
     judged_by_itself,
     nis_charts,
@@ -92,12 +92,12 @@ class Diagnosis:
 
     @property
     def hypotheses(self) -> int:
-        """How many faults were tried."""
+        """Count how many faults were tried."""
         return len(self.tried)
 
     @property
     def told(self) -> list[str]:
-        """The sentences, numbered; or that nothing was found."""
+        """Return the sentences, numbered; or that nothing was found."""
         if not self.sentences:
             why = (
                 f"of {self.hypotheses} faults none surely gains {self.least_gain:.3g} in log-likelihood"
@@ -107,14 +107,14 @@ class Diagnosis:
 
     @property
     def causes(self) -> pd.DataFrame:
-        """A row per sentence, or per number of it: kind, topic, part, interval, gain, setting.
+        """Return a row per sentence, or per number of it: kind, topic, part, interval, gain, setting.
 
         What the log does not tell from a cause has the same number in the column `sentence_number`.
         """
         rows = []
         for order, each in enumerate(self.sentences, start=1):
-            told = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
-            nothing = [Told("", np.nan, np.nan, np.nan)]
+            shared = {"sentence_number": order, "kind": each.kind, "topic": each.topic}
+            nothing = [Estimated("", np.nan, np.nan, np.nan)]
             alike = (each.cause, *each.cause.others) if each.cause else ()
             for cause in alike or (None,):
                 about = cause.hypothesis if cause else None
@@ -122,7 +122,7 @@ class Diagnosis:
                 for part in cause.numbers if cause else nothing:
                     rows.append(
                         {
-                            **told,
+                            **shared,
                             **own,
                             **part._asdict(),
                             "gain": cause.gain if cause else np.nan,
@@ -134,23 +134,23 @@ class Diagnosis:
 
     @property
     def metrics(self) -> pd.DataFrame:
-        """A row per metric of the replay: estimator, quantity, case, value."""
+        """Return a row per metric of the replay: estimator, quantity, case, value."""
         return self.replay.metrics
 
     @cached_property
     def profiles(self) -> dict[str, Chart]:
-        """NIS per component over time, by case."""
+        """Draw NIS per component over time, by case."""
         innovations = Outputs(self.replay, schemas.INNOVATION)
         return nis_charts(self.label, innovations, self.replay.logs[0].epoch_ns)
 
     @property
     def marks(self) -> dict[str, Stream]:
-        """The sentences as messages by topic, for the timeline: at the stamp where each one began."""
+        """Return the sentences as messages by topic, for the timeline: stamped where each one began."""
         first_ns = self.replay.logs[0].extent("publish_time")[0]
         return marks_of(self.sentences, self.label, [*self.replay.estimates[0].topics], first_ns)
 
     def view(self, save: str | Path) -> None:
-        """Write the timeline of the replay, the sentences among its events, to an .rrd file.
+        """Write the timeline of the replay, the sentences among its events, to the .rrd file `save`.
 
         Raises BadInput where the file cannot be written.
         """
@@ -166,7 +166,7 @@ class Diagnosis:
             judge_logs(estimates, [log], {}, gap_limit_s=self.replay.gap_limit_s, drawing=drawing)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write sentences, tables, figures, metrics and a timeline as a result folder.
+        """Write sentences, tables, figures, metrics and a timeline to the result folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """
@@ -216,6 +216,9 @@ def diagnose(
             an estimates log one of its labels, by default its only one.
         set: parameters of the estimator, and how topics are altered; see `replay`.
         gap_limit_s: the truth is not interpolated over longer gaps.
+
+    Returns:
+        At most five sentences on what is wrong, and tables of the evidence.
 
     Raises BadInput where there are several logs, or the estimator does not fit the log, fails, or gives
     no innovations.
@@ -331,7 +334,7 @@ def _of_recorded(
 
 
 class _Followed(NamedTuple):
-    """A log that an estimator can follow, how it did, what had to be mended first, and a note on it."""
+    """Holds a log that an estimator can follow, how it did, what was mended first, and a note on it."""
 
     source: LogSource | MemorySource
     done: Replay
@@ -363,8 +366,8 @@ def _followed(
             raise
         trying = Trying(label, alterations_of(source), is_own=False)
         mends = [trying.over(Advice.of(each.setting)) for each in mended]
-        said = " ".join(f"--set {each.setting}" for each in mends)
-        note = f"all else is said of the log with {said}, since as it is: {error}"
+        settings_given = " ".join(f"--set {each.setting}" for each in mends)
+        note = f"all else is said of the log with {settings_given}, since as it is: {error}"
         with suppress(BadInput):
             other = alter(source, {each.key: each.value for each in mends})
             return replayed(other)._replace(mended=mended, notes=[note])

@@ -42,7 +42,7 @@ FLOOR_STEP = 1e-4  # relative, from the least variance to the next
 
 
 class Finding(NamedTuple):
-    """Something unusual: its kind, a topic, a sentence with its evidence, when it began, its mend."""
+    """Describes something unusual: its kind, topic, a sentence with evidence, its begin, its mend."""
 
     kind: Kind
     topic: str
@@ -117,7 +117,7 @@ def of_plausibility(source: LogSource | MemorySource, streamed: Collection[str])
 
 
 def component_table(innovations: Mapping[str, Stream]) -> pd.DataFrame:
-    """A row per measured component.
+    """Return a row per measured component.
 
     Of the normalised innovations: how many there are, their mean with its 95 % interval, mean square,
     the share beyond 3 standard deviations (0.27 % of a Gaussian), the excess kurtosis, the correlation

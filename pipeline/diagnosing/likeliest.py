@@ -1,4 +1,4 @@
-"""The likeliest cause of each inconsistent estimator of a result, and what its mend does to it."""
+"""Names the likeliest cause of each inconsistent estimator of a result, and what its mend does."""
 
 import math
 from collections.abc import Mapping

@@ -40,7 +40,7 @@ LEAST_SCORED = 0.5  # of the measurements: a trial that scores fewer is of anoth
 
 
 class Trial(NamedTuple):
-    """A run as it may be, and the estimator's settings as they may be.
+    """Holds a run as it may be, and the estimator's settings as they may be.
 
     `stretched` is by topic the logarithm of how many times larger the volumes are in which a message's
     measurement lies, compared with the log's: a density of numbers in other units is another one.
@@ -52,7 +52,7 @@ class Trial(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """The part of a trial that a filter can score.
+    """Holds the part of a trial that a filter can score.
 
     Attributes:
         source: its messages.
@@ -71,7 +71,7 @@ class Scored(NamedTuple):
 
 @dataclass
 class Likelihood:
-    """The log-likelihood of trials that have the measurements of one run.
+    """Computes the log-likelihood of trials that have the measurements of one run.
 
     Trials of equal settings are replayed together, as the runs of an ensemble.
 
@@ -213,12 +213,15 @@ class Likelihood:
             outputs = collect(replay(Ensemble(sources), bound, is_part=True))
         except BadInput:  # no run can be followed with these
             return [[{}] * count for _ in trials]
-        told = {
+        innovations = {
             topic: rows
             for topic, rows in outputs.items()
             if rows.stream.schema.full_name == schemas.INNOVATION.full_name
         }
-        runs = [{topic: rows.of_run(run) for topic, rows in told.items()} for run in range(len(sources))]
+        runs = [
+            {topic: rows.of_run(run) for topic, rows in innovations.items()}
+            for run in range(len(sources))
+        ]
         return [runs[first : first + count] for first in range(0, len(runs), count)]
 
     def _totals(self, scored: Scored, parts: Sequence[Mapping[str, Stream]], count: int) -> Floats:
@@ -325,7 +328,7 @@ def _foreseen(broad: Mapping[str, float], reading: Reading, innovations: Stream)
 
 
 def first_of_each(innovations: Stream, share: float) -> NDArray[np.bool_]:
-    """Whether rows are of the first share of their sensor's, told by what is measured.
+    """Tell whether rows are of the first share of their sensor's, told by what is measured.
 
     Of all rows it would be other measurements where a delay changes their order.
     """

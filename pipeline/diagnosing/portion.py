@@ -22,7 +22,7 @@ MOST_MESSAGES = 40_000  # of a log, by which causes are looked for: its first
 
 
 class Outputs(Mapping[str, Stream]):
-    """The outputs of a replay that have a schema, by topic: each is read anew when it is asked for.
+    """Maps topics to the outputs of a replay that have a schema: each is read anew when asked for.
 
     Of a long log they are much.
     """
@@ -45,13 +45,13 @@ class Outputs(Mapping[str, Stream]):
         return len(self._topics)
 
     def state(self, column: str) -> bool:
-        """Whether all of them have a column."""
+        """Tell whether all of them have a column."""
         firsts = (next(iter(self._estimates.blocks([topic], "publish_time", 1))) for topic in self)
         return all(column in stream.columns for first in firsts for stream in first.values())
 
 
 def silent(name: str, label: str, bound: Sequence[Bound]) -> BadInput:
-    """The sentence on an estimator that gives no innovations of a log of this name."""
+    """Return the sentence on an estimator that gives no innovations of a log of this name."""
     offers = (offer for each in bound for offer in getattr(each, "offers", {}).items())
     topic, setting = next(offers, ("", ""))
     mend = "give a filter of the same model, such as -e ekf"
@@ -61,14 +61,14 @@ def silent(name: str, label: str, bound: Sequence[Bound]) -> BadInput:
 
 
 def recorded(source: LogSource | MemorySource, label: str, gap_limit_s: float) -> Replay:
-    """The estimates that a recording has of an estimator, as if a replay had made them."""
+    """Return the estimates that a recording has of an estimator, as if a replay had made them."""
     estimates = Renamed(source, label, label)
     judge = judge_logs([estimates], [source], find_metrics(), gap_limit_s=gap_limit_s)
     return Replay([source], [estimates], {label: {}}, Pass(judge, {label: {}}), gap_limit_s)
 
 
 class Portion(NamedTuple):
-    """What the estimator reads of a log, in memory; `end_ns` is where it ends, None for all of it."""
+    """Holds what the estimator reads of a log, in memory, until `end_ns`; None stands for all of it."""
 
     source: MemorySource
     end_ns: int | None
@@ -78,7 +78,7 @@ class Portion(NamedTuple):
 def first_part(
     source: LogSource | MemorySource, bound: Sequence[Bound], streamed: Sequence[str]
 ) -> Portion:
-    """What the estimator reads of a log; of a long one its first MOST_MESSAGES."""
+    """Return what the estimator reads of a log; of a long one its first MOST_MESSAGES."""
     whole = dict.fromkeys(topic for each in bound for topic in each.static)
     streams = source.read([topic for topic in whole if topic in source.topics])
     parts: dict[str, list[Stream]] = {topic: [] for topic in streamed}
@@ -112,7 +112,7 @@ def on_the_rest(
     advised: Mapping[str, Any],
     end_ns: int,
 ) -> str:
-    """What following an advice gains after a part of the log, as a sentence goes on.
+    """Return what following an advice gains after a part of the log, as a sentence goes on.
 
     Args:
         source: the whole log.

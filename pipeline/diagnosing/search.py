@@ -30,7 +30,7 @@ NUMBER_COST = 3.0  # of log-likelihood, for each number that is found
 
 
 class Peak(NamedTuple):
-    """The value at which the gain of a fault is greatest, and that gain.
+    """Holds the value at which the gain of a fault is greatest, and that gain.
 
     `is_special` says that the value was not searched: it is one of the fault's special ones.
     """
@@ -40,7 +40,7 @@ class Peak(NamedTuple):
     is_special: bool = False
 
     def score(self, of: Hypothesis) -> float:
-        """The gain less what each number costs that is found."""
+        """Return the gain less what each number costs that is found."""
         is_free = of.tried and not self.is_special
         return self.gain - (NUMBER_COST * of.size if is_free else 0.0)
 

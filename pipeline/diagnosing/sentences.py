@@ -27,7 +27,7 @@ Rest = Callable[[Mapping[str, Any]], str]  # of settings, what they gain over th
 
 
 class Sentence(NamedTuple):
-    """What is wrong, and what to try; `topic` is the topic or parameter that it is of.
+    """Says what is wrong, and what to try; `topic` is the topic or parameter that it is of.
 
     `time_ns` is when it began, where it began in the run, `cause` what it is by its likelihood, if so,
     and `setting` what `--set` takes to undo it, such as `/fix.delay_s=0.3`.
@@ -42,7 +42,7 @@ class Sentence(NamedTuple):
 
     @property
     def names(self) -> list[tuple[Kind, str]]:
-        """What it names: a kind and a topic, and those that the log does not tell from it."""
+        """Return what it names: a kind and a topic, and those that the log does not tell from it."""
         others = self.cause.others if self.cause else ()
         return [
             (self.kind, self.topic),
@@ -51,7 +51,7 @@ class Sentence(NamedTuple):
 
     @classmethod
     def of(cls, found: Finding) -> "Sentence":
-        """A finding that no likelihood is needed for."""
+        """Return a finding that no likelihood is needed for."""
         return cls(found.kind, found.topic, found.words, found.time_ns, None, found.setting)
 
 

@@ -1,4 +1,4 @@
-"""The study of diagnosing: faults put into logs and settings, and how often a diagnosis names them.
+"""Studies diagnosing: faults put into logs and settings, and how often a diagnosis names them.
 
 Faults that cannot be told apart are one kind: a bearing's bias and its sensor's turned frame; and it is
 only between two frames, or two clocks, that a turn or a drift is seen, so that either may be named. What
@@ -45,7 +45,7 @@ CLEAN_RUN = "none"
 
 
 class Options(Parameters):
-    """What is diagnosed beside the scenarios.
+    """States what is diagnosed beside the scenarios.
 
     Attributes:
         battery_seed: the first seed of the battery, see `pipeline.diagnosing.battery.battery`.
@@ -57,7 +57,7 @@ class Options(Parameters):
 
 
 class Fault(NamedTuple):
-    """A fault, and what a diagnosis should say.
+    """Describes a fault, and what a diagnosis should say.
 
     Attributes:
         kind, topic: what is named; any topic where that is empty.
@@ -80,7 +80,7 @@ class Fault(NamedTuple):
 
 
 class Scenario(NamedTuple):
-    """What is recorded, the estimator, and the faults by name."""
+    """States what is recorded, the estimator, and the faults by name."""
 
     recorder: str
     parameters: Mapping[str, Any]
@@ -280,7 +280,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
                 found = diagnose(faulty, scenario.estimator, set=merge(fault.settings, OPEN))
                 row = {"scenario": name, "fault": fault_name, "run": run}
                 rows.append(
-                    {**row, "worth": _worth(scenario, fault, source, faulty), **_said(fault, found)}
+                    {**row, "worth": _worth(scenario, fault, source, faulty), **_named_by(fault, found)}
                 )
                 if fault_name == CLEAN_RUN:
                     clean.append(source)
@@ -326,7 +326,7 @@ def _worth(scenario: Scenario, fault: Fault, source: MemorySource, faulty: Memor
     return max(after - before, 0.0)
 
 
-def _said(fault: Fault, found: Diagnosis) -> dict[str, Any]:
+def _named_by(fault: Fault, found: Diagnosis) -> dict[str, Any]:
     """What the diagnosis said, and whether it is right."""
     is_right = [
         any(kind == fault.kind and fault.topic in ("", topic) for kind, topic in each.names)

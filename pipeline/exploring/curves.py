@@ -22,14 +22,14 @@ LINES = 400  # a curve has no more points than these, so that it follows the sli
 
 
 class Path(NamedTuple):
-    """Positions in the plane (n, 2), at times (n,) since the epoch."""
+    """Holds positions in the plane (n, 2), at times (n,) since the epoch."""
 
     time_s: Floats
     points: Floats
 
 
 class Nis(NamedTuple):
-    """Mean NIS per measured component of each span of time (n,), and where 95 % of these lie."""
+    """Holds the mean NIS per component of each span of time (n,), and where 95 % of these lie."""
 
     time_s: Floats
     mean: Floats
@@ -39,7 +39,7 @@ class Nis(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """What is drawn of one thing that is estimated, such as `robot1`.
+    """Holds the curves of one thing that is estimated, such as `robot1`.
 
     Attributes:
         name: of it; may be empty.
@@ -69,7 +69,7 @@ class Case:
 
     @property
     def nees_interval(self) -> tuple[float, float]:
-        """Where 95 % of the NEES of a consistent filter lie, of the components that the truth has."""
+        """Return where 95 % of NEES of a consistent filter lie, of the components that the truth has."""
         assert self.errors is not None
         low, high = np.asarray(chi2.ppf([0.025, 0.975], len(self.errors.components)))
         return float(low), float(high)
@@ -81,7 +81,7 @@ def cases_of(
     epoch_ns: int,
     estimated: Sequence[str] = (),
 ) -> dict[str, Case]:
-    """What is drawn of a filter's outputs on one log, by the name of what is estimated.
+    """Return what is drawn of a filter's outputs on one log, by the name of what is estimated.
 
     Args:
         outputs: by topic.
@@ -168,12 +168,12 @@ def _of_innovations(
 
 
 def fewer(count: int, most: int = LINES) -> NDArray[np.int64]:
-    """The rows that are drawn of so many: evenly chosen, with the first and the last."""
+    """Return the rows that are drawn of so many: evenly chosen, with the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
 
 
 def extremes(values: Floats, most: int = LINES) -> NDArray[np.int64]:
-    """The rows that are drawn of values (n,), the extremes of each span: no outlier is lost."""
+    """Return the rows that are drawn of values (n,), the extremes of each span: no outlier is lost."""
     count = len(values)
     if count <= most:
         return np.arange(count)
@@ -196,7 +196,7 @@ def ellipse(center: Floats, covariance: Floats, probability: float = 0.95) -> Fl
 
 
 def typical_time_s(case: Case) -> float | None:
-    """The second whose share of truths outside is nearest the whole run's: there the lens looks.
+    """Return the second whose share of truths outside is nearest the whole run's: there the lens looks.
 
     Of several the one in the middle of the run; None without truth.
     """
@@ -214,7 +214,7 @@ def typical_time_s(case: Case) -> float | None:
 
 
 def instant_of(case: Case | None) -> float:
-    """Where the lens looks at first: at a typical second, else in the middle."""
+    """Return where the lens looks at first: at a typical second, else in the middle."""
     if case is None or not len(case.time_s):
         return 0.0
     found = typical_time_s(case)
@@ -222,7 +222,7 @@ def instant_of(case: Case | None) -> float:
 
 
 def true_path(source: MemorySource, topic: str) -> Path | None:
-    """The path of a truth of a log; None where it has no position."""
+    """Return the path of a truth of a log; None where it has no position."""
     if topic not in source.topics:
         return None
     stream = source[topic]
@@ -235,7 +235,7 @@ def true_path(source: MemorySource, topic: str) -> Path | None:
 
 
 def map_points(source: MemorySource) -> Floats:
-    """The points of the log's map in the plane (n, 2)."""
+    """Return the points of the log's map in the plane (n, 2)."""
     found = [
         source[topic]["position_m"][:, :2]
         for topic, stated in source.topics.items()

@@ -1,4 +1,4 @@
-"""`fuselog explore` as a function: a page on which a filter's parameters are dragged."""
+"""Offers `fuselog explore` as a function: a page on which a filter's parameters are dragged."""
 
 import webbrowser
 from collections.abc import Mapping
@@ -33,8 +33,9 @@ def explore(
         gap_limit_s: the truth is not interpolated over longer gaps.
         show: open it in the browser, but in a notebook.
 
-    Returns what serves the page, until it is closed: `url` is its address, `wait()` waits until the last
-    page is closed, `close()` ends it.
+    Returns:
+        What serves the page until it is closed; `url` is its address, `wait()` waits until the last
+        page is closed, `close()` ends it.
 
     Raises BadInput where there are several logs, more than two filters, one cannot follow the log, or
     the extra `explore` is not installed.

@@ -1,4 +1,4 @@
-"""The page's words as HTML: verdicts, numbers, the labels of sliders. All text is escaped."""
+"""Writes the page's words as HTML: verdicts, numbers, labels of sliders. All text is escaped."""
 
 from collections.abc import Iterable, Mapping
 from html import escape

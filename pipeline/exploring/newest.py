@@ -7,7 +7,7 @@ Work = Callable[[Callable[[], bool]], None]
 
 
 class NewestFirst:
-    """A thread that does the newest work it is given; what was waiting before that is forgotten.
+    """Runs a thread that does the newest work it is given; what was waiting before that is forgotten.
 
     Work is handed a function that tells whether newer work waits, so that it can give up.
     """

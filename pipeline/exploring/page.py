@@ -1,4 +1,4 @@
-"""The page: sliders, plots and words, bound to a session. All replays run in the background."""
+"""Builds the page: sliders, plots and words, bound to a session. Replays run in the background."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -41,7 +41,7 @@ GROW = {"flex": "1 1 350px"}
 
 
 class Page:
-    """One page that looks at a session.
+    """Builds one page that looks at a session.
 
     Attributes:
         session: what it looks at.
@@ -72,7 +72,7 @@ class Page:
         log = self.session.log
         status = {"role": "status"}  # a screen reader says what changes
         self._head = Div(name="verdict", sizing_mode="stretch_width", html_attributes=status)
-        self._said = Div(name="said", sizing_mode="stretch_width", html_attributes=status)
+        self._sentences = Div(name="said", sizing_mode="stretch_width", html_attributes=status)
         self._saved = Div(name="saved", width=SIDE)
         self._cursor = Span(dimension="height", line_dash="dotted", line_color=QUIET, location=0.0)
         self._time = time = time_range(self.session.source.epoch_ns)  # its ends come with estimates
@@ -104,7 +104,7 @@ class Page:
         right = column(figures["error"], figures["nees"], figures["nis"], sizing_mode="stretch_width")
         left.styles = right.styles = {"flex": "1 1 330px"}
         both = row(left, right, sizing_mode="stretch_width", styles=WRAP)
-        main = column(self._head, self._said, both, sizing_mode="stretch_width", styles=GROW)
+        main = column(self._head, self._sentences, both, sizing_mode="stretch_width", styles=GROW)
         main.html_attributes = {"role": "main"}
         self._document.add_root(row(self._side, main, sizing_mode="stretch_width", styles=WRAP))
         self._document.title = f"fuselog explore: {self.session.source.name}"
@@ -233,8 +233,8 @@ class Page:
         self._tell("diagnosing ...")
 
         def work(_: Callable[[], bool]) -> None:
-            told = self.session.diagnosed(label, values)
-            self._later(lambda: self._tell(*told))
+            sentences = self.session.diagnosed(label, values)
+            self._later(lambda: self._tell(*sentences))
 
         self._work.ask(work)
 
@@ -381,11 +381,11 @@ class Page:
         return list(self.session.filters)[place]
 
     def _tell(self, *sentences: str) -> None:
-        self._said.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
+        self._sentences.text = "".join(f"<p>{escape(each)}</p>" for each in sentences)
 
     def _say_error(self, error: Exception) -> None:
-        said = str(error) if isinstance(error, BadInput) else f"this failed: {error!r}"
-        self._later(lambda: self._tell(said))
+        message = str(error) if isinstance(error, BadInput) else f"this failed: {error!r}"
+        self._later(lambda: self._tell(message))
 
     def _later(self, act: Callable[[], object]) -> None:
         """Change the page from the thread that may."""

@@ -1,4 +1,4 @@
-"""The plots of the page, and what fills them: Bokeh figures over sources that change while one drags."""
+"""Makes the plots of the page, and fills them: Bokeh figures over sources that change with a drag."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -46,7 +46,7 @@ Data = Mapping[str, Any]
 
 @dataclass
 class Plot:
-    """A figure with what changes in it.
+    """Holds a figure with what changes in it.
 
     Attributes:
         figure: as Bokeh draws it.
@@ -57,7 +57,7 @@ class Plot:
     sources: dict[tuple[int | str, str], ColumnDataSource] = field(default_factory=dict)
 
     def source(self, of: int | str, what: str, *columns: str) -> ColumnDataSource:
-        """A source that is empty still."""
+        """Return a source that is empty still."""
         made = ColumnDataSource({name: [] for name in columns}, name=f"{self.figure.name}-{what}-{of}")
         self.sources[of, what] = made
         return made
@@ -89,7 +89,7 @@ class Plot:
 
 
 def blank(name: str, title: str, *, over_time: Range1d | None = None, **options: Any) -> Plot:
-    """An empty figure of the page's look, without a tool bar."""
+    """Return an empty figure of the page's look, without a tool bar."""
     ranges = {} if over_time is None else {"x_range": over_time}
     made = figure(
         name=name,
@@ -165,7 +165,7 @@ def scene_plot(log: MemorySource, topics: Sequence[str]) -> Plot:
 
 
 def lens_plot() -> Plot:
-    """The scene at one instant, so near that errors of centimetres are seen."""
+    """Draw the scene at one instant, so near that errors of centimetres are seen."""
     plot = blank("lens", "Lens", x_range=Range1d(0, 1), y_range=Range1d(0, 1))
     plot.figure.axis.ticker = BasicTicker(desired_num_ticks=4)
     plot.figure.xaxis.ticker = BasicTicker(desired_num_ticks=2)  # of many digits each

@@ -41,7 +41,7 @@ CLOSED_MS = 3000  # after a page is closed; one that is loaded again is back by 
 
 
 class Explorer:
-    """A page that is served.
+    """Serves a page.
 
     Attributes:
         session: what it looks at.

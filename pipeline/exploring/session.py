@@ -1,4 +1,4 @@
-"""A log in memory and the filters on it: what a change of settings does, without server or browser."""
+"""Keeps a log in memory and the filters on it, without server or browser: replays what changes."""
 
 import json
 import math
@@ -39,7 +39,7 @@ MOST = 2  # filters side by side
 
 @dataclass(frozen=True)
 class Played:
-    """One filter's replay with some settings.
+    """Holds one filter's replay with some settings.
 
     Attributes:
         label: the filter's.
@@ -82,11 +82,11 @@ class Session:
 
     @property
     def log(self) -> MemorySource:
-        """What is in memory of the log."""
+        """Return what is in memory of the log."""
         return self._run.ensemble[0]
 
     def slider(self, name: str) -> Slider:
-        """The slider of a parameter; raises BadInput where it has none."""
+        """Return the slider of a parameter; raises BadInput where it has none."""
         found = next((each for each in self.sliders if each.name == name), None)
         if found is None:
             raise BadInput(f"no slider '{name}'; {choices(name, [each.name for each in self.sliders])}")
@@ -104,11 +104,11 @@ class Session:
         return {**like, "kind": modelled(model, method) if model else method}
 
     def with_filters(self, filters: Mapping[str, dict[str, Any]]) -> "Session":
-        """The same log with other filters; raises BadInput where one cannot follow it."""
+        """Return the same log with other filters; raises BadInput where one cannot follow it."""
         return Session(self.source, dict(filters), self.gap_limit_s)
 
     def with_estimated(self, names: Sequence[str]) -> "Session":
-        """The same with these parameters in the state, each from a quarter of its slider's way.
+        """Return the same with these parameters in the state, each from a quarter of its slider's way.
 
         Raises BadInput where a filter cannot estimate one.
         """
@@ -139,7 +139,7 @@ class Session:
     def likelihoods(
         self, label: str, values: Values, name: str, count: int = 15
     ) -> Iterator[tuple[float, float]]:
-        """The log-likelihood along one parameter: value and likelihood, from its least value on.
+        """Yield the log-likelihood along one parameter: value and likelihood, from its least value on.
 
         The gate is open: likelihoods of other measurements are not to be compared.
         """
@@ -165,7 +165,7 @@ class Session:
         return {**values, **{name: float(f"{best[name]:.4g}") for name in free}}, found.objective.by
 
     def diagnosed(self, label: str, values: Values) -> list[str]:
-        """What is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""
+        """Return what is likely to be wrong, in sentences; raises BadInput as `diagnose` does."""
         found = diagnose(
             self.source, {label: self.settings(label, values)}, gap_limit_s=self.gap_limit_s
         )
@@ -183,7 +183,7 @@ class Session:
             viewer.view(rrd, at_s=at_s)
 
     def settings(self, label: str, values: Values) -> dict[str, Any]:
-        """The settings of a filter, with values over its own where it has such parameters."""
+        """Return the settings of a filter, with values over its own where it has such parameters."""
         own = self.filters[label]
         taken = {name: value for name, value in values.items() if self._takes(label, name)}
         for name, value in taken.items():
@@ -193,7 +193,7 @@ class Session:
         return dict(own)
 
     def toml(self, values: Values) -> str:
-        """All filters' settings as a settings file has them, for `--settings`.
+        """Return all filters' settings as a settings file has them, for `--settings`.
 
         Raises BadInput where one is no text, such as an estimator of one's own.
         """

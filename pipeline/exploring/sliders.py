@@ -31,7 +31,7 @@ MOTION, GATE = "motion", "gate"
 
 
 class Slider(NamedTuple):
-    """A parameter that can be dragged.
+    """Describes a parameter that can be dragged.
 
     Attributes:
         name: of the parameter.
@@ -53,7 +53,7 @@ class Slider(NamedTuple):
 
     @property
     def title(self) -> str:
-        """The name as a person reads it: without its unit.
+        """Return the name as a person reads it: without its unit.
 
         >>> Slider("sigma_range_m", "", "", "m", 0.1, 0.01, 1.0, True).title
         'sigma range'
@@ -62,12 +62,12 @@ class Slider(NamedTuple):
         return self.name.removesuffix(end).replace("_", " ")
 
     def place(self, value: float) -> float:
-        """Where a value lies between the ends: 0 to 1, beyond them less or more."""
+        """Return where a value lies between the ends: 0 to 1, beyond them less or more."""
         value, low, high = (self._straight(each) for each in (value, self.low, self.high))
         return (value - low) / (high - low)
 
     def value(self, place: float) -> float:
-        """The value at a place from 0 to 1, to four digits; the own value where it is that."""
+        """Return the value at a place from 0 to 1, to four digits; the own value where it is that."""
         low, high = self._straight(self.low), self._straight(self.high)
         there = low + place * (high - low)
         value = float(f"{math.exp(there) if self.is_logarithmic else there:.4g}")
@@ -85,12 +85,12 @@ class Slider(NamedTuple):
         return math.log(value) if value > 0.0 else -math.inf
 
     def words(self, value: float) -> str:
-        """A value with its unit, as people write it."""
+        """Return a value with its unit, as people write it."""
         return in_words(value, self.unit)
 
 
 def in_words(value: float, unit: str) -> str:
-    """A number with its unit, as people write it.
+    """Return a number with its unit, as people write it.
 
     >>> in_words(0.1, "m"), in_words(0.02, "rad"), in_words(-0.99, ""), in_words(0.0, "rad")
     ('10 cm', '1.15°', '−0.99', '0°')
@@ -124,7 +124,7 @@ def ticks_between(low: float, high: float, unit: str) -> dict[float, str]:
 
 
 def sliders_of(source: LogSource | MemorySource, bound: Mapping[str, Bound]) -> list[Slider]:
-    """The parameters of filters that can be dragged, those of one group together.
+    """Return the parameters of filters that can be dragged, those of one group together.
 
     Of an estimator of a model these are the parameters that its functions read on this log; of any other
     all its numbers that have a value above zero, but for how a program is run.

@@ -14,7 +14,7 @@ Level = Literal["good", "doubtful", "failed"]
 
 
 class Verdict(NamedTuple):
-    """A judgement in words.
+    """States a judgement in words.
 
     Attributes:
         level: how bad it is.
@@ -63,7 +63,7 @@ def _ratio(case: Case, about: Set[str]) -> tuple[float, str]:
 
 
 def mean_nis(case: Case) -> float:
-    """The mean square of the whitened innovations; NaN without any."""
+    """Return the mean square of the whitened innovations; NaN without any."""
     known = {name: each for name, each in case.whiteness.items() if np.isfinite(each.mean_square)}
     count = sum(each.size for each in known.values())
     if not count:
@@ -83,7 +83,7 @@ def _evidence(case: Case) -> str:
 
 
 def numbers_of(case: Case) -> Mapping[str, tuple[float, str]]:
-    """The numbers at the head of the page, by what they are of, each with its unit."""
+    """Return the numbers at the head of the page, by what they are of, each with its unit."""
     found: dict[str, tuple[float, str]] = {}
     if case.errors is not None and len(case.errors.nees):
         main = case.errors.main

@@ -1,4 +1,4 @@
-"""The page's sliders, buttons, choices and the axis of time, as Bokeh has them."""
+"""Makes the page's sliders, buttons, choices and the axis of time, as Bokeh has them."""
 
 from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
@@ -37,7 +37,7 @@ view.render = function () {
 
 
 def widget_of(slider: Slider, value: float) -> Any:
-    """The slider of a parameter, from 0 to 1, at its value."""
+    """Return the slider of a parameter, from 0 to 1, at its value."""
     return SliderWidget(
         start=0.0,
         end=1.0,

@@ -1,1 +1,1 @@
-"""Logs as files: information, editing, and export for other tools; begin with `information`."""
+"""Handles logs as files: information, editing, and export; begin with `information`."""

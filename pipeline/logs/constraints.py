@@ -13,7 +13,7 @@ from recorders.parameters import Parameters
 
 
 class ConstraintParameters(Parameters):
-    """What is told of a body, and how it is known that it stands.
+    """States how often constraints on a body are told, and how it is known that it stands.
 
     Attributes:
         standing_hz: how many times a second it is told whether the body stands; 0 leaves it out.
@@ -49,13 +49,13 @@ def constraints_of(inertial: Stream, parameters: ConstraintParameters) -> list[S
     shaken, turned = unrest(time_ns, force, rate, parameters.window_s)
     stands = (shaken < parameters.still_mps2) & (turned < parameters.still_radps)
     rates_hz = {"standing": parameters.standing_hz, "rolling": parameters.rolling_hz}
-    told = {"standing": stands, "rolling": np.ones(len(stands), bool)}
+    holds = {"standing": stands, "rolling": np.ones(len(stands), bool)}
     beside, found = inertial.topic.rpartition("/")[0], []
     for name, rate_hz in rates_hz.items():
         if rate_hz > 0.0:
             turn = np.floor((time_ns - time_ns[0]) * (1e-9 * rate_hz) + 1e-6)
             rows = np.flatnonzero(np.diff(turn, prepend=-1.0) > 0.0)
-            value = told[name][rows, None].astype(float)
+            value = holds[name][rows, None].astype(float)
             metadata = {"components": name, "kinds": "linear"}
             stream = make_stream(
                 f"{beside}/{name}",

@@ -59,6 +59,9 @@ def cut(
             keep at most, as "5Hz"; messages of one stamp stay together.
         recover: read what is whole of a log that was cut off or damaged.
 
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+
     Raises BadInput where a name or pattern is of no topic, nothing is in the span, or something else is
     in the place of the output.
 
@@ -128,6 +131,9 @@ def merge(
             The sensors' own clock readings stay as they are.
         recover: read what is whole of logs that were cut off or damaged.
 
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+
     Raises BadInput where two logs have a topic in common, an offset is of no log or takes stamps out of
     range, or something else is in the place of the output.
 
@@ -163,11 +169,11 @@ def merge(
         for block in stream_blocks(log, names)
     )
     empty = [read_empty(log, name) for log, names in zip(logs, chosen, strict=True) for name in names]
-    told = [
+    merged = [
         f"{log.path.name}{f' {offset_ns * 1e-9:+g} s' if offset_ns else ''}"
         for log, offset_ns in zip(logs, offsets_ns, strict=True)
     ]
-    run = with_operation(joined_runs(logs, offsets_ns, target), "merge", f"merged {', '.join(told)}")
+    run = with_operation(joined_runs(logs, offsets_ns, target), "merge", f"merged {', '.join(merged)}")
     return write_changed(target, run, empty, blocks, notes)
 
 
@@ -190,6 +196,9 @@ def relabel(
             topics that begin so. The truth that estimates name need not be in their log.
         components: new names by old ones, such as "x_m": "east_m", of every topic that has them.
         recover: read what is whole of a log that was cut off or damaged.
+
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
 
     Raises BadInput where there is no such topic or component, two would have one name, or something else
     is in the place of the output.
@@ -237,6 +246,9 @@ def constrain(
         settings: of `ConstraintParameters`, such as {"rolling_hz": 10}.
         recover: read what is whole of a log that was cut off or damaged.
 
+    Returns:
+        The path of the new log, how many messages each topic has there, and sentences on what is lost.
+
     Raises BadInput where it is not clear which unit is meant, the log has such a topic, nothing is asked
     for, or something else is in the place of the output.
     """
@@ -252,8 +264,8 @@ def constrain(
             )
     notes = losses_of(log)
     for stream in added:
-        told, total = int(stream["value"].sum()), len(stream)
-        notes.append(f"{stream.topic}: holds at {told} of {total} stamps")
+        held, total = int(stream["value"].sum()), len(stream)
+        notes.append(f"{stream.topic}: holds at {held} of {total} stamps")
     chosen = readable_log(log, ranked(log), notes)
     empty = [*(read_empty(log, topic) for topic in chosen), *(each.take(slice(0)) for each in added)]
     names = " ".join(stream.topic for stream in added)

@@ -1,4 +1,4 @@
-"""Logs exported for other tools: estimates and truths as trajectories, any stream as a table.
+"""Exports logs for other tools: estimates and truths as trajectories, any stream as a table.
 
 A log is read once, block by block, so that memory does not grow with it, but for tracks, which are told
 frame by frame. No file is ever replaced.
@@ -36,7 +36,7 @@ Write = Callable[[Stream], None]
 
 
 class Exported(NamedTuple):
-    """The files that were written, with the topics in them, and sentences on what is not in them."""
+    """Holds the files that were written, by topic, and sentences on what is not in them."""
 
     files: dict[str, Path]
     notes: list[str]
@@ -62,6 +62,9 @@ def export(
             "foxglove", the file.
         topics: which; none stands for all that fit.
         recover: read what is whole of a log that was cut off or damaged.
+
+    Returns:
+        The files that were written, by topic, and sentences on what is not in them.
 
     Raises BadInput where a topic is not there or does not fit, or the place is taken.
     """

@@ -1,4 +1,4 @@
-"""Folders of logs, where a command takes them."""
+"""Finds the logs of folders, where a command takes them."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Companions: a log's streams as messages of Foxglove, so that its viewers show a log without fuselog.
+"""Makes companions of a log's streams: Foxglove's messages, which its viewers show without fuselog.
 
 They are for viewers alone: no replay reads them, and no command counts them among a log's streams. The
 definitions are Foxglove's own, https://docs.foxglove.dev/docs/sdk/schemas.

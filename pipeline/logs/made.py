@@ -4,7 +4,7 @@ from collections import Counter
 from pathlib import Path
 from shlex import quote
 
-from pipeline.output.report.kinds import said
+from pipeline.output.report.kinds import run_sentences
 from pipeline.output.results import RESULT_FILE, Result, read_result
 from pipeline.output.terminal import print_json, print_others, print_table, print_worst, say
 from recorders.errors import BadInput
@@ -16,7 +16,7 @@ def show_result(folder: Path, *, as_json: bool) -> None:
     if as_json:
         print_json({"path": str(folder), **result.model_dump(mode="json")})
         return
-    ran, came = said(result, folder)
+    ran, came = run_sentences(result, folder)
     say(f"{folder}: a result of {_what(result)}, fuselog {result.fuselog}: {ran}")
     print_worst(result.alarms)
     say(came)

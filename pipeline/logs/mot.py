@@ -1,4 +1,4 @@
-"""Tracks and truths as lines of the MOT Challenge, which TrackEval reads.
+"""Writes tracks and truths as lines of the MOT Challenge, which TrackEval reads.
 
 A frame is every half second from the run's epoch on, the first one has number 1. Tracks are predicted to
 it, truths interpolated. A target has no extent: its box begins where it is, in metres, and has no width
@@ -81,8 +81,8 @@ def _frames(epoch_ns: int, last_ns: int) -> Integers:
 
 def _track_lines(sizes: Stream, tracks: Stream, epoch_ns: int) -> Iterator[str]:
     frames = _frames(epoch_ns, int(sizes.publish_time_ns.max(initial=0)))
-    for number, told in enumerate(tracks_at(sizes, tracks, frames), start=1):
-        for track, place in zip(told.number, told.place, strict=True):
+    for number, at_frame in enumerate(tracks_at(sizes, tracks, frames), start=1):
+        for track, place in zip(at_frame.number, at_frame.place, strict=True):
             yield f"{number},{track},{_box(place)},1,-1,-1,-1"
 
 

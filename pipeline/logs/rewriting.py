@@ -23,7 +23,7 @@ UNKNOWN = "unknown"
 
 
 class Changed(NamedTuple):
-    """The log that was written, how many messages each topic has there, and what else is to be said."""
+    """Holds the log that was written, how many messages each topic has there, and what else to say."""
 
     path: Path
     messages: dict[str, int]
@@ -61,7 +61,7 @@ def ranked(log: Log) -> list[str]:
 
 
 def matching_topics(log: Log, patterns: Sequence[str]) -> list[str]:
-    """The topics that are named, or match a pattern; all where there are none."""
+    """Return the topics that are named, or match a pattern; all where there are none."""
     for pattern in patterns:
         if not any(fnmatchcase(topic, pattern) for topic in log.topics):
             raise UnknownName(f"{log.path}: no topic {pattern}; {choices(pattern, log.topics)}")
@@ -96,7 +96,7 @@ def losses_of(log: Log) -> list[str]:
 def readable_log(
     log: Log, topics: Sequence[str], notes: list[str], asked: Sequence[str] = ()
 ) -> list[str]:
-    """The topics that are columns; the messages and fields that are left out are noted.
+    """Return the topics that are columns; the messages and fields that are left out are noted.
 
     Raises BadInput where a topic that is asked for by name, or every topic, is none.
     """
@@ -153,6 +153,6 @@ def joined_runs(logs: Sequence[Log], offsets_ns: Sequence[int], target: Path) ->
 
 
 def with_operation(run: RunMetadata, command: str, done: str) -> RunMetadata:
-    """The run, with what a command did to its log, after what was done before."""
+    """Return the run, with what a command did to its log, after what was done before."""
     before = [run.notes[CHANGES]] if CHANGES in run.notes else []
     return replace(run, notes={**run.notes, CHANGES: "; ".join([*before, done]), CHANGED_BY: command})

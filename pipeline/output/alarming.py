@@ -28,7 +28,7 @@ UNUSED = 0.05  # of a topic's messages
 def alarms_of(
     judge: Judge, parameters: Mapping[str, Mapping[str, Any]], coverage: Sequence[Row] = ()
 ) -> list[Alarm]:
-    """The alarms of a judged replay, the worst first.
+    """Return the alarms of a judged replay, the worst first.
 
     Args:
         judge: of all runs.
@@ -183,9 +183,9 @@ def _of_gates(judge: Judge, parameters: Mapping[str, Mapping[str, Any]]) -> Iter
     }
     is_closed = any(each.total.accepted < each.total.messages for each in judge.innovations.values())
     if is_closed and len({*gates.values()}) > 1:
-        told = ", ".join(f"{gate:g} of {label}" for label, gate in gates.items())
+        own = ", ".join(f"{gate:g} of {label}" for label, gate in gates.items())
         words = (
-            f"gate_probability is {told}: their likelihoods are of different measurements; compare with "
+            f"gate_probability is {own}: their likelihoods are of different measurements; compare with "
             "--set gate_probability=1"
         )
         yield Alarm("gates", "", "", 1.0, words)

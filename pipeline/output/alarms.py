@@ -30,7 +30,7 @@ class Alarm:
 
 @dataclass(frozen=True)
 class Cause:
-    """Why an estimator is likeliest inconsistent, as a diagnosis found it.
+    """Says why an estimator is likeliest inconsistent, as a diagnosis found it.
 
     Attributes:
         estimator: whose.
@@ -53,7 +53,7 @@ NOT_TESTED = "not stress-tested: --stress says whether changes that should not m
 
 @dataclass(frozen=True)
 class Stressing:
-    """What changes that should not matter do to an estimator, over all runs.
+    """States what changes that should not matter do to an estimator, over all runs.
 
     Attributes:
         estimator: whose.

@@ -1,4 +1,4 @@
-"""Charts: figures made of series over axes, described once.
+"""Describes charts once: figures made of series over axes.
 
 A study says what there is to see: series, bands, labels with their units. The result folder keeps that
 as JSON, beside the SVG picture that is drawn of it here; the report draws it for a person to zoom.
@@ -66,7 +66,7 @@ class Drawn(Parameters):
 
 
 class Series(Drawn):
-    """Values y over x."""
+    """Holds values y over x."""
 
     y: Numbers
     style: Style = "line"
@@ -78,7 +78,7 @@ class Series(Drawn):
 
 
 class Band(Drawn):
-    """A range over x, such as where a value lies with 95 % if all is well."""
+    """Holds a range over x, such as where a value lies with 95 % if all is well."""
 
     low: Numbers
     high: Numbers
@@ -95,7 +95,7 @@ def _check_lengths(*columns: Sequence[Any]) -> None:
 
 
 class Panel(Parameters):
-    """Series and bands over two axes; a `plane` has one scale on both.
+    """Draws series and bands over two axes; a `plane` has one scale on both.
 
     Attributes:
         x, y: the axes.
@@ -114,7 +114,7 @@ class Panel(Parameters):
 
 
 class Chart(Parameters):
-    """Panels in rows of so many columns, with one legend unless their titles say what is drawn.
+    """Arranges panels in rows, with one legend unless their titles say what is drawn.
 
     Attributes:
         panels: row by row.
@@ -129,7 +129,7 @@ class Chart(Parameters):
     legend: bool = True
 
     def colours(self, first: Iterable[str] = ()) -> dict[str, str]:
-        """Return the colour of every label; charts that begin with the same labels agree on theirs."""
+        """Return the colour of every label; charts with the same labels `first` agree on theirs."""
         drawn: list[Drawn] = [each for panel in self.panels for each in (*panel.series, *panel.bands)]
         own = dict.fromkeys([*first, *(each.label for each in drawn if _has_own_colour(each))])
         colours = {label: COLOURS[index % len(COLOURS)] for index, label in enumerate(own)}
@@ -147,7 +147,7 @@ def _has_own_colour(drawn: Drawn) -> bool:
 
 
 def thinned(count: int, most: int = MOST_POINTS) -> slice:
-    """Every k-th of so many points: by default no more of them than a person sees in a line."""
+    """Return every k-th of so many points: by default no more of them than a person sees in a line."""
     return slice(None, None, max(1, -(-count // most)))
 
 
@@ -162,6 +162,9 @@ def curve(
         y: (n,), its values at x.
         style: how it is drawn.
         reference: whether it is what others are compared with.
+
+    Returns:
+        The series, for `Panel.series`.
     """
     return Series(label=label, x=_places(x), y=_numbers(y), style=style, reference=reference)
 
@@ -182,12 +185,15 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
         low: (n,), its lower end at x.
         high: (n,), its upper end at x.
         reference: whether it is what others are compared with.
+
+    Returns:
+        The band, for `Panel.bands`.
     """
     return Band(label=label, x=_places(x), low=_numbers(low), high=_numbers(high), reference=reference)
 
 
 def level(label: str, x: ArrayLike, y: float) -> Series:
-    """A value that others are seen against, from end to end."""
+    """Return a value that others are seen against, from end to end."""
     ends = np.asarray(x)[[0, -1]]
     return curve(label, ends, [y, y], reference=True)
 
@@ -224,7 +230,7 @@ def _numbers(values: ArrayLike) -> Numbers:
 
 
 def draw(chart: Chart) -> "Figure":
-    """The chart as a figure of matplotlib."""
+    """Draw the chart as a figure of matplotlib."""
     from matplotlib.figure import Figure
 
     rows = -(-len(chart.panels) // chart.columns)

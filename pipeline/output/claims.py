@@ -1,4 +1,4 @@
-"""Claims: statements of papers with our verdicts.
+"""Decides claims: statements of papers with our verdicts.
 
 A claim is stated as data, beside an experiment's settings in data/experiments: a sentence, what the
 paper says, and a comparison of metrics that decides it; see `pipeline.output.expressions`.
@@ -66,6 +66,9 @@ def judged(claim: str, paper: str, ours: str, holds: bool | np.bool_, why: str =
         holds: whether what was measured confirms the claim.
         why: as in `Claim`.
 
+    Returns:
+        The claim with its verdict, "confirmed" or "refuted".
+
     >>> judged("the filter is consistent", "NEES 3", "NEES 3.1", holds=True).verdict
     'confirmed'
     """
@@ -82,7 +85,7 @@ def known(claim: Claim) -> Claim:
 
 
 class StatedClaim(Parameters):
-    """A claim as an experiment's file says it.
+    """States a claim as an experiment's file has it.
 
     In texts, `{EXPRESSION:FORMAT}` is a number; everywhere `$NAME` is what `each` says.
 

@@ -1,4 +1,4 @@
-"""The table `coverage`: what became of every topic of a log; nothing is unused in silence."""
+"""Makes the table `coverage`: what became of every topic of a log; nothing is unused in silence."""
 
 import json
 import math
@@ -40,7 +40,7 @@ REPLAYED = "replayed"
 def untaken(
     sources: Sequence[Source], labels: Iterable[str], bound: Iterable[Bound], order: Clock
 ) -> list[Row]:
-    """The topics that an estimator does not take at all, in the replayed spans of all logs.
+    """Return the topics that an estimator does not take at all, in the replayed spans of all logs.
 
     Truths and maps are none, nor are controls but for those that it would take if told to.
     """
@@ -130,8 +130,8 @@ def _replayed(estimates: LogSource, source: LogSource) -> tuple[LogSource, Clock
 def replayed_note(source: Source, order: Clock) -> dict[str, str]:
     """The note REPLAYED of a source's estimates; none where it was replayed whole, by publish time."""
     ends = source.start_ns, getattr(source, "end_ns", None)
-    said = json.dumps([*ends, order])
-    return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: said}
+    text = json.dumps([*ends, order])
+    return {} if (*ends, order) == (None, None, "publish_time") else {REPLAYED: text}
 
 
 def _noted(note: str) -> tuple[int | None, int | None, Clock]:
@@ -162,14 +162,14 @@ def _recounted(
         usage.note_start(own_maps[name])
     streamed = sorted({topic for each in bound for topic in each.streams})
     empty = {topic: source.empty(topic) for topic in streamed}
-    told = [
+    counted = [
         topic
         for topic, about in estimates.topics.items()
         if about.schema_name in (INNOVATION, SKIPPED) and topic.rpartition("/")[0] in _places(bound)
     ]
-    for topic in told:  # that it has innovations is said by a topic without messages too
+    for topic in counted:  # that it has innovations is said by a topic without messages too
         usages[_places(bound)[topic.rpartition("/")[0]]].note_outputs([gather([estimates.empty(topic)])])
-    outputs = estimates.blocks(told, "publish_time", BLOCK_MESSAGES) if told else iter(())
+    outputs = estimates.blocks(counted, "publish_time", BLOCK_MESSAGES) if counted else iter(())
     inputs = source.blocks(streamed, order, BLOCK_MESSAGES) if streamed else iter(())
     reached_ns = -1
 
@@ -203,7 +203,7 @@ def _places(bound: Iterable[Bound]) -> dict[str, str]:
 def rows_of(
     usages: Mapping[str, Usage], others: Sequence[Row], doubts: Mapping[str, Doubt] | None = None
 ) -> list[Row]:
-    """All lines, by estimator and topic: what was counted, other topics, and doubtful truths."""
+    """Return all lines, by estimator and topic: what was counted, other topics, and doubtful truths."""
     rows = [row for usage in usages.values() for row in usage.rows()]
     there = {(row.estimator, row.topic) for row in rows}
     rows += [row for row in others if (row.estimator, row.topic) not in there]
@@ -228,7 +228,7 @@ def added(rows: Sequence[Row], more: Sequence[Row]) -> list[Row]:
 
 
 def stored_rows(folder: Path) -> list[Row]:
-    """The table `coverage` of a result; older ones have none."""
+    """Return the table `coverage` of a result; older ones have none."""
     path = folder / "tables" / "coverage.parquet"
     if not path.is_file():
         return []
@@ -237,12 +237,12 @@ def stored_rows(folder: Path) -> list[Row]:
 
 
 def rows_of_candidate(coverage: Sequence[Row], label: str, name: str) -> list[Row]:
-    """The lines of one estimator, under a candidate's name."""
+    """Return the lines of one estimator, under a candidate's name."""
     return [row._replace(estimator=name) for row in coverage if row.estimator == label]
 
 
 def coverage_table(rows: Sequence[Row]) -> "pd.DataFrame":
-    """A row per estimator and topic; see `Row`."""
+    """Return a row per estimator and topic; see `Row`."""
     import pandas as pd  # which takes long to import
 
     return pd.DataFrame(rows, columns=COLUMNS).astype({"used": "Int64", "gated": "Int64"})
@@ -253,5 +253,5 @@ def sentences(rows: Sequence[Row]) -> list[str]:
     measuring = {
         row.estimator for row in rows if row.used is not None and not row.why.startswith(UNTAKEN)
     }
-    told = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
-    return list(dict.fromkeys(row.sentence for row in told if row.sentence))
+    shown = [row for row in rows if row.why != UNTAKEN or row.estimator in measuring]
+    return list(dict.fromkeys(row.sentence for row in shown if row.sentence))

@@ -1,4 +1,4 @@
-"""Expressions over the metrics of a result: what claims are decided by, and numbers in their sentences.
+"""Evaluates expressions over a result's metrics, which decide claims and give their numbers.
 
     nees[ekf, robot1]          the metric `ekf.nees.robot1`
     nees[ekf]                  the metric `ekf.nees`
@@ -36,7 +36,7 @@ from recorders.errors import BadInput, choices
 
 
 class NoMetric(Exception):
-    """A metric that an expression names is not in the result."""
+    """Says that a metric which an expression names is not in the result."""
 
 
 class Values(NamedTuple):
@@ -54,7 +54,7 @@ class Values(NamedTuple):
 
 
 def evaluate(expression: str, values: Values) -> Value:
-    """The value of an expression.
+    """Return the value of an expression.
 
     Raises BadInput where it is none, and `NoMetric` where the result lacks one of its metrics.
     """
@@ -86,23 +86,23 @@ def formatted(template: str, values: Values) -> str:
         if expression is not None:
             found = evaluate(expression, values)
             try:
-                parts.append(_said(found, form or ".3g", named=conversion == "n"))
+                parts.append(_in_words(found, form or ".3g", named=conversion == "n"))
             except ValueError:
                 raise BadInput(f"'{form}' is no format of numbers; write as {{value:.2f}}") from None
     return "".join(parts)
 
 
 def expressions_in(template: str) -> list[str]:
-    """The expressions of a template; raises BadInput where its braces do not match."""
+    """Return the expressions of a template; raises BadInput where its braces do not match."""
     try:
         return [each for _, each, _, _ in Formatter().parse(template) if each is not None]
     except ValueError as error:
         raise BadInput(f"'{template}': {error}; write braces as {{{{ and }}}}") from None
 
 
-def _said(value: Value, form: str, *, named: bool) -> str:
+def _in_words(value: Value, form: str, *, named: bool) -> str:
     if isinstance(value, list):
-        return ", ".join(_said(each, form, named=named) for each in value)
+        return ", ".join(_in_words(each, form, named=named) for each in value)
     if not isinstance(value, Number):
         return value if isinstance(value, str) else {True: "yes", False: "no", None: "open"}[value]
     text = format(value.value, form)
@@ -113,7 +113,7 @@ def _said(value: Value, form: str, *, named: bool) -> str:
 
 @cache
 def parse(expression: str) -> ast.expr:
-    """The tree of an expression; raises BadInput where it has more in it than expressions may."""
+    """Return the tree of an expression; raises BadInput where it has more in it than expressions may."""
     quoted = re.sub(r"(\w)\[(?!-?\d+\])([^\[\]]*)\]", lambda each: f"{each[1]}[{each[2]!r}]", expression)
     try:
         tree = ast.parse(quoted.strip(), mode="eval").body
@@ -133,7 +133,7 @@ def parse(expression: str) -> ast.expr:
 
 
 def names_in(expression: str) -> set[str]:
-    """The names of numbers in an expression; raises BadInput where it is none."""
+    """Return the names of numbers in an expression; raises BadInput where it is none."""
     tree = parse(expression)
     nodes = list(ast.walk(tree))
     called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
@@ -190,7 +190,7 @@ def _value(node: ast.expr, values: Values) -> Value:
 
 
 def metric(quantity: str, of: str, values: Values) -> Value:
-    """The metric of `estimator, case`, or a list where these have `*` or `|`.
+    """Return the metric of `estimator, case`, or a list where these have `*` or `|`.
 
     Raises `NoMetric` where there is none.
     """
@@ -202,7 +202,7 @@ def metric(quantity: str, of: str, values: Values) -> Value:
 
 
 def keys_of(quantity: str, of: str, metrics: Mapping[str, Any]) -> dict[str, str]:
-    """The keys of the metrics of `estimator, case`, and what `*` and `|` stand for in each.
+    """Return the keys of the metrics of `estimator, case`, and what `*` and `|` stand for in each.
 
     Raises `NoMetric` where there is not what is named without a `*`.
     """

@@ -1,4 +1,4 @@
-"""Numbers with their 95 % intervals, and what expressions do with them.
+"""Computes with numbers and their 95 % intervals, as expressions need it.
 
 What an interval leaves open is neither true nor false. Operations and comparisons on lists are entry by
 entry.
@@ -15,7 +15,7 @@ from recorders.errors import BadInput
 
 
 class Number(NamedTuple):
-    """A number and where it lies with 95 %; the ends are the number itself where it has no interval."""
+    """Holds a number and where it lies with 95 %; without interval both ends are the number itself."""
 
     value: float
     low: float
@@ -35,13 +35,13 @@ Value = Number | Truth | list[Any]
 
 
 def exactly(value: float | None, name: str = "") -> Number:
-    """A number without an interval; NaN for None."""
+    """Return a number without an interval; NaN for None."""
     value = math.nan if value is None else float(value)
     return Number(value, value, value, name)
 
 
 def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
-    """The function of numbers, or of the entries of lists, which are of one length."""
+    """Return the function of numbers, or of the entries of lists, which are of one length."""
     lengths = {len(each) for each in arguments if isinstance(each, list)}
     if not lengths:
         return function(*arguments)
@@ -53,7 +53,7 @@ def by_entry(function: Callable[..., Any], *arguments: Value) -> Value:
 
 
 def combined(operation: Callable[[float, float], float]) -> Callable[[Number, Number], Number]:
-    """An operation on numbers with intervals: its ends are among those of its arguments' ends."""
+    """Return an operation on numbers with intervals: its ends are among those of its arguments' ends."""
 
     def of(one: float, other: float) -> float:
         try:
@@ -164,7 +164,7 @@ def _rising(function: Callable[[float], float]) -> Callable[[Value], Value]:
 
 
 def negative(number: Number) -> Number:
-    """The number with its sign changed."""
+    """Return the number with its sign changed."""
     return Number(-number.value, -number.high, -number.low, number.name)
 
 

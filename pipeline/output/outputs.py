@@ -22,7 +22,7 @@ CHANGES, CHANGED_BY = "changes", "changed by"
 
 
 class Kind(NamedTuple):
-    """A kind of file that a command writes: its suffix, what it is, and how it is known."""
+    """Describes a kind of file that a command writes: its suffix, what it is, and how it is known."""
 
     suffix: str
     what: str
@@ -142,7 +142,7 @@ def _holds_estimates(path: Path) -> bool:
 
 
 def changed(command: str) -> Kind:
-    """The log that one of the commands on logs made of others."""
+    """Return the log that one of the commands on logs made of others."""
 
     def is_changed(path: Path) -> bool:
         run = _run_of(path, is_changed=True)
@@ -152,7 +152,7 @@ def changed(command: str) -> Kind:
 
 
 def imported(source: str) -> Kind:
-    """The log of an importer."""
+    """Return the log of an importer."""
 
     def is_imported(path: Path) -> bool:
         run = _run_of(path)

@@ -44,14 +44,21 @@ MetricValue = float | list[float] | list[float | None] | None
 
 @dataclass
 class Outcome:
-    """Holds what a study found. Metric keys are `estimator.quantity_unit[.case]`.
+    """Holds what a study found.
 
-    `bounds` are where a metric lies with 95 % if all is well, `intervals` where the true one lies with
-    95 %, by the spread over runs. A figure is a chart, or a picture of another kind. `input_sha256` is
-    a hash of the data that went in, `parameters` are those of all estimators, defaults included,
-    `alarms` what makes the metrics doubtful, `causes` why an estimator is inconsistent, where it was
-    diagnosed, `stress` what changes do that should not matter, where it was stressed, `timings` the
-    seconds and messages of each estimator.
+    Attributes:
+        metrics: by `estimator.quantity_unit[.case]`.
+        claims: the statements of the paper, with our verdicts.
+        tables: by name.
+        figures: charts, or pictures of another kind, by name.
+        input_sha256: a hash of the data that went in.
+        parameters: those of all estimators, defaults included.
+        bounds: where a metric lies with 95 % if all is well.
+        intervals: where the true metric lies with 95 %, by the spread over runs.
+        alarms: what makes the metrics doubtful.
+        causes: why an estimator is inconsistent, where it was diagnosed.
+        stress: what changes do that should not matter, where it was stressed.
+        timings: the seconds and messages of each estimator.
     """
 
     metrics: dict[str, MetricValue] = field(default_factory=dict)
@@ -68,7 +75,7 @@ class Outcome:
     timings: dict[str, dict[str, float]] = field(default_factory=dict)
 
     def measure(self, key: str, value: float, low: float, high: float) -> None:
-        """Keep a metric with its 95 % interval."""
+        """Keep the metric `key`: its `value`, and its 95 % interval from `low` to `high`."""
         self.metrics[key], self.intervals[key] = float(value), (float(low), float(high))
 
 
@@ -104,7 +111,7 @@ class Result(Parameters):
 
     @property
     def contents(self) -> list[str]:
-        """The folders and files at the top of the result's folder."""
+        """Return the folders and files at the top of the result's folder."""
         return [*dict.fromkeys(Path(name).parts[0] for name in self.files)]
 
 
@@ -121,14 +128,14 @@ def split_metric(key: str) -> tuple[str, str, str]:
 
 
 def in_order(metrics: Mapping[str, MetricValue], estimators: Iterable[str]) -> dict[str, MetricValue]:
-    """The metrics of these estimators first and in their order, those of others as they were."""
+    """Return the metrics of these estimators first and in their order, those of others as they were."""
     place = {label: index for index, label in enumerate(estimators)}
     keys = sorted(metrics, key=lambda key: place.get(split_metric(key)[0], len(place)))
     return {key: metrics[key] for key in keys}
 
 
 class Measured(NamedTuple):
-    """A metric's value or what is said of it, and where it lies with 95 % if all is well."""
+    """Holds a metric's value, or the word for it, and where it lies with 95 % if all is well."""
 
     value: MetricValue | str = None
     bounds: Bounds | None = None
@@ -144,7 +151,7 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one case, by quantity and then by estimator; all estimators in one order."""
+    """Holds the metrics of one case, by quantity and then estimator; all estimators in one order."""
 
     case: str
     estimators: list[str]
@@ -152,7 +159,7 @@ class MetricTable:
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """A table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
+    """Return a table of a result's folder; Arrow itself opens no name beyond the locale's characters."""
     import pandas as pd
 
     with path.open("rb") as file:
@@ -164,7 +171,7 @@ def metric_tables(
     bounds: Mapping[str, Bounds],
     runs: "pd.DataFrame | None" = None,
 ) -> list[MetricTable]:
-    """The metrics by case; with a table of runs also the interval of the mean NEES over them."""
+    """Return the metrics by case; with a table of runs also the interval of the mean NEES over them."""
     over_runs = {} if runs is None else _nees_over_runs(runs)
     estimators = list(dict.fromkeys(split_metric(key)[0] for key in metrics))
     cases: dict[str, dict[str, dict[str, Measured]]] = {}
@@ -260,7 +267,7 @@ def _is_by_clock(path: Path) -> bool:
 
 
 def hash_of(path: Path) -> str:
-    """The SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -327,10 +334,10 @@ def keep(
     folder: Path, result: Result, **found: Sequence[Cause] | Sequence[Stressing] | Sequence[Claim]
 ) -> Result:
     """Write what was found afterwards, `causes`, or `stress` and `claims`, into a result's folder."""
-    told = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
+    sealed = _sealed(result.model_copy(update={name: [*each] for name, each in found.items()}))
     with whole_file(folder / RESULT_FILE) as new:
-        new.write_text(_text(told), encoding="utf-8")
-    return told
+        new.write_text(_text(sealed), encoding="utf-8")
+    return sealed
 
 
 def read_result(folder: Path) -> Result:

@@ -57,7 +57,7 @@ def summarise(
 
 
 def error_charts(judge: Judge) -> dict[str, Chart]:
-    """The errors of each case over time, where there are any."""
+    """Draw the errors of each case over time, where there are any."""
     steps = {topic: table for topic, table in judge.steps.items() if len(table)}
     judged = {topic: each for topic, each in judge.judged.items() if topic in steps}
     shown: dict[str, list[tuple[Errors, pd.DataFrame]]] = {}
@@ -163,7 +163,7 @@ def _outside(
 
 
 def by_case(table: pd.DataFrame, draw: Callable[[pd.DataFrame, str], Chart]) -> dict[str, Chart]:
-    """A chart of the rows of each case."""
+    """Draw a chart of the rows of each case."""
     if table.empty:
         return {}
     return {str(case): draw(rows, str(case)) for case, rows in table.groupby("case", sort=False)}
@@ -183,7 +183,7 @@ def mode_chart(modes: pd.DataFrame, case: str) -> Chart:
 
 
 def effective_chart(effective: pd.DataFrame, case: str) -> Chart:
-    """The mean share of the particles that is effective over time, all runs together."""
+    """Draw the mean share of the particles that is effective over time, all runs together."""
     x, y = Axis(label="time (s)"), Axis(label="effective share", limits=(0.0, 1.0))
     series = [
         curve(str(name), rows["elapsed_s"], rows["effective_share"])

@@ -1,4 +1,4 @@
-"""Quantities and numbers in words: what a person reads where a result has `position_rmse_m`."""
+"""Puts quantities and numbers in words: what a person reads for `position_rmse_m`."""
 
 import math
 import re
@@ -13,7 +13,7 @@ MISSING, MINUS, TIMES = "\u2013", "\u2212", "\u00d7"
 
 
 class Quantity(NamedTuple):
-    """A quantity in words.
+    """Names a quantity in words.
 
     Attributes:
         name: what a person calls it.
@@ -107,7 +107,7 @@ LESS_IS_BETTER = ("*rmse*", "*gospa*", "*ospa*", "*error*", "ape_*", "rpe_*", "l
 
 
 def quantity(key: str) -> Quantity:
-    """A quantity of a result in words; one that is not known by its own name, readably.
+    """Return a quantity of a result in words; one that is not known by its own name, readably.
 
     >>> quantity("turn_rmse_radps").name, quantity("turn_rmse_radps").unit
     ('turn error, RMS', 'radps')
@@ -126,7 +126,7 @@ def quantity(key: str) -> Quantity:
 
 
 def label_of(key: str, meaning: str = "") -> str:
-    """A quantity or a parameter as an axis has it, with the unit in which a result keeps it.
+    """Return a quantity or a parameter as an axis has it, with the unit in which a result keeps it.
 
     >>> label_of("position_rmse_m"), label_of("sigma_range_m", "standard deviation of a range")
     ('position error, RMS (m)', 'standard deviation of a range (m)')
@@ -138,13 +138,13 @@ def label_of(key: str, meaning: str = "") -> str:
 
 
 def is_error(key: str) -> bool:
-    """Whether less of a quantity is better, so that estimators may be compared by it."""
+    """Tell whether less of a quantity is better, so that estimators may be compared by it."""
     is_less_better = any(fnmatchcase(key, pattern) for pattern in LESS_IS_BETTER)
     return is_less_better and not key.startswith("standard_error")  # which says how sure a number is
 
 
 def meaning_alone(text: str) -> str:
-    """A sentence that begins with a parameter's name, with what that means in its place.
+    """Return a sentence that begins with a parameter's name, with what that means in its place.
 
     >>> meaning_alone("sigma_range_m (standard deviation of a range) is too small")
     'the standard deviation of a range is too small'
@@ -159,11 +159,11 @@ class Scale(NamedTuple):
     sign: str = ""
 
     def text(self, value: float | None, digits: int = DIGITS) -> str:
-        """A number in this unit, without the unit."""
+        """Return a number in this unit, without the unit."""
         return number(None if value is None else value * self.factor, digits)
 
     def with_unit(self, value: float | None, digits: int = DIGITS) -> str:
-        """A number with the unit."""
+        """Return a number with the unit."""
         text = self.text(value, digits)
         return (
             text
@@ -199,7 +199,7 @@ def scale(unit: str, *values: float | None) -> Scale:
 
 
 def number(value: float | None, digits: int = DIGITS) -> str:
-    """A number as people write it: so many digits, no e, a true minus, commas in thousands.
+    """Return a number as people write it: so many digits, no e, a true minus, commas in thousands.
 
     >>> [number(each) for each in (0.0266714, -7514.7, 3.0, 1e-7, 0.99999, None)]
     ['0.0267', '−7,515', '3', '1 × 10⁻⁷', '1', '–']
@@ -217,7 +217,7 @@ def number(value: float | None, digits: int = DIGITS) -> str:
 
 
 def stated(value: float) -> str:
-    """A number that a person set, as it was set: 0.05, not 0.0500."""
+    """Return a number that a person set, as it was set: 0.05, not 0.0500."""
     return f"{value:.4g}".replace("-", MINUS) if 1e-4 <= abs(value) < 1e6 else number(value)
 
 
@@ -256,7 +256,7 @@ def alike(values: Sequence[float], own: Scale, digits: int = DIGITS) -> list[str
 
 
 def count(number_of: int, one: str, many: str = "") -> str:
-    """A number of things.
+    """Return a number of things.
 
     >>> count(1, "run"), count(1200, "run")
     ('1 run', '1,200 runs')

@@ -1,4 +1,4 @@
-"""Runs of experiments: ensembles recorded, replayed and judged, in cells and sweeps.
+"""Runs experiments: ensembles are recorded, replayed and judged, in cells and sweeps.
 
 Begin with `ensemble`.
 """

@@ -1,4 +1,4 @@
-"""Campaigns: an experiment cut into cells, worked off in any order, merged in the cells' own.
+"""Cuts an experiment into cells, works them off in any order, and merges them in their own.
 
 A cell is a part of the runs. What it gives depends on its description and on the code alone, so that it
 may be worked off anywhere, and once is enough: finished cells are kept until all are done, and the same
@@ -39,7 +39,7 @@ _LOG = logging.getLogger("fuselog")
 
 @dataclass(frozen=True)
 class Cell:
-    """The runs from `first` to `end` of an experiment.
+    """Holds the runs from `first` to `end` of an experiment.
 
     Attributes:
         experiment: all of it; nothing that decides lies in another file, but for its logs.
@@ -65,17 +65,17 @@ class Cell:
 
     @property
     def files(self) -> list[Path]:
-        """The logs that it reads."""
+        """Return the logs that it reads."""
         return self.experiment.files[self.first : self.end]
 
     @cached_property
     def key(self) -> str:
-        """A hash of what decides about the result: this description, the data, and the code."""
+        """Return a hash of what decides about the result: this description, the data, and the code."""
         experiment = self.experiment.model_dump(mode="json", by_alias=True)
         runs = [self.first, self.end, self.logs, self.draws, self.errors]
         files = [*self.files, *program_files(self.experiment.estimators)]
-        said = [experiment, states_of(files), runs, str(self.place), version_of_code()]
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        contents = [experiment, states_of(files), runs, str(self.place), version_of_code()]
+        return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
 
     def work_off(self, folder: Path, setting: Setting | None = None) -> Pass:
         """Record or open the runs, replay and judge them; files go to the folder."""
@@ -100,7 +100,7 @@ class Cell:
 
 
 class Sent(NamedTuple):
-    """A cell for a machine with other files: logs go there, and what is written comes back, as bytes.
+    """Sends a cell to a machine with other files: logs go there, what is written comes back, as bytes.
 
     Attributes:
         cell: what there is to do.
@@ -188,22 +188,22 @@ def _merged(parts: Sequence[Sequence[Cell]], setting: Setting) -> Iterator[Pass]
     cells = list(chain.from_iterable(parts))
     pace = Pace(sum(cell.runs for cell in cells))
     results = work_off(cells, setting.open_pool or inline_pool, setting.checkpoints, pace)
-    told = iter(setting.progress(results, pace, len(cells)))
+    finished = iter(setting.progress(results, pace, len(cells)))
     for part in parts:
-        whole = next(told)
+        whole = next(finished)
         hashes = hashlib.sha256(whole.input_sha256.encode())
-        for done in islice(told, len(part) - 1):
+        for done in islice(finished, len(part) - 1):
             hashes.update(done.input_sha256.encode())
             whole.merge(done)
         if len(part) > 1:
             whole.input_sha256 = hashes.hexdigest()
         yield whole.check()
-    for _ in told:  # there are no more: progress and pool come to their ends
+    for _ in finished:  # there are no more: progress and pool come to their ends
         pass
 
 
 def cells_of(experiment: Experiment, setting: Setting) -> list[Cell]:
-    """The cells: a cut that only the number of runs decides."""
+    """Return the cells: a cut that only the number of runs decides."""
     require_memory(f"{experiment.runs} runs of {experiment.title}", experiment.runs * KEPT_BYTES)
     if experiment.record:
         recorder, values, _ = load_scenario(experiment.record.scenario)

@@ -166,7 +166,7 @@ class Checkpoints:
 
 
 class _Left(NamedTuple):
-    """What a cell left, pickled, and the SHA-256 of its files by their paths in its folder."""
+    """Holds what a cell left, pickled, and the SHA-256 of its files by their paths in its folder."""
 
     pickled: bytes
     files: dict[str, str]

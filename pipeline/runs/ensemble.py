@@ -1,4 +1,4 @@
-"""Ensembles: recorded, replayed and judged, in one streamed pass or whole in memory.
+"""Records, replays and judges ensembles, in one streamed pass or whole in memory.
 
 Recording runs on any `concurrent.futures.Executor`; the replay itself uses all cores.
 """
@@ -43,13 +43,13 @@ Progress = Callable[[Iterable[Any], object, int | None], Iterable[Any]]
 
 
 def no_progress(items: Iterable[Any], title: object, total: int | None) -> Iterable[Any]:  # noqa: ARG001
-    """The progress bar of programs that show none."""
+    """Return the progress bar of programs that show none."""
     return items
 
 
 @dataclass(frozen=True)
 class Part:
-    """Some runs of an ensemble, replayed together.
+    """Holds some runs of an ensemble, replayed together.
 
     Attributes:
         sources: the runs.
@@ -67,7 +67,7 @@ class Part:
 
 
 def parts_of(runs: int) -> Iterator[slice]:
-    """The runs of an ensemble that are replayed together: a cut that only their number decides."""
+    """Yield the runs of an ensemble that are replayed together: a cut that only their number decides."""
     for first in range(0, runs, RUNS_AT_ONCE):
         yield slice(first, min(first + RUNS_AT_ONCE, runs))
 
@@ -77,7 +77,7 @@ def cut_in_parts(
     estimates: Sequence[tuple[Path, Path]],
     origins: Sequence[Origin] = (),
 ) -> Iterator[Part]:
-    """The parts of runs that are all at hand; `estimates` and `origins` are of all of them."""
+    """Yield the parts of runs that are all at hand; `estimates` and `origins` are of all of them."""
     for now in parts_of(len(sources)):
         yield Part(
             sources[now], now.start, now.stop - now.start == len(sources), estimates[now], origins[now]
@@ -316,7 +316,7 @@ def replay_blocks(
     block_messages: int = BLOCK_MESSAGES,
     is_part: bool = False,
 ) -> Iterator[dict[str, Ragged]]:
-    """The outputs of a replay, block by block, by topic; the last block says what was covered."""
+    """Yield the outputs of a replay, block by block, by topic; the last block says what was covered."""
     for block in replay(
         sources,
         bound,

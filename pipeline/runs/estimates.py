@@ -46,7 +46,7 @@ def log_of_estimates(estimates: Log) -> Path:
 def source_of_estimates(
     estimates: Log, place: Path | None = None, *, recover: bool = False
 ) -> LogSource:
-    """The log that an estimates log is of, altered as it was for the replay.
+    """Return the log that an estimates log is of, altered as it was for the replay.
 
     Args:
         estimates: the estimates log.
@@ -68,7 +68,7 @@ def stated_estimators(estimates: Log | Source) -> dict[str, Any]:
 
 
 def labels_of(estimates: Log | Source) -> list[str]:
-    """The estimators of which a log has estimates."""
+    """Return the estimators of which a log has estimates."""
     topics = (topic for topic in estimates.topics if topic.startswith("/estimates/"))
     return list(dict.fromkeys(split_topic(topic)[0] for topic in topics))
 
@@ -108,7 +108,7 @@ def hash_files(paths: Sequence[Path]) -> str:
 
 
 class ErrorTables:
-    """Every error of every estimate, on request: a Parquet file per estimator and case.
+    """Writes every error of every estimate: a Parquet file per estimator and case.
 
     They are written block by block, as they come; use it as a context.
     """

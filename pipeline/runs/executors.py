@@ -75,7 +75,7 @@ def pool_for(
 
 
 def pool_of(executor: Executor) -> PoolFactory:
-    """An executor that is there; it is given as much work at a time as there are cores."""
+    """Return an executor that is there; it is given as much work at a time as there are cores."""
 
     @contextmanager
     def begin() -> Iterator[WorkerPool]:
@@ -146,7 +146,7 @@ def _begin_worker() -> None:
 
 
 def dask(scheduler: str) -> PoolFactory:
-    """The workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
+    """Return the workers of a Dask scheduler at an address such as tcp://127.0.0.1:8786.
 
     `local:N` begins N on this machine, which no other can reach. Raises BadInput when they are to begin
     where no scheduler answers, its workers have other code than this process, or Dask is missing.

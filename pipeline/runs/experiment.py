@@ -1,4 +1,4 @@
-"""Experiments: scenario (or real data, or logs) x estimators x metrics, one TOML file each."""
+"""Reads and runs experiments: scenario (or real data, or logs) x estimators x metrics, in TOML."""
 
 import os
 import warnings
@@ -160,11 +160,14 @@ class Setting:
 
 @dataclass(frozen=True)
 class Study:
-    """Does an experiment's work: a registered study.
+    """Describes a registered study, which does an experiment's work.
 
-    `run` writes its logs and timeline into the setting's folder, and returns what it found. Where it
-    replays by `pipeline.runs.campaigns` alone, `is_campaign` says so: others may work on parts of the
-    runs.
+    Attributes:
+        summary: what it does, in a line.
+        run: (experiment, setting) -> what it found; logs and timeline go to the setting's folder.
+        options: the type of the experiment's `options`.
+        is_campaign: whether it replays by `pipeline.runs.campaigns` alone, so that others may work on
+            parts of the runs.
     """
 
     summary: str
@@ -192,7 +195,7 @@ class Stated(NamedTuple):
 
     @property
     def labels(self) -> Mapping[str, Mapping[str, Any]]:
-        """The labels of its estimators, with their settings."""
+        """Return the labels of its estimators, with their settings."""
         return self.with_settings({}, {}).estimators
 
     @property
@@ -204,7 +207,7 @@ class Stated(NamedTuple):
         return {**self.values, "estimators": allowed_in(estimators, self.folder)}
 
     def with_settings(self, settings: Mapping[str, Any], over: Mapping[str, Any]) -> Experiment:
-        """The experiment with settings and then `over` over it; see `load_experiment`."""
+        """Return the experiment with settings and then `over` over it; see `load_experiment`."""
         where = f"experiment {self.source}"
         values = self._values
         own = _settings_of_experiment(build(Experiment, values, where), settings)
@@ -221,7 +224,7 @@ class Stated(NamedTuple):
 def load_experiment(
     name: str, settings: Mapping[str, Any], over: Mapping[str, Any]
 ) -> tuple[str, Experiment]:
-    """An experiment by its shipped name or its TOML file, with settings and then `over` over it.
+    """Return an experiment by its shipped name or its TOML file, with settings and then `over` over it.
 
     A setting goes to the entry of the experiment or to the estimator that its first word names, else to
     the scenario's or importer's parameters, else to all estimators that have such a parameter:
@@ -232,7 +235,7 @@ def load_experiment(
 
 
 def read_experiment(name: str) -> Stated:
-    """An experiment by its shipped name or its TOML file, without settings."""
+    """Return an experiment by its shipped name or its TOML file, without settings."""
     known = shipped("experiments")
     if not name.endswith(".toml") and name not in known:
         raise BadInput(f"no experiment '{name}', nor is it a .toml file; {choices(name, known)}")
@@ -241,10 +244,7 @@ def read_experiment(name: str) -> Stated:
 
 
 def experiment_of_logs(logs: Sequence[Path], labels: Sequence[str]) -> Stated:
-    """The experiment that replays logs through estimators as they are.
-
-    Raises BadInput where no estimator is named.
-    """
+    """Return the experiment that replays logs; raises BadInput where no estimator is named."""
     if not labels:
         raise BadInput(f"{logs[0]}: name the estimators to replay it with, such as -e ekf")
     title = logs[0].stem if len(logs) == 1 else f"{len(logs)} logs"

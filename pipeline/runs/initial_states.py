@@ -33,7 +33,7 @@ Spanned = TypeVar("Spanned", bound=LogSource | MemorySource)
 def order_of(
     *, arrival_order: bool, late: str | None, origins: Sequence[str | Path] = ()
 ) -> tuple[Clock, Late | None]:
-    """The clock that orders a replay, and what is done about late messages.
+    """Return the clock that orders a replay, and what is done about late messages.
 
     Raises BadInput where `late` is none of the ways, or makes no sense with the others.
     """
@@ -48,7 +48,7 @@ def order_of(
 
 
 def span_of(source: Spanned, start_s: float | None, end_s: float | None, order: Clock) -> Spanned:
-    """The part of a run between two times in seconds, by the clock that orders the replay.
+    """Return the part of a run between two times in seconds, by the clock that orders the replay.
 
     Raises BadInput where there is nothing in it.
     """
@@ -119,7 +119,7 @@ def check_same_run(estimates: Source, source: Source) -> None:
 def start_from(
     bound: Bound, sources: Sequence[Source], origins: Sequence[Origin], order: Clock
 ) -> Bound:
-    """The estimator, begun from each run's origin where that run's span begins after its prior.
+    """Return the estimator, begun from each run's origin where that run's span begins after its prior.
 
     Raises BadInput where an origin has no state for a prior at the beginning of the span, or the log no
     prior that it stands for.

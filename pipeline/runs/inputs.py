@@ -14,7 +14,7 @@ from recorders.registry import available
 
 
 class Record(Parameters):
-    """What to simulate.
+    """States what to simulate.
 
     Attributes:
         scenario: a scenario by name or TOML file.
@@ -26,7 +26,7 @@ class Record(Parameters):
 
 
 class Import(Parameters):
-    """What to import; the data's place comes from --data.
+    """States what to import; the data's place comes from --data.
 
     Attributes:
         source: name of the importer.
@@ -38,7 +38,7 @@ class Import(Parameters):
 
 
 class Logs(Parameters):
-    """Logs to replay, one run each.
+    """Names the logs to replay, one run each.
 
     Attributes:
         files: files or patterns such as `drive-*.mcap`, from the folder of the experiment's file on;
@@ -49,7 +49,7 @@ class Logs(Parameters):
 
 
 class Recording(Parameters):
-    """A recording that claims are of, told by what is in its files, wherever they lie.
+    """Identifies a recording that claims are of by what is in its files, wherever they lie.
 
     Attributes:
         files: pattern of its files, such as `*_detections.json` or `path_9/*.csv`; what lies beside them
@@ -94,7 +94,7 @@ SHIPPED = resources.files("fuselog_data")
 
 
 def shipped(kind: str) -> dict[str, Path]:
-    """The TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
+    """Return the TOML files of a kind ("experiments", "scenarios") that ship with fuselog, by name."""
     with resources.as_file(SHIPPED / kind) as folder:
         return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 

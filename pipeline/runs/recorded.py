@@ -1,4 +1,4 @@
-"""Ensembles whole in memory: recorded, replayed and judged at once, where there is room."""
+"""Records, replays and judges ensembles whole in memory, where there is room."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -28,7 +28,7 @@ KEPT_BYTES = 8 * TIME_BINS
 
 @dataclass(frozen=True)
 class Replayed:
-    """An ensemble in memory, what the estimators made of it, and how that compares with the truth."""
+    """Holds an ensemble in memory, what estimators made of it, and how that compares with the truth."""
 
     sources: Sequence[MemorySource]
     outputs: dict[str, Ragged]
@@ -46,7 +46,7 @@ class Replayed:
         return [*self.errors, *self.innovations, *self.sets, *outputs]
 
     def metrics(self, names: Sequence[str] = ()) -> dict[str, float]:
-        """The metrics of these names, of all where none is given; see `measure`."""
+        """Return the metrics of these names, of all where none is given; see `measure`."""
         return measure(self.judged, find_metrics(names))
 
 

@@ -46,7 +46,7 @@ class Runner:
         first_run: int = 0,
         runs: int | None = None,
     ) -> list[MemorySource]:
-        """Runs in memory: simulated, imported, or those of the logs.
+        """Return runs in memory: simulated, imported, or those of the logs.
 
         Args:
             parameters: what differs in those of the scenario.
@@ -80,7 +80,7 @@ class Runner:
         )
 
     def replay(self, sources: Sequence[MemorySource], estimators: Settings | None = None) -> Replayed:
-        """Replay runs by the experiment's estimators, or others; all in memory."""
+        """Replay the runs `sources` in memory, by `estimators` or those of the experiment."""
         return replay_ensemble(
             sources,
             self.experiment.estimators if estimators is None else estimators,
@@ -97,10 +97,14 @@ class Runner:
         drawn: str | None = "",
         first_run: int = 0,
     ) -> None:
-        """Write logs and estimates of the first runs to a folder, and the first timeline to another.
+        """Write logs and estimates of the first runs; the others can be recorded again from the seed.
 
-        `drawn` is None where no timeline is wanted. The other runs can be recorded again from the seed.
-        `first_run` is the number of the first of these, where they are a part of all.
+        Args:
+            sources: the runs.
+            outputs: what the estimators gave, by topic.
+            folder: where logs and estimates go, in the setting's folder.
+            drawn: likewise where the timeline of the first run goes; None where none is wanted.
+            first_run: the number of the first of these runs, where they are a part of all.
         """
         count = max(0, min(self.setting.logs - first_run, len(sources)))
         for run in self.setting.progress(range(count), "writing logs", count) if count else ():
@@ -115,7 +119,7 @@ class Runner:
     def draw(
         self, sources: Sequence[MemorySource], outputs: Mapping[str, Ragged], folder: str = ""
     ) -> None:
-        """Draw the first run into a folder."""
+        """Draw the first of the runs `sources` with its `outputs` into `folder`."""
         from replay.timeline.show import show
 
         place = self.setting.folder / folder
@@ -131,7 +135,7 @@ class Runner:
         return replayed
 
     def cases(self, cases: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Replayed]]:
-        """Do the same for every case, given by name and what differs in the scenario's parameters.
+        """Do as `run` for all `cases`, by name what differs in the scenario's parameters.
 
         What is kept goes to a folder of the case, but the first case's timeline is the experiment's.
         """
@@ -141,7 +145,7 @@ class Runner:
             yield name, replayed
 
     def judge(self, now: slice) -> Pass:
-        """Judge some runs in one streamed pass; the first ones' logs and timeline go to the folder."""
+        """Judge the runs `now` in one streamed pass; the first ones' logs and timeline are written."""
         experiment, setting = self.experiment, self.setting
         order, late = order_of(arrival_order=bool(experiment.arrival_order), late=experiment.late)
         places = [self._places("", run) for run in range(now.start, min(setting.logs, now.stop))]

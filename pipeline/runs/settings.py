@@ -1,4 +1,4 @@
-"""Parameters of estimators as commands take them: by --set, a settings file, options of their own."""
+"""Reads parameters of estimators as commands take them: --set, a settings file, own options."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -40,7 +40,7 @@ def read_settings(path: Path | None, labels: Settings) -> dict[str, dict[str, An
 
 
 def split_texts(texts: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-    """The settings of topics among KEY=VALUE, by `/TOPIC.WHAT`; and the texts of all others."""
+    """Return the settings of topics among KEY=VALUE, by `/TOPIC.WHAT`; and the texts of all others."""
     of_topics = [text for text in texts if is_of_topic(text.strip())]
     return parse_settings(of_topics), [text for text in texts if text not in of_topics]
 
@@ -61,7 +61,7 @@ def settings_of_estimators(
 
 
 def named_by(names: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """The labels and settings that names stand for, such as `ekf` and `lib:./mine.so`.
+    """Return the labels and settings that names stand for, such as `ekf` and `lib:./mine.so`.
 
     Raises BadInput where two programs have the same label.
     """
@@ -99,7 +99,7 @@ def with_settings(base: Settings, settings: Mapping[str, Any]) -> dict[str, dict
 
 
 def parameters_by_label(estimators: Mapping[str, Mapping[str, Any]]) -> dict[str, set[str]]:
-    """The names of the parameters that estimators have, from their settings by label.
+    """Return the names of the parameters that estimators have, from their settings by label.
 
     Raises BadInput where there is no such estimator.
     """
@@ -124,7 +124,7 @@ def sigmas_of(texts: Sequence[str], option: str) -> dict[str, float]:
 
 
 def meanings_of(bound: Sequence[Bound]) -> dict[str, dict[str, str]]:
-    """What the parameters of estimators mean, in a few words, by label and name."""
+    """Return what the parameters of estimators mean, in a few words, by label and name."""
     kinds = {each.name.partition("/")[0]: type(each.parameters) for each in bound if each.parameters}
     return {
         label: {name: in_few_words(meaning) for name, meaning in meanings(kind).items()}

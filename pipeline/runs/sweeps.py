@@ -1,4 +1,4 @@
-"""Sweeps: an experiment at many points of its parameters, a grid or samples."""
+"""Runs sweeps: an experiment at many points of its parameters, a grid or samples."""
 
 import itertools
 import math
@@ -47,7 +47,7 @@ DRAWN = ("position_rmse_m", "orientation_rmse_deg", "nees", "position_nees", "ni
 
 
 class Over(NamedTuple):
-    """A parameter that is swept.
+    """Describes a parameter that is swept.
 
     Attributes:
         key: as `--set` has it.
@@ -65,7 +65,7 @@ class Over(NamedTuple):
 
     @property
     def label(self) -> str:
-        """What an axis says."""
+        """Return what an axis says."""
         unit = unit_of(self.key)
         return f"{self.name}{f' ({unit})' if unit else ''}" if self.name else self.key
 
@@ -224,7 +224,7 @@ def run_sweep(
 
 
 def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataFrame:
-    """A row per metric: its value over all runs, and between what nine in ten runs lie.
+    """Return a row per metric: its value over all runs, and between what nine in ten runs lie.
 
     Of NEES and NIS also what it should be, and where it lies with 95 % if the estimator is consistent.
     """
@@ -241,17 +241,17 @@ def point_table(number: int, point: Mapping[str, Any], judge: Judge) -> pd.DataF
         if quantity in runs:
             is_own = (runs["estimator"] == estimator) & (runs["case"] == case)
             low, high = runs.loc[is_own, quantity].quantile([LOW, HIGH])
-        said = {"estimator": estimator, "quantity": quantity, "case": case}
+        keys = {"estimator": estimator, "quantity": quantity, "case": case}
         bound_low, bound_high = bounds.get(key, (math.nan, math.nan))
         aim = sizes.get(key, 1.0) if key in bounds else math.nan
         estimate = {"value": value, "low": low, "high": high}
         consistent = {"aim": aim, "bound_low": bound_low, "bound_high": bound_high}
-        rows.append({"point": number, **point, **said, **estimate, **consistent})
+        rows.append({"point": number, **point, **keys, **estimate, **consistent})
     return pd.DataFrame(rows)
 
 
 def errors_of_runs(number: int, judge: Judge) -> pd.DataFrame:
-    """The errors of every run at a point, by which points are compared run by run."""
+    """Return the errors of every run at a point, by which points are compared run by run."""
     runs = judge.runs_table
     names = [name for name in ("estimator", "case", "run") if name in runs]
     kept = runs[[*names, *(key for key in runs if is_error(str(key)))]].copy()
@@ -273,7 +273,7 @@ def meaning_of(key: str, done: Pass, experiment: Experiment) -> str:
 
 
 def metrics_of(table: pd.DataFrame, points: int) -> dict[str, MetricValue]:
-    """Every metric as a list, by point; null where a point has none."""
+    """Return every metric as a list, by point; null where a point has none."""
     found: dict[str, MetricValue] = {}
     for names, rows in table.groupby(["estimator", "quantity", "case"], sort=False):
         values = dict(zip(rows["point"], rows["value"], strict=True))
@@ -300,7 +300,7 @@ def figures_of(table: pd.DataFrame, over: Sequence[Over]) -> dict[str, "Chart | 
 
 
 def curves(rows: pd.DataFrame, over: Sequence[Over], quantity: str, case: str = "") -> Chart:
-    """The quantity over each parameter; where others are swept too, the mean over them."""
+    """Draw the quantity over each parameter; where others are swept too, the mean over them."""
     panels = []
     for each in over:
         numbers = all(isinstance(value, int | float) for value in each.taken)

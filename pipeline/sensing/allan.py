@@ -1,4 +1,4 @@
-"""The overlapping Allan deviation, and intervals from the degrees of freedom that a model gives it.
+"""Computes the overlapping Allan deviation, and intervals by a model's degrees of freedom.
 
 NIST SP 1065 has the definitions. Degrees of freedom are exact for any sum of Gaussian terms: with M
 second differences of autocovariance g, they are M^2 g_0^2 / sum over |k| < M of (M - |k|) g_k^2.
@@ -21,7 +21,7 @@ _A_WINDOW = 1000  # differences a window then, which are as good as all
 
 
 class Curve(NamedTuple):
-    """An Allan deviation: times (n,), deviations (n,), and how many differences (n,) there are."""
+    """Holds an Allan deviation: times (n,), deviations (n,), and how many differences (n,) there are."""
 
     taus_s: Floats
     deviations: Floats
@@ -41,7 +41,7 @@ def _stride(multiple: int, count: int) -> int:
 
 
 def allan_deviation(values: Floats, step_s: float, multiples: Integers) -> Curve:
-    """The overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
+    """Return the overlapping Allan deviation of samples (n,) every `step_s`; NaN is one that was lost.
 
     Only pairs of whole windows count. Of many samples a thousand differences a window do.
 

@@ -1,4 +1,4 @@
-"""Noise as the settings of other programs: which number each reads, in which unit.
+"""Writes noise as the settings of other programs: which number each reads, in which unit.
 
 A filter takes the larger of three axes, so that none is stated too small. Continuous densities are N in
 unit/sqrt(Hz) and K in unit/sqrt(s); who wants a standard deviation per step divides by its root.
@@ -30,12 +30,12 @@ class Densities(NamedTuple):
 
     @property
     def unit(self) -> tuple[Density, Density] | None:
-        """The accelerometer's and the gyro's, where there are both."""
+        """Return the accelerometer's and the gyro's, where there are both."""
         force, rate = self.fields.get(_FORCE), self.fields.get(_RATE)
         return None if force is None or rate is None else (force, rate)
 
     def warned(self, mark: str, text: str) -> str:
-        """The text after the sentences, as comments that begin with a mark."""
+        """Return the text after the sentences, as comments that begin with a mark."""
         return "".join(f"{mark} {each}\n" for each in self.doubts) + text
 
 
@@ -50,8 +50,8 @@ def settings(found: Densities) -> str:
         for field, density in found.fields.items()
         for name, number in zip(names.get(field, ()), density, strict=False)
     }
-    said = "# continuous: N in unit/sqrt(Hz), K in unit/sqrt(s); for --settings\n"
-    return found.warned("#", said + tomli_w.dumps({"ekf": values})) if values else ""
+    header = "# continuous: N in unit/sqrt(Hz), K in unit/sqrt(s); for --settings\n"
+    return found.warned("#", header + tomli_w.dumps({"ekf": values})) if values else ""
 
 
 def kalibr(found: Densities) -> str:
@@ -99,11 +99,11 @@ def gtsam(found: Densities) -> str:
         "setBiasOmegaCovariance": rate.walk,
     }
     lines = [f"params->{name}(I_3x3 * {density**2:.6g});\n" for name, density in calls.items()]
-    said = (
+    header = (
         "// continuous: N^2 and K^2; GTSAM divides by the step itself. A BetweenFactor of your own\n"
         "// over T seconds needs the standard deviation K sqrt(T)\n"
     )
-    return found.warned("//", said + "".join(lines))
+    return found.warned("//", header + "".join(lines))
 
 
 def robot_localization(found: Densities) -> str:

@@ -1,4 +1,4 @@
-"""Maximum likelihood of a sensor's noise: which terms there are, how large, and how well that is known.
+"""Fits a sensor's noise by maximum likelihood: which terms, how large, how well that is known.
 
 A walk of zero is at the boundary of what may be: with no walk at all its likeliest density is zero in
 two of three recordings, so "none found, and it is less than" is an answer.
@@ -32,7 +32,7 @@ WORDS = {
 
 
 class Fit(NamedTuple):
-    """The likeliest terms of one kind.
+    """Holds the likeliest terms of one kind.
 
     Attributes:
         free: the names of the terms' numbers.
@@ -50,17 +50,17 @@ class Fit(NamedTuple):
 
     @property
     def criterion(self) -> float:
-        """The log-likelihood less half of BIC's penalty: the greater the better."""
+        """Return the log-likelihood less half of BIC's penalty: the greater the better."""
         return self.log_likelihood - 0.5 * len(self.free) * math.log(self.size)
 
     @property
     def words(self) -> str:
-        """The names of the terms."""
+        """Return the names of the terms."""
         return ", ".join(WORDS[name] for name in self.free if name in WORDS)
 
     @property
     def sigmas(self) -> Floats:
-        """The standard deviations (p,) of the logarithms of the numbers."""
+        """Return the standard deviations (p,) of the logarithms of the numbers."""
         return np.sqrt(np.diag(np.linalg.pinv(self.curvature)))
 
 
@@ -148,7 +148,7 @@ def _objective(samples: Samples, free: Sequence[str]) -> Objective:
 
 
 def of_point(free: Sequence[str], point: Floats) -> Terms:
-    """The terms whose free numbers have these logarithms."""
+    """Return the terms whose free numbers have these logarithms."""
     return Terms(**dict(zip(free, np.exp(point).tolist(), strict=True)))
 
 

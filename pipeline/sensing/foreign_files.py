@@ -1,4 +1,4 @@
-"""Files of noise that imu_utils and allan_variance_ros wrote: what their numbers are, and in what unit.
+"""Reads files of noise of imu_utils and allan_variance_ros: what their numbers are, in what unit.
 
 imu_utils states `gyr_n` as the root of the rate times the Allan deviation at 1 s, a standard deviation
 per sample, although its README says rad/s/sqrt(Hz); `gyr_w` is the least of its curve and no walk.

@@ -1,4 +1,4 @@
-"""The likelihood of a sensor's noise: a Kalman filter whose state is the walk, Gauss-Markov and angle.
+"""Computes the likelihood of a sensor's noise by a Kalman filter: walk, Gauss-Markov and angle.
 
 A sample is y = b + g + (e_k - e_(k-1)) / step + v, with the walk b, exactly diffuse at first, the
 Gauss-Markov noise g, errors e of a quantised angle and white v. So the first sample is not counted.
@@ -19,7 +19,7 @@ Integers = NDArray[np.int64]
 
 
 class Samples(NamedTuple):
-    """Samples of one column, as the likelihood takes them.
+    """Holds the samples of one column, as the likelihood takes them.
 
     Attributes:
         values: (n, 1 + regressors) the samples, then what they may depend on.
@@ -33,7 +33,7 @@ class Samples(NamedTuple):
 
 
 class Likelihood(NamedTuple):
-    """What the samples say of some terms.
+    """Computes what the samples say of some terms.
 
     Attributes:
         log_likelihood: with these terms.
@@ -62,7 +62,7 @@ def likelihood(samples: Samples, terms: Terms) -> Likelihood:
 
 
 def residuals(samples: Samples, terms: Terms) -> Floats:
-    """The normalised innovations (n - 1,) of samples, without what regressors explain."""
+    """Return the normalised innovations (n - 1,) of samples, without what regressors explain."""
     columns = samples.values.shape[1]
     moments, found = np.zeros((columns, columns)), np.zeros(samples.values.shape)
     _filtered(samples, terms, moments, found)

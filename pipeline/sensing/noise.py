@@ -1,4 +1,4 @@
-"""The noise of a sensor at rest: its terms with intervals, its Allan deviation, and what to be told.
+"""Finds the noise of a sensor at rest: its terms with intervals, its Allan deviation, notes.
 
 Begin here: `noise` goes through the columns of a log's topics, `_analysed` through one column.
 """
@@ -43,6 +43,9 @@ def noise(
         sheet: what a data sheet states, by the name of a field: `{"turn_rate_radps": "0.007
             deg/s/sqrt(Hz)"}`.
         taus: also say the Allan deviation at these times, in s.
+
+    Returns:
+        The noise of every column, with 95 % intervals: its terms, and its Allan deviations.
 
     Raises BadInput where a unit moves, the log is too short, a column is constant, stamps go back, too
     many messages are lost, a time is beyond the log's third, or a unit is another quantity's.
@@ -203,7 +206,7 @@ def _misfits(found: ColumnNoise) -> list[str]:
 
 def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> list[str]:
     longest_s = len(values) // 3 * found.step_s
-    said = []
+    sentences = []
     for tau_s in taus_s:
         m = round(tau_s / found.step_s)
         if not 1 <= m <= len(values) // 3:
@@ -214,11 +217,11 @@ def _read_at(found: ColumnNoise, taus_s: Sequence[float], values: Floats) -> lis
         at = allan_deviation(values, found.step_s, np.array([m]))
         degrees = degrees_of_freedom(found.fitted.terms, found.step_s, m, int(at.pairs[0]))
         low, high = interval(at.deviations, np.array([degrees]))
-        said.append(
+        sentences.append(
             f"Allan deviation at {at.taus_s[0]:.4g} s: {at.deviations[0]:.4g} "
             f"({low[0]:.4g} to {high[0]:.4g}) {unit_of(found.field) or 'unit'}"
         )
-    return said
+    return sentences
 
 
 def _least(found: ColumnNoise, unit: str) -> str:

@@ -32,7 +32,7 @@ _TERMS = {  # what a table says of each number: the name of its field, and its u
 
 
 class Number(NamedTuple):
-    """A number of a noise model and its 95 % interval; of a walk that was not found the value is 0."""
+    """Holds a number of a noise model and its 95 % interval; 0 for a walk that was not found."""
 
     value: float
     low: float
@@ -67,12 +67,12 @@ class ColumnNoise:
 
     @property
     def name(self) -> str:
-        """The column as sentences name it."""
+        """Return the column as sentences name it."""
         return f"{self.topic}.{self.field}" + (f".{self.component}" if self.component else "")
 
     @property
     def model_deviations(self) -> Floats:
-        """The Allan deviation (n,) of the fitted model at the curve's times."""
+        """Return the Allan deviation (n,) of the fitted model at the curve's times."""
         return np.sqrt(self.fitted.terms.allan_variance(self.curve.taus_s, self.step_s))
 
 
@@ -93,7 +93,7 @@ class SensorNoise:
 
     @property
     def table(self) -> pd.DataFrame:
-        """A row per number: column, term with its unit, value, 95 % interval."""
+        """Return a row per number: column, term with its unit, value, 95 % interval."""
         rows = [
             (column.name, _TERMS[name].format(unit_of(column.field) or "unit"), *number)
             for column in self.columns
@@ -103,12 +103,12 @@ class SensorNoise:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on all columns."""
+        """Return sentences on all columns."""
         return [note for column in self.columns for note in column.notes]
 
     @property
     def densities(self) -> Densities:
-        """What other programs are told: N and K of each field, the largest of its axes.
+        """Return what other programs read: N and K of each field, the largest of its axes.
 
         Of Gauss-Markov noise without a walk, the walk is the one that begins as it does: s sqrt(2 / T).
         Where no axis has a walk, K is the most that it may be: Kalibr refuses a zero, and a covariance
@@ -134,7 +134,7 @@ class SensorNoise:
 
     @property
     def curves(self) -> pd.DataFrame:
-        """A row per column and time: the deviation, its 95 % interval, the model's."""
+        """Return a row per column and time: the deviation, its 95 % interval, the model's."""
         tables = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)
@@ -151,7 +151,7 @@ class SensorNoise:
 
     @property
     def chart(self) -> Chart:
-        """The measured curves, their intervals, and the models'."""
+        """Draw the measured curves, their intervals, and the models'."""
         panels = []
         for column in self.columns:
             low, high = interval(column.curve.deviations, column.degrees)
@@ -172,7 +172,7 @@ class SensorNoise:
         return Chart(title=title, panels=panels, columns=min(3, len(panels)))
 
     def draw(self, rrd: Path) -> None:
-        """Write the curves to an .rrd file for the viewer."""
+        """Write the curves to the file `rrd` for the viewer."""
         from replay.timeline.drawing.canvas import MUTED, PALETTE
         from replay.timeline.drawing.curves import CurvePanel, save_curves
         from replay.timeline.drawing.plane import Stroke
@@ -196,7 +196,7 @@ class SensorNoise:
         save_curves(f"noise of {self.name}", panels, rrd)
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write tables, the curves as figure and timeline, and the numbers as other programs read them.
+        """Write tables, curves, and the numbers as other programs read them to the folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """

@@ -1,4 +1,4 @@
-"""Recordings at rest as noise is read from them: on a grid, still, without the drift of warming up."""
+"""Prepares recordings at rest: on a grid, still, without the drift of warming up."""
 
 import math
 from typing import NamedTuple
@@ -27,7 +27,7 @@ _DRIFT_SAMPLES = 4096
 
 
 class Grid(NamedTuple):
-    """The stamps of a topic as a grid: its step, and which of its places (n,) the messages have."""
+    """Lays the stamps of a topic on a grid: its step, and which of its places (n,) the messages have."""
 
     step_s: float
     places: Integers
@@ -35,17 +35,17 @@ class Grid(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many places there are."""
+        """Count how many places there are."""
         return int(self.places[-1]) + 1
 
     @property
     def lost(self) -> float:
-        """The share of messages that are not there."""
+        """Return the share of messages that are not there."""
         return 1 - len(self.places) / self.size
 
 
 class Drift(NamedTuple):
-    """What a column drifts by: a rate, and an offset that decays; and what they gain in likelihood."""
+    """Holds what a column drifts by, a rate and an offset that decays, and their gain in likelihood."""
 
     rate: float
     rate_sigma: float
@@ -54,7 +54,7 @@ class Drift(NamedTuple):
     gain: float
 
     def over(self, times_s: Floats) -> Floats:
-        """The drift (n,) at times since the first sample."""
+        """Return the drift (n,) at times since the first sample."""
         return self.rate * times_s + self.offset * np.exp(-times_s / self.time_s)
 
 

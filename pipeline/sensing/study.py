@@ -1,4 +1,4 @@
-"""The study of noise: how often the intervals of a sensor at rest hold the truth.
+"""Studies noise: how often the intervals of a sensor at rest hold the truth.
 
 Each unit is recorded at rest, with white noise and a walk, and looked at as a user's log is: drifts,
 vibration and correlation are looked for, the terms chosen, and intervals given.
@@ -32,7 +32,7 @@ QUANTITIES = ("white", "walk", *(f"deviation-{tau_s:g}s" for tau_s in TAUS_S))
 
 
 class NoiseOptions(Parameters):
-    """Which units are looked at.
+    """States which units are looked at.
 
     Attributes:
         seeds: the first seed of each block of the experiment's runs.

@@ -1,4 +1,4 @@
-"""The terms of a sensor's noise, after IEEE Std 952-1997, annex C: their Allan variances add.
+"""Defines the terms of a sensor's noise, by IEEE Std 952-1997, annex C: Allan variances add.
 
 White noise N, random walk K, Gauss-Markov noise of standard deviation s and time T, a quantised angle Q.
 With u the unit of the samples: N in u/sqrt(Hz), K in u/sqrt(s), s in u, T in s, Q in u s.
@@ -15,7 +15,7 @@ _DECAYED = 1e-7  # of the variance: what is left of an autocovariance counts by 
 
 
 class Terms(NamedTuple):
-    """The noise of one column; a term that is zero is not there."""
+    """Holds the noise of one column; a term that is zero is not there."""
 
     white: float = 0.0
     walk: float = 0.0
@@ -24,7 +24,7 @@ class Terms(NamedTuple):
     quantisation: float = 0.0
 
     def allan_variance(self, taus_s: Floats, step_s: float) -> Floats:
-        """The expected Allan variance (n,) of samples every `step_s` at times (n,), exactly."""
+        """Return the expected Allan variance (n,) of samples every `step_s` at times (n,), exactly."""
         multiples = np.rint(taus_s / step_s)
         return self._second_differences(multiples, step_s) / (2 * taus_s**2)
 

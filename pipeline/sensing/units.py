@@ -1,4 +1,4 @@
-"""Units of noise: what a column's is, and those in which data sheets state it."""
+"""Reads units of noise: what a column's is, and those in which data sheets state it."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Changes of a run that should not matter: each gives a copy of it, all topics at once by a seed.
+"""Changes a run in ways that should not matter: each copies it, all topics at once by a seed.
 
 Most have a size, 1 or a half of it, so that it is seen whether the difference shrinks with the change.
 """
@@ -24,7 +24,7 @@ PARAMETERS, DROPPED = "parameters", "dropped"
 
 
 class Inputs(NamedTuple):
-    """What a change may touch: topics that are sensed, those that drive the estimator, its priors."""
+    """States what a change may touch: topics that are sensed, those that drive the estimator, priors."""
 
     sensed: Collection[str]
     controls: Collection[str]
@@ -35,7 +35,7 @@ Changed = Callable[[MemorySource, Inputs, float, int], MemorySource]
 
 
 class Change(NamedTuple):
-    """One change: what it does in words, to a run; whether half of it is defined."""
+    """Describes one change: what it does in words, to a run; whether half of it is defined."""
 
     words: str
     of_run: Changed | None

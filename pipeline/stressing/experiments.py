@@ -26,7 +26,7 @@ from replay.foreign.naming import allowed
 
 
 class _Part(NamedTuple):
-    """Runs of an experiment that are stressed together.
+    """Holds runs of an experiment that are stressed together.
 
     Attributes:
         experiment: all of it.
@@ -88,13 +88,13 @@ def stress_result(
                 f"--stress --scheduler {scheduler}: its workers do not see the files that are replayed; "
                 "put them where all see them, or leave out --scheduler"
             )
-        return [each.told for each in _merged(parts, pool, progress).values()]
+        return [each.summary for each in _merged(parts, pool, progress).values()]
 
 
 def claims_under_stress(
     experiment: Experiment, result: Result, stress: Sequence[Stressing]
 ) -> list[Claim]:
-    """The claims of a result: those that stress may carry across their limit are not shown.
+    """Return the claims of a result: those that stress may carry across their limit are not shown.
 
     They are decided again with each metric's interval, or its value, wider on both sides by the largest
     change that stress makes to it. Verdicts on metrics that are not of single estimators stay.

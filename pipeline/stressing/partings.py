@@ -23,7 +23,7 @@ AXES = ("x_m", "y_m", "z_m")
 
 
 class Parting(NamedTuple):
-    """Two replays of one estimate.
+    """Holds how far two replays of one estimate are apart.
 
     Attributes:
         topic: the estimate's.
@@ -50,13 +50,13 @@ class Parting(NamedTuple):
 
     @property
     def growth(self) -> float:
-        """The largest A for the first one that is not zero."""
+        """Return the largest A for the first one that is not zero."""
         there = self.amplification[self.amplification > 0.0]
         return float(np.max(there) / there[0]) if len(there) else 1.0
 
     @property
     def parted(self) -> int | None:
-        """The row where the copies part; None where they do not."""
+        """Return the row where the copies part; None where they do not."""
         there = np.flatnonzero(self.amplification > 0.0)
         if not len(there):
             return None
@@ -132,7 +132,7 @@ def _explained(covariance: Floats, other: Floats) -> Floats:
 
 
 def covariances(stream: Stream) -> Floats:
-    """The covariances (rows, n, n) of Gaussian estimates."""
+    """Return the covariances (rows, n, n) of Gaussian estimates."""
     n = int(np.sqrt(stream["covariance"].shape[1]))
     return stream["covariance"].reshape(len(stream), n, n)
 
@@ -144,7 +144,7 @@ def _norm(apart: Floats, is_in: Sequence[bool]) -> Floats:
 
 
 class Undetermined(NamedTuple):
-    """A direction of the state that the measurements do not determine.
+    """Holds a direction of the state that the measurements do not determine.
 
     Attributes:
         components: their names, all of one unit.
@@ -162,7 +162,7 @@ class Undetermined(NamedTuple):
 
     @property
     def words(self) -> str:
-        """The direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
+        """Return the direction as a sum: `0.58 rate_radps - 0.58 bias_radps`."""
         parts = [
             f"{'-' if value < 0 else '+'} {abs(value):.2g} {name}"
             for name, value in zip(self.components, self.direction, strict=True)

@@ -1,4 +1,4 @@
-"""Is this result a result? Replays under changes that should not matter; begin with `stress`.
+"""Tells whether a result is one: replays under changes that should not matter; see `stress`.
 
 Runs that hold the same topics are replayed together with all their copies, as further runs of one pass.
 """

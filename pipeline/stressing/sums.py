@@ -1,4 +1,4 @@
-"""What changes that should not matter do to an estimator over many runs: counts and means."""
+"""Sums over runs what changes that should not matter do to an estimator: counts and means."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -51,8 +51,8 @@ class StressSums:
                 own[key] = before[0] + by, before[1] + runs
 
     @property
-    def told(self) -> Stressing:
-        """The verdict over all runs."""
+    def summary(self) -> Stressing:
+        """Return the verdict over all runs."""
         runs = self.verdicts.total()
         often = [each for each, own in self.verdicts.items() if own * RARE_RUNS > runs]
         verdict = max(often, key=ORDER.index)
@@ -79,8 +79,8 @@ class StressSums:
 
 
 def verdicts_of(stressed: Iterable[Stressed]) -> dict[str, Stressing]:
-    """The verdict on each estimator over its runs."""
+    """Return the verdict on each estimator over its runs."""
     sums: dict[str, StressSums] = {}
     for each in stressed:
         sums.setdefault(each.estimator, StressSums(each.estimator)).add(each)
-    return {label: each.told for label, each in sums.items()}
+    return {label: each.summary for label, each in sums.items()}

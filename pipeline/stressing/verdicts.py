@@ -1,4 +1,4 @@
-"""What changes that should not matter did to a result: harmless, sensitive, discontinuous or chaotic."""
+"""Judges what such changes did to a result: harmless, sensitive, discontinuous or chaotic."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ SHRINKS = 1.5  # of a sigma: noise per prediction does not shrink with the shift
 
 
 class Tried(NamedTuple):
-    """One change to one run, as replayed.
+    """Holds what one change did to one run.
 
     Attributes:
         name: a key of `CHANGES`.
@@ -51,7 +51,7 @@ class Tried(NamedTuple):
 
     @property
     def largest(self) -> float:
-        """The largest A."""
+        """Return the largest A."""
         return float(self.parting.amplification.max(initial=0.0)) if self.parting else 0.0
 
     @property
@@ -74,7 +74,7 @@ class Tried(NamedTuple):
 
     @property
     def is_wider(self) -> bool:
-        """Whether moved stamps change a covariance by more than noise per second mostly does."""
+        """Tell whether moved stamps change a covariance by more than noise per second mostly does."""
         return (
             self.name == "stamps" and self.parting is not None and self.parting.spread > PER_PREDICTION
         )
@@ -82,7 +82,7 @@ class Tried(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stressed:
-    """One estimator over one run, stressed.
+    """Holds what all changes did to one run, by one estimator.
 
     Attributes:
         source: the run.
@@ -113,7 +113,7 @@ class Stressed:
 
     @property
     def run(self) -> str:
-        """The run's name."""
+        """Return the run's name."""
         return self.source.name
 
     def _is_explained(self, name: str) -> bool:
@@ -137,7 +137,7 @@ class Stressed:
         return more.size / less.size if less and less.size > 0.0 else np.nan
 
     def verdict(self, name: str) -> Verdict:
-        """What a change does."""
+        """Return what a change does."""
         each = self.tried[name]
         if each.why:
             return "not tried"
@@ -152,12 +152,12 @@ class Stressed:
 
     @property
     def worst(self) -> Verdict:
-        """The worst of all verdicts."""
+        """Return the worst of all verdicts."""
         return max((self.verdict(name) for name in self.tried), key=ORDER.index)
 
     @property
     def deciding(self) -> str:
-        """Which change decides the worst verdict: of those that have it what moves most."""
+        """Return which change decides the worst verdict: of those that have it what moves most."""
         own = [name for name in self.tried if self.verdict(name) == self.worst]
         return max(own, key=lambda name: (bool(self.tried[name].failed), self.tried[name].size))
 
@@ -182,13 +182,13 @@ class Stressed:
 
     @cached_property
     def undetermined(self) -> Undetermined | None:
-        """The direction that measurements do not determine, of the estimate that moves most."""
+        """Return the direction that measurements do not determine, of the estimate that moves most."""
         moved = max(self.tried.values(), key=lambda each: each.largest).parting
         return None if moved is None else undetermined(self.estimates[moved.topic])
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """A row for each change."""
+        """Return a row for each change."""
         found = []
         for name, each in self.tried.items():
             row: dict[str, Any] = {
@@ -224,7 +224,7 @@ class Stressed:
 
     @property
     def sentence(self) -> str:
-        """The verdict, with the numbers of the change that decides it."""
+        """Return the verdict, with the numbers of the change that decides it."""
         if self.worst == "not tried":
             return f"{self.estimator} of {self.run}: not tried: {next(iter(self.tried.values())).why}"
         name = self.deciding
@@ -251,7 +251,7 @@ class Stressed:
 
     @property
     def sentences(self) -> list[str]:
-        """The verdict first, then what explains it."""
+        """Return the verdict first, then what explains it."""
         sentences = [self.sentence]
         if self.is_per_prediction:
             sentences.append(
@@ -285,7 +285,7 @@ def _largest(values: Any) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Stress:
-    """Estimators over runs, stressed: one of `Stressed` for each run and estimator.
+    """Holds what changes did to runs, by estimators: one of `Stressed` for each run and estimator.
 
     Attributes:
         stressed: one for each run and estimator.
@@ -304,10 +304,10 @@ class Stress:
     def sentences(self) -> list[str]:
         """Return the verdicts in words, the worst first."""
         by_weight = sorted(self.stressed, key=lambda each: -ORDER.index(each.worst))
-        return list(dict.fromkeys(said for each in by_weight for said in each.sentences))
+        return list(dict.fromkeys(sentence for each in by_weight for sentence in each.sentences))
 
     def draw(self, save: str | Path) -> None:
-        """Write the timeline of the first run, an .rrd file: copies fan out from the estimates.
+        """Write the timeline of the first run to the .rrd file `save`: copies fan out from estimates.
 
         Raises BadInput where the file cannot be written.
         """

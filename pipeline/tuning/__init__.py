@@ -1,4 +1,4 @@
-"""Tuning: which parameters of an estimator explain logs best, and how well the logs tell them.
+"""Finds which parameters of an estimator explain logs best, and how well the logs tell them.
 
 Begin with `tuning`.
 """

@@ -1,4 +1,4 @@
-"""The command `fuselog tune`, and what `calibrate` shares with it: what is printed and written."""
+"""Prints and writes what `fuselog tune` finds, and what `calibrate` shares with it."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

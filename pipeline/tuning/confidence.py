@@ -37,7 +37,7 @@ class Confidence(NamedTuple):
 
     @property
     def errors(self) -> Floats:
-        """The standard errors (m,) of the coordinates."""
+        """Return the standard errors (m,) of the coordinates."""
         return np.sqrt(np.diagonal(self.covariance))
 
     @property
@@ -53,7 +53,7 @@ class SearchOutcome(NamedTuple):
     Attributes:
         coordinates: what was searched for.
         optimum: (k,) the values of that at which the cost is least.
-        told: how well the logs tell them; None where the search was no maximum likelihood, was
+        confidence: how well the logs tell them; None where the search was no maximum likelihood, was
             stopped, or ended at bounds alone.
         evaluations: how many values were tried.
         has_converged, was_stopped: how it ended.
@@ -66,7 +66,7 @@ class SearchOutcome(NamedTuple):
     coordinates: Coordinates
     optimum: Floats
     evaluations: int
-    told: Confidence | None = None
+    confidence: Confidence | None = None
     has_converged: bool = True
     was_stopped: bool = False
     is_at_edge: bool = False
@@ -85,42 +85,42 @@ def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
     return Confidence(places, curvature, covariance)
 
 
-def doubts(told: Confidence, coordinates: Coordinates) -> Iterator[str]:
-    """A sentence for every direction of the parameters (k,) of which the logs tell little."""
-    own = [coordinates.free[place] for place in told.places]
-    for direction, value in _weak(told, coordinates):
+def doubts(confidence: Confidence, coordinates: Coordinates) -> Iterator[str]:
+    """Yield a sentence for every direction of the parameters (k,) of which the logs tell little."""
+    own = [coordinates.free[place] for place in confidence.places]
+    for direction, value in _weak(confidence, coordinates):
         yield _in_words(direction, value, own)
 
 
-def unknown(told: Confidence, coordinates: Coordinates) -> list[int]:
-    """The parameters (k,), by their places, of which the logs tell nothing by the curvature."""
+def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
+    """Return the parameters (k,), by their places, of which the logs tell nothing by the curvature."""
     found = []
-    for direction, value in _weak(told, coordinates):
+    for direction, value in _weak(confidence, coordinates):
         first, *others = _involved(direction)
         if (
             not others
-            and not coordinates.free[told.places[first]].useful
+            and not coordinates.free[confidence.places[first]].useful
             and _factor(value) >= MEANINGLESS
         ):
-            found.append(told.places[first])
+            found.append(confidence.places[first])
     return found
 
 
-def _weak(told: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
+def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
     """The directions (m,), of length one, along which the cost hardly rises, and its curvature there.
 
     By the eigenvalues of the curvature in useful units: two standard errors that are useful, a factor of
     2.7, or `UNIT` standard errors that a parameter without a useful one has alone.
     """
-    places = list(told.places)
+    places = list(confidence.places)
     own, units = [coordinates.free[place] for place in places], coordinates.units[places]
     is_log = np.array([each.is_positive for each in own])
     useful = np.array([each.useful for each in own])
-    diagonal = np.diagonal(told.curvature)
+    diagonal = np.diagonal(confidence.curvature)
     with np.errstate(divide="ignore", invalid="ignore"):
         alone = np.where(diagonal <= 0.0, 1.0, UNIT / np.sqrt(diagonal))
     scale = np.select([is_log, useful > 0.0], [1.0, 2.0 * useful / units], alone)
-    values, vectors = np.linalg.eigh(told.curvature * np.outer(scale, scale))
+    values, vectors = np.linalg.eigh(confidence.curvature * np.outer(scale, scale))
     for index in np.flatnonzero(values < LEAST_CURVATURE):
         yield vectors[:, index], values[index]
 
@@ -160,7 +160,7 @@ def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
 
 
 class Profile(NamedTuple):
-    """The cost along one parameter, all others following at their best to second order.
+    """Holds the cost along one parameter, all others at their best to second order.
 
     Attributes:
         name: of the parameter.
@@ -175,17 +175,19 @@ class Profile(NamedTuple):
     parabola: Floats
 
 
-def profiles(cost: Cost, coordinates: Coordinates, point: Floats, told: Confidence) -> list[Profile]:
+def profiles(
+    cost: Cost, coordinates: Coordinates, point: Floats, confidence: Confidence
+) -> list[Profile]:
     """The profiles of all parameters that have a standard error, about the point (k,) of least cost."""
     found = []
-    for index, place in enumerate(told.places):
-        error, free = told.errors[index], coordinates.free[place]
+    for index, place in enumerate(confidence.places):
+        error, free = confidence.errors[index], coordinates.free[place]
         if not np.isfinite(error):
             continue
         reach = min(PROFILE_ERRORS * error, WIDEST if free.is_positive else np.inf)
         way = np.linspace(-reach, reach, PROFILE_POINTS)
         points = np.tile(point, (PROFILE_POINTS, 1))
-        points[:, list(told.places)] += np.outer(way, told.covariance[:, index] / error**2)
+        points[:, list(confidence.places)] += np.outer(way, confidence.covariance[:, index] / error**2)
         values = coordinates.values(points)
         costs = cost(values)
         rise = costs - costs[PROFILE_POINTS // 2]

@@ -1,4 +1,4 @@
-"""The study of tuning where the truth of the noise is not known: values are judged on other vehicles.
+"""Studies tuning where the truth of the noise is unknown: other vehicles judge the values.
 
 The log's vehicles are parted: some tune the experiment's one estimator by likelihood, from its settings
 or what the log states; others, held out, are replayed with either values.
@@ -20,7 +20,7 @@ from replay.engine.streams.sources import MemorySource
 
 
 class HeldOutOptions(Parameters):
-    """What is searched for, and which vehicles tune and judge it.
+    """States what is searched for, and which vehicles tune and judge it.
 
     Attributes:
         free: names of the parameters that are searched for.

@@ -1,4 +1,4 @@
-"""What the motion in logs tells of a calibration, before any search: the information, and what it lacks.
+"""Measures what the motion in logs tells of a calibration before any search, and what it lacks.
 
 With v the innovations and S their covariances, I = sum dv' S^-1 dv over all measurements, where dv are
 the derivatives by the parameters. In units that are useful for each, a direction whose eigenvalue is
@@ -40,7 +40,7 @@ class Undetermined(NamedTuple):
 
 
 def information(objective: Objective, values: Floats, useful: Floats, places: Sequence[int]) -> Floats:
-    """The information (m, m) on the parameters at m of k places, in their useful units (k,).
+    """Return the information (m, m) on the parameters at m of k places, in their useful units (k,).
 
     At values (k,), over all logs. Measurements that one side of a difference lacks tell nothing.
     """
@@ -65,7 +65,7 @@ def information(objective: Objective, values: Floats, useful: Floats, places: Se
 
 
 def undetermined(scaled: Floats) -> Undetermined:
-    """What an information (m, m) in useful units leaves open.
+    """Return what an information (m, m) in useful units leaves open.
 
     At a constant speed of 8 m/s a sensor 0.2 m ahead is one that is 0.025 s late:
 

@@ -1,4 +1,4 @@
-"""The part of a log over which something is measured, for diagnoses and tuning."""
+"""Takes the part of a log over which something is measured, for diagnoses and tuning."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -43,7 +43,7 @@ INNOVATION, FAILURE = schemas.INNOVATION.full_name, schemas.FAILURE.full_name
 
 
 class Run(NamedTuple):
-    """A log in memory as it is replayed again and again.
+    """Holds a log in memory as it is replayed again and again.
 
     Attributes:
         ensemble: it alone.
@@ -84,7 +84,7 @@ def is_innovation(rows: Ragged) -> bool:
 
 
 def innovations_in(outputs: Mapping[str, Ragged]) -> Iterator[tuple[str, Stream]]:
-    """The innovation streams of one log's outputs, by topic."""
+    """Yield the innovation streams of one log's outputs, by topic."""
     for topic, rows in outputs.items():
         if is_innovation(rows) and len(rows):
             yield topic, rows.stream
@@ -166,7 +166,7 @@ CRITERIA: dict[By, Criterion] = {
 
 
 class Best(NamedTuple):
-    """The best point (k,) of a search so far, what it costs, and how many points were tried."""
+    """Holds the best point (k,) of a search so far, its cost, and how many points were tried."""
 
     evaluations: int
     point: Floats
@@ -179,7 +179,7 @@ def silent(_: Best) -> None:
 
 @dataclass
 class Objective:
-    """The cost of parameter values over logs.
+    """Computes the cost of parameter values over logs.
 
     Attributes:
         label, settings: the estimator, and its parameters but for those that are searched for.
@@ -201,7 +201,7 @@ class Objective:
     on_best: Callable[[Best], None] = silent
     pool: WorkerPool | None = None
     best: Best = field(default_factory=lambda: Best(0, np.empty(0), np.inf))
-    _told: list[int] = field(default_factory=list)
+    _counts: list[int] = field(default_factory=list)
 
     def __call__(self, points: Floats) -> Floats:
         """What points (n, k) cost (n,); infinity where a run fails or uses fewer measurements.
@@ -226,8 +226,8 @@ class Objective:
             parts = np.array_split(points, min(pool.workers, len(points)))
             alone = self._without_runs()
             working = [
-                [pool.executor.submit(alone.sums, part, run, told) for part in parts]
-                for run, told in zip(self.runs, self._told, strict=True)
+                [pool.executor.submit(alone.sums, part, run, count) for part in parts]
+                for run, count in zip(self.runs, self._counts, strict=True)
             ]
             try:
                 return [[sums for part in of_run for sums in part.result()] for of_run in working]
@@ -258,7 +258,7 @@ class Objective:
                     f"{self.label}: cannot be sent to another process ({error}); tune it with one worker"
                 ) from error
         self.best = Best(self.best.evaluations, np.empty(0), np.inf)
-        self._told, self.runs = [], [self.begun(start, run) for run in self.runs]
+        self._counts, self.runs = [], [self.begun(start, run) for run in self.runs]
         for run in self.runs:
             outputs = self.outputs(start, run)
             failures = _failures(outputs)
@@ -268,14 +268,14 @@ class Objective:
                     f"({failures[0]}); give others with --set"
                 )
             parts = self._parts(start, run)
-            told = max(map(self._count, parts))
-            cost = self._cost([self._total(parts, run, told)])
+            count = max(map(self._count, parts))
+            cost = self._cost([self._total(parts, run, count)])
             if not np.isfinite(cost):
                 raise BadInput(
                     f"{run.name}: {self.label} gives no {CRITERIA[self.by].lacks} there; tune by "
                     f"another of {', '.join(each for each in CRITERIA if each != self.by)}"
                 )
-            self._told.append(told)
+            self._counts.append(count)
 
     def begins_alike(self, values: Floats) -> bool:
         """Tell whether filters would begin at the same stamps with these values (k,)."""
@@ -284,7 +284,7 @@ class Objective:
         )
 
     def begun(self, values: Floats, run: Run) -> Run:
-        """The log, with how the estimator begins with these values (k,); BadInput as `replay`."""
+        """Return the log, with how the estimator begins with these values (k,); BadInput as `replay`."""
         begun: dict[str, Initialized] = {}
         bound = self._bound(values, run)
         if any(initialization_of(each) for each in bound):
@@ -308,16 +308,16 @@ class Objective:
         ]
         return collect(replay(run.ensemble, bound))
 
-    def sums(self, points: Floats, run: Run, told: int) -> list[Sums | None]:
+    def sums(self, points: Floats, run: Run, count: int) -> list[Sums | None]:
         """Sum what a log tells at each point (n, k); None where it gave another number of messages."""
-        return [self._sums(point, run, told) for point in points]
+        return [self._sums(point, run, count) for point in points]
 
-    def _sums(self, values: Floats, run: Run, told: int) -> Sums | None:
+    def _sums(self, values: Floats, run: Run, count: int) -> Sums | None:
         try:
             parts = self._parts(values, run)
         except BadInput:  # as of a batch that does not converge
             return None
-        return self._total(parts, run, told)
+        return self._total(parts, run, count)
 
     def _parts(self, values: Floats, run: Run) -> list[dict[str, Ragged]]:
         """The outputs that are compared: from each part of broad starts, where the log has none."""
@@ -330,9 +330,9 @@ class Objective:
             for part in range(len(run.parts))
         ]
 
-    def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, told: int) -> Sums | None:
+    def _total(self, parts: Sequence[Mapping[str, Ragged]], run: Run, count: int) -> Sums | None:
         """What all parts tell; None where all of them fail or gave another number of messages."""
-        is_used = [not _failures(outputs) and self._count(outputs) == told for outputs in parts]
+        is_used = [not _failures(outputs) and self._count(outputs) == count for outputs in parts]
         if not any(is_used):
             return None
         found = [
@@ -351,9 +351,9 @@ class Objective:
         return CRITERIA[self.by].sums(run, outputs, self.gap_limit_s)
 
     def _cost(self, of_runs: Sequence[Sums | None]) -> float:
-        told = [each for each in of_runs if each is not None]
-        total: Sums = reduce(plus, told, {})
-        if len(told) < len(of_runs) or not total:
+        used = [each for each in of_runs if each is not None]
+        total: Sums = reduce(plus, used, {})
+        if len(used) < len(of_runs) or not total:
             return np.inf
         cost = CRITERIA[self.by].cost(total)
         return cost if np.isfinite(cost) else np.inf

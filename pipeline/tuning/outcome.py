@@ -89,23 +89,23 @@ class Tuning:
 
     @property
     def standard_errors(self) -> Floats:
-        """(k,) of the logarithms of what is positive, of others in units of their own; else NaN."""
+        """Return (k,) of logarithms of what is positive, of others in units of their own; else NaN."""
         errors = np.full(len(self.found.optimum), np.nan)
-        if self.found.told is not None:
-            errors[list(self.found.told.places)] = self.found.told.errors
+        if self.found.confidence is not None:
+            errors[list(self.found.confidence.places)] = self.found.confidence.errors
         return errors
 
     @property
     def correlation(self) -> pd.DataFrame:
         """Return how the errors of what was searched for (logarithms, where positive) correlate."""
-        if self.found.told is None:
+        if self.found.confidence is None:
             return pd.DataFrame()
-        names = [self.found.coordinates.free[place].name for place in self.found.told.places]
-        return pd.DataFrame(self.found.told.correlation, names, names)
+        names = [self.found.coordinates.free[place].name for place in self.found.confidence.places]
+        return pd.DataFrame(self.found.confidence.correlation, names, names)
 
     @property
     def profile(self) -> pd.DataFrame:
-        """Along each parameter its value, and the log-likelihood less its greatest."""
+        """Return along each parameter its value, and the log-likelihood less its greatest."""
         tables = [
             {
                 "parameter": each.name,
@@ -120,10 +120,10 @@ class Tuning:
     @cached_property
     def _profiles(self) -> list[Profile]:
         found = self.found
-        if found.told is None:
+        if found.confidence is None:
             return []
         coordinates = found.coordinates
-        return profiles(self.objective, coordinates, coordinates.of(found.optimum), found.told)
+        return profiles(self.objective, coordinates, coordinates.of(found.optimum), found.confidence)
 
     @cached_property
     def whiteness(self) -> pd.DataFrame:
@@ -172,7 +172,7 @@ class Tuning:
 
     @property
     def replays(self) -> list[Replay]:
-        """Both."""
+        """Return both replays, or the one that there is."""
         return [self.replay, *([self.held_out] if self.held_out else [])]
 
     @property
@@ -244,8 +244,8 @@ class Tuning:
                 "that likelihoods cannot be compared; give every log a prior, a narrower --bound, or "
                 "other values to start from"
             )
-        if found.told is not None:
-            yield from doubts(found.told, found.coordinates)
+        if found.confidence is not None:
+            yield from doubts(found.confidence, found.coordinates)
 
     def _notes_of_innovations(self) -> Iterator[str]:
         rows = self.whiteness.to_dict("records")
@@ -317,7 +317,7 @@ class Tuning:
         return tomli_w.dumps({self.label: values})
 
     def save(self, folder: str | Path) -> ResultFolder:
-        """Write settings.toml, tables, figures, metrics and a timeline as a result folder.
+        """Write settings.toml, tables, figures, metrics and timeline to the result folder `folder`.
 
         Raises BadInput where something else than a result of ours is in the place.
         """

@@ -1,4 +1,4 @@
-"""The search for the parameters of least cost.
+"""Searches for the parameters of least cost.
 
 It goes over the logarithm of what is positive, a standard deviation say; anything else has a unit of its
 own. Gradient and curvature are central differences, whose points are handed over together.
@@ -31,7 +31,7 @@ MOST_GRID_POINTS = 10_000
 
 
 class Free(NamedTuple):
-    """A parameter that is searched for: where from, and between what bounds.
+    """Describes a parameter that is searched for: where from, and between what bounds.
 
     Where it is positive, its logarithm is searched for. `is_assumed` says that neither a setting nor the
     log states the start. `useful` is the standard error that a calibration wants; zero of what is none.
@@ -47,7 +47,7 @@ class Free(NamedTuple):
 
     @property
     def kept(self) -> "Free":
-        """The same, kept at its start."""
+        """Return the same, kept at its start."""
         return self._replace(low=self.start, high=self.start)
 
     @property
@@ -64,22 +64,22 @@ class Coordinates:
     units: Floats
 
     def of(self, values: Floats) -> Floats:
-        """The coordinates (..., k) of values."""
+        """Return the coordinates (..., k) of values."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self._is_log, np.log(values), values / self.units)
 
     def values(self, coordinates: Floats) -> Floats:
-        """The values (..., k) at coordinates, never beyond the bounds by rounding."""
+        """Return the values (..., k) at coordinates, never beyond the bounds by rounding."""
         return np.clip(self.unbounded(coordinates), *self._ends)
 
     def unbounded(self, coordinates: Floats) -> Floats:
-        """The values (..., k) at coordinates, which may lie beyond the bounds."""
+        """Return the values (..., k) at coordinates, which may lie beyond the bounds."""
         with np.errstate(over="ignore"):
             return np.where(self._is_log, np.exp(coordinates), coordinates * self.units)
 
     @property
     def bounds(self) -> tuple[Floats, Floats]:
-        """The bounds (k,), (k,) in coordinates."""
+        """Return the bounds (k,), (k,) in coordinates."""
         low, high = map(self.of, self._ends)
         return low, high
 
@@ -98,7 +98,7 @@ class Coordinates:
 
 
 def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
-    """The coordinates to search in.
+    """Return the coordinates to search in.
 
     Raises BadInput where the cost does not change with a parameter.
     """
@@ -109,7 +109,7 @@ def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
             continue
 
         def near(steps: Sequence[float], place: int = place, each: Free = each) -> Floats:
-            """What it costs so far from the start along this parameter."""
+            """Return what it costs so far from the start along this parameter."""
             points = np.tile(start, (len(steps), 1))
             points[:, place] = np.clip(each.start + np.array(steps), each.low, each.high)
             return cost(points)
@@ -138,7 +138,7 @@ def _unit(near: Callable[[Sequence[float]], Floats], each: Free) -> tuple[float,
 
 
 def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
-    """The start (k,) in coordinates, or the point of a grid between the bounds that costs less.
+    """Return the start (k,) in coordinates, or the point of a grid between the bounds that costs less.
 
     Raises BadInput where the grid has no end, or too many points.
     """
@@ -249,7 +249,7 @@ def _minimum(
 
 
 def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:
-    """The second derivatives (m, m) of the cost at a point (k,), by m of its coordinates.
+    """Return the second derivatives (m, m) of the cost at a point (k,), by m of its coordinates.
 
     They are not finite where the cost beside the point is not.
     """

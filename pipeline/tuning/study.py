@@ -1,4 +1,4 @@
-"""The study of tuning: how well maximum likelihood finds what a scenario was recorded with.
+"""Studies tuning: how well maximum likelihood finds what a scenario was recorded with.
 
 Every run is tuned by itself, at several lengths, from the settings of the experiment's one estimator;
 the tuning is not told what is true. How often 95 % intervals hold the truth, how far values are from
@@ -26,7 +26,7 @@ COVERAGE = 0.95
 
 
 class TuningOptions(Parameters):
-    """How long logs are, and what is searched for.
+    """States how long logs are, and what is searched for.
 
     Attributes:
         durations_s: lengths of the logs, in s.
@@ -106,8 +106,8 @@ def _chart(summary: pd.DataFrame) -> Chart:
         length_s = rows["duration_s"]
         covered.series.append(curve(str(name), length_s, rows["covered_share"], "line+markers"))
         spread.series.append(curve(str(name), length_s, rows["ratio_spread"], "line+markers"))
-        said = rows["standard_error"]
-        spread.series.append(curve(f"{name}, as intervals say", length_s, said, "dashed"))
+        standard_error = rows["standard_error"]
+        spread.series.append(curve(f"{name}, as intervals say", length_s, standard_error, "dashed"))
     covered.series.append(level("95 %", summary["duration_s"], COVERAGE))
     return Chart(title="tuned values over the length of the log", panels=[covered, spread])
 

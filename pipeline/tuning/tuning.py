@@ -1,4 +1,4 @@
-"""The search for the parameters of an estimator that explain logs best.
+"""Searches for the parameters of an estimator that explain logs best.
 
 By maximum likelihood: Durbin and Koopman, Time Series Analysis by State Space Methods, 2nd ed. 2012,
 chapter 7.
@@ -91,6 +91,9 @@ def tune(
         scheduler: as for `run`.
         executor: as for `run`.
         on_best: is told of the best values again and again.
+
+    Returns:
+        The parameters with 95 % intervals, and the logs replayed with the values before and after.
 
     Ctrl-C ends the search with the best values so far. A gate is open while innovations are tuned by.
     Raises BadInput where there is nothing to search, or no log can be replayed at the start.
@@ -325,8 +328,8 @@ def _search(
             point = least_of_grid(objective, coordinates, grid)
         is_smooth = CRITERIA[objective.by].is_smooth
         point, has_converged = least(objective, coordinates, point, is_smooth=is_smooth)
-        told, is_at_edge = _told(objective, coordinates, point)
-        if told is not None and (places := unknown(told, coordinates)):
+        known, is_at_edge = _confidence_at(objective, coordinates, point)
+        if known is not None and (places := unknown(known, coordinates)):
             kept = [each.kept if place in places else each for place, each in enumerate(free)]
             nearer = replace(coordinates, free=kept)
             low, high = nearer.bounds
@@ -334,10 +337,10 @@ def _search(
             best, cost = objective(np.array([coordinates.values(point), nearer.values(ended)]))
             if cost - best < ENOUGH:
                 coordinates, point = nearer, ended
-                told, is_at_edge = _told(objective, coordinates, point)
+                known, is_at_edge = _confidence_at(objective, coordinates, point)
         optimum, evaluations = coordinates.values(point), objective.best.evaluations
         return SearchOutcome(
-            coordinates, optimum, evaluations, told, has_converged=has_converged, is_at_edge=is_at_edge
+            coordinates, optimum, evaluations, known, has_converged=has_converged, is_at_edge=is_at_edge
         )
     except KeyboardInterrupt as stopped:
         if type(stopped) is not KeyboardInterrupt:  # a signal that ends the process
@@ -346,7 +349,7 @@ def _search(
         return SearchOutcome(coordinates, best_yet.point, best_yet.evaluations, was_stopped=True)
 
 
-def _told(
+def _confidence_at(
     objective: Objective, coordinates: Coordinates, point: Floats
 ) -> tuple[Confidence | None, bool]:
     """How well a search by likelihood tells what lies at no bound, and whether runs fail beside it."""

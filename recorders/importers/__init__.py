@@ -1,1 +1,1 @@
-"""Importers of real data, one file or package per source; begin with `mrclam`."""
+"""Imports real data, one file or package per source; begin with `mrclam`."""

@@ -1,4 +1,4 @@
-"""AIS position reports of vessels, as tables with one row per report (CSV, also compressed).
+"""Imports AIS position reports of vessels: tables with one row per report (CSV, also compressed).
 
 The columns are Time, MMSI, Latitude_degrees, Longitude_degrees, COG_degrees and SOG_knots; others are
 not read. Codes for what a transponder does not know are those of ITU-R M.1371-5, table 48. /reports says
@@ -37,7 +37,7 @@ NO_LATITUDE, NO_LONGITUDE, NO_COURSE, NO_SPEED = 91.0, 181.0, 360.0, 102.3
 
 
 class AisParameters(Parameters):
-    """Where the tangent plane is, and what is reported as unlikely.
+    """States where the tangent plane is, and what is reported as unlikely.
 
     Attributes:
         origin_deg: latitude and longitude of the tangent plane's origin; without one the median of the
@@ -54,7 +54,7 @@ class AisParameters(Parameters):
 
 
 class Reports(NamedTuple):
-    """The rows of a file: stamps in ns, MMSI, degrees, and m/s; NaN where not available."""
+    """Holds the rows of a file: stamps in ns, MMSI, degrees, and m/s; NaN where not available."""
 
     time_ns: NDArray[np.int64]
     mmsi: NDArray[np.int64]
@@ -64,7 +64,7 @@ class Reports(NamedTuple):
     speed_mps: Floats
 
     def take(self, rows: NDArray) -> "Reports":
-        """Some of the rows."""
+        """Return some of the rows."""
         return Reports(*(column[rows] for column in self))
 
 

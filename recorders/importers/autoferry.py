@@ -1,4 +1,4 @@
-"""Autoferry: lidar, radar and camera detections of vessels from a moving one, with their GPS as truth.
+"""Imports Autoferry: lidar, radar and camera detections of vessels from a moving one, GPS as truth.
 
 Helgesen et al., "Heterogeneous multi-sensor tracking for an autonomous surface vehicle in a littoral
 environment", Ocean Engineering 252, 2022; data CC0 1.0. A scenario is a folder with a list of scans,
@@ -37,7 +37,7 @@ PLANE = ("x_m", "y_m")
 
 
 class PlaceSensor(Parameters):
-    """What is assumed of a sensor that measures positions; its channels state it to trackers.
+    """States what is assumed of a sensor of positions; its channels state it to trackers.
 
     Attributes:
         sigma_m: standard deviation of a position along the line of sight.
@@ -66,7 +66,7 @@ class PlaceSensor(Parameters):
 
 
 class Camera(Parameters):
-    """What is assumed of a camera's bearings; its channels state it to trackers.
+    """States what is assumed of a camera's bearings; its channels state it to trackers.
 
     Attributes:
         sigma_rad: standard deviation of a bearing.
@@ -87,7 +87,7 @@ class Camera(Parameters):
 
 
 class AutoferryParameters(Parameters):
-    """What the files do not state: the sensors' properties, the same in all scenarios.
+    """States what the files do not: the sensors' properties, the same in all scenarios.
 
     Attributes:
         lidar, radar: what is assumed of this sensor's detections.
@@ -118,7 +118,7 @@ class AutoferryParameters(Parameters):
 
 
 class Scans(NamedTuple):
-    """The scans (n,) of a file in its order: sensor, stamp, arrival, ownship (n, 2), what was seen.
+    """Holds the scans (n,) of a file in order: sensor, stamp, arrival, ownship (n, 2), what was seen.
 
     What was seen is (detections, 2) places east and north of the ownship, or (detections, 1) bearings.
     """

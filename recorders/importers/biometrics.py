@@ -1,4 +1,4 @@
-"""Score matrices of biometric matchers, such as the NIST Biometric Scores Set: one CSV per matcher.
+"""Imports score matrices of biometric matchers, as NIST's Biometric Scores Set: a CSV per matcher.
 
 The first row holds the gallery's user ids, the first column the probes'. Matchers are named in the
 parameters, or in a file `matchers.toml` of the folder:
@@ -26,7 +26,7 @@ from recorders.recording import Importer, Recording, simulation_stamps_ns
 
 
 class Matchers(Parameters):
-    """What matchers.toml says.
+    """Holds what matchers.toml says.
 
     Attributes:
         matchers: the matchers, in the order of their files.
@@ -43,7 +43,7 @@ class Matchers(Parameters):
 
 
 class ScoreMatricesParameters(Matchers):
-    """The matchers, and when probes arrive: the data say no times.
+    """States the matchers, and when probes arrive: the data say no times.
 
     Attributes:
         probe_interval_s: time between probes.

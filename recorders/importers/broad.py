@@ -1,4 +1,4 @@
-"""BROAD, the Berlin Robust Orientation Estimation Assessment Dataset: inertial samples with truth.
+"""Imports BROAD, the Berlin Robust Orientation Estimation Assessment Dataset: inertial samples, truth.
 
 Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021, CC BY 4.0. A trial is one HDF5 file; a file or a folder
 of them is one run, in which every trial has its own topics under the file's name.
@@ -27,7 +27,7 @@ DATASETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "movement":
 
 
 class BroadParameters(Parameters):
-    """What is refused, and what is reported.
+    """States what is refused, and what is reported.
 
     Attributes:
         unit_tolerance: how far the length of a true quaternion may be from 1.

@@ -56,7 +56,7 @@ _IN_BODY = {
 
 
 class Inflation(Parameters):
-    """Where standard deviations are larger than they say.
+    """States where standard deviations are larger than they say.
 
     Attributes:
         where: for each source the values with which they are.
@@ -68,7 +68,7 @@ class Inflation(Parameters):
 
 
 class StreamMapping(Parameters):
-    """What becomes one of fuselog's messages.
+    """States what becomes one of fuselog's messages.
 
     Attributes:
         becomes: name of the message.
@@ -107,7 +107,7 @@ class StreamMapping(Parameters):
     states: dict[str, float] = {}
 
     def sources(self) -> Iterator[str]:
-        """The names of all sources of numbers; some may come again."""
+        """Yield the names of all sources of numbers; some may come again."""
         for fields in (self.fields, *self.each):
             for given in fields.values():
                 yield from (source for source in _listed(given) if isinstance(source, str))
@@ -115,7 +115,7 @@ class StreamMapping(Parameters):
             yield from (source for source in listed if isinstance(source, str))
 
     def conditions(self) -> Iterator[tuple[str, list[Source]]]:
-        """The sources that are compared, and with what."""
+        """Yield the sources that are compared, and with what."""
         for where in (self.where, *(each.where for each in self.inflated)):
             for source, values in where.items():
                 yield source, _listed(values)
@@ -152,7 +152,7 @@ def schema_of(mapping: StreamMapping, where: str) -> Schema:
 
 
 class Mapped(NamedTuple):
-    """Messages (k,) that were made: their columns, of which row (n,) each is, and which are left out."""
+    """Holds messages (k,) that were made: columns, of which row (n,) each is, and which are left out."""
 
     columns: dict[str, NDArray]
     rows: NDArray[np.int64]
@@ -189,7 +189,7 @@ def mapped(mapping: StreamMapping, size: int, read: Read, holds: Holds, where: s
 
 
 class _Maker(NamedTuple):
-    """What makes columns of the sources."""
+    """Makes columns of the sources."""
 
     mapping: StreamMapping
     schema: Schema
@@ -198,7 +198,7 @@ class _Maker(NamedTuple):
     where: str
 
     def columns(self, fields: Mapping[str, OneOrMore[Source]], stretch: Floats) -> dict[str, NDArray]:
-        """A column for every field of the message but the sensor's clock."""
+        """Return a column for every field of the message but the sensor's clock."""
         made: dict[str, NDArray] = {}
         for entry in list(self.schema)[1:]:
             if entry.name in self.mapping.deviations:

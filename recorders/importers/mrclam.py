@@ -1,4 +1,4 @@
-"""UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
+"""Imports UTIAS multi-robot cooperative localization and mapping (MRCLAM) data sets.
 
 K. Leung et al., "The UTIAS multi-robot cooperative localization and mapping dataset", IJRR 2011. A
 folder holds Barcodes.dat, Landmark_Groundtruth.dat and, per robot, its ground truth, odometry and
@@ -22,7 +22,7 @@ POSE = {"components": "x_m,y_m,heading_rad", "kinds": "linear,linear,angle"}
 
 
 class MrclamParameters(Parameters):
-    """What the data do not state: noise of odometry and sensor, and the uncertainty of the start.
+    """States what the data do not: noise of odometry and sensor, and the uncertainty of the start.
 
     They are the same for all sets and robots. The densities of the odometry are those of its errors
     over 1 to 20 s, rounded up. Errors of successive ranges and bearings are correlated (by 0.5 to 0.7

@@ -1,4 +1,4 @@
-"""Sounds in synchronised recordings of several microphones, as differences of their arrivals.
+"""Imports sounds in synchronised recordings of microphones, as differences of their arrivals.
 
 A folder as opensoundscape's: WAV files, a table of the microphones' places (CSV with the file first, x,
 y and perhaps z, in m), and tables of detections (CSV with the file first, start_time and end_time in s
@@ -36,7 +36,7 @@ AXES = ("x", "y", "z")
 
 
 class SoundRecordingsParameters(Parameters):
-    """What the files do not state: the air, the band that is used, and true positions of sounds.
+    """States what the files do not: the air, the band that is used, and true positions of sounds.
 
     Attributes:
         speed_of_sound_mps: speed of sound in the air.
@@ -57,7 +57,7 @@ class SoundRecordingsParameters(Parameters):
 
 
 class Recorded(NamedTuple):
-    """A file: its samples, how many a second, and when it began, ns since 1970, or None."""
+    """Holds a file: its samples, how many a second, and when it began, ns since 1970, or None."""
 
     samples: Floats
     rate_hz: int
@@ -74,7 +74,7 @@ class Sound(NamedTuple):
 
 
 class Array(NamedTuple):
-    """The microphones of one table, by file: their places (3,), numbers in the log, and recordings."""
+    """Holds the microphones of one table, by file: places (3,), numbers in the log, and recordings."""
 
     path: Path
     places: dict[str, Floats]
@@ -107,8 +107,8 @@ def read(folder: Path, parameters: SoundRecordingsParameters) -> Recording:
     for path, table in placing.items():
         arrays.append(_array(folder, path, table, 1 + count, notes))
         count += len(arrays[-1].files)
-    told = [each.begin_ns for array in arrays for each in array.files.values()]
-    epoch_ns = min((each for each in told if each is not None), default=SIMULATION_EPOCH_NS)
+    begins_ns = [each.begin_ns for array in arrays for each in array.files.values()]
+    epoch_ns = min((each for each in begins_ns if each is not None), default=SIMULATION_EPOCH_NS)
     streams = [
         stream
         for array in arrays

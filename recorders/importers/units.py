@@ -1,4 +1,4 @@
-"""Units of what others log, such as deg, km/h or m/s^2, and what they are in fuselog's.
+"""Reads units of what others log, such as deg, km/h or m/s^2, as multiples of fuselog's.
 
 A product of powers of a dozen names is all that logs need, and what a field is in stands in its name
 (`range_m`, `turn_rate_radps`): a library of units would bring thousands more and half a second of start.
@@ -12,7 +12,7 @@ from recorders.errors import BadInput, choices
 
 
 class Unit(NamedTuple):
-    """A size in SI units (angles in rad), and the powers of length, time, angle and flux density."""
+    """Holds a size in SI units (angles in rad), and powers of length, time, angle and flux density."""
 
     size: float
     powers: tuple[int, ...]
@@ -42,7 +42,7 @@ _FACTOR = re.compile(r"\s*([/*]?)\s*([A-Za-z]+)(?:\^?(-?\d))?\s*")
 
 
 def unit(text: str) -> Unit:
-    """The unit that a text such as `m/s^2`, `deg/s` or `m s^-2` names.
+    """Return the unit that a text such as `m/s^2`, `deg/s` or `m s^-2` names.
 
     Raises BadInput where it names none.
 

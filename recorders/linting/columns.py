@@ -1,4 +1,4 @@
-"""Checks of single columns: values that freeze, are rounded, or end where the sensor's range does."""
+"""Checks single columns: values that freeze, are rounded, or end where the sensor's range does."""
 
 from collections.abc import Iterator, Mapping
 
@@ -25,7 +25,7 @@ _DRIVEN = {schemas.ODOMETRY.full_name, schemas.TWIST.full_name}  # exact zeros o
 
 
 def frozen(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
-    """A value that stays for far longer than the column's do, while others of the topic move.
+    """Find a value that stays for far longer than the column's do, while others of the topic move.
 
     What is rounded, and goes on within two steps of where it stood, has rested and was not frozen.
     """
@@ -108,7 +108,7 @@ def saturated(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def resolution(values: Floats) -> float:
-    """The grid that all values lie on; zero where there is none."""
+    """Return the grid that all values lie on; zero where there is none."""
     levels = np.unique(values)
     if len(levels) < LEVELS or len(levels) > len(values) / 2:
         return 0.0

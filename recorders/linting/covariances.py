@@ -1,4 +1,4 @@
-"""A check of covariances: matrices that none can be, and numbers that stand for unknown."""
+"""Checks covariances: matrices that none can be, and numbers that stand for unknown."""
 
 from collections.abc import Iterator, Mapping
 from math import isqrt

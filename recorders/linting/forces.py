@@ -1,4 +1,4 @@
-"""A check of specific forces: which axis is up."""
+"""Checks specific forces: which axis is up."""
 
 from collections.abc import Iterator, Mapping
 

@@ -1,4 +1,4 @@
-"""The checks of a log in their table, asked portion by portion, so that memory is bounded."""
+"""Asks the checks of a log in their table, portion by portion, so that memory is bounded."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import islice
@@ -33,7 +33,7 @@ CHECKS: tuple[Callable[[Stream, Mapping[str, Stream]], Iterator[Finding]], ...] 
 
 
 def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None) -> list[Finding]:
-    """What is wrong with a log, of blocks that follow one another in time; hints stand last.
+    """Return what is wrong with a log, of blocks that follow one another in time; hints stand last.
 
     Every portion of some `MOST` messages is checked by itself, and what is found in several is said
     once, of the first. Topics are compared in pairs in the first portion alone.
@@ -47,17 +47,17 @@ def lint(blocks: Iterable[Mapping[str, Stream]], *, portions: int | None = None)
     """
     found: dict[tuple[str, str, str], list[Finding]] = {}
     for index, streams in enumerate(islice(_portions(blocks), portions)):
-        told = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
-        for each in (*told, *_asked(CHECKS, streams)):
+        of_stamps = findings(streams) if not index else list(_asked(OF_STAMPS, streams))
+        for each in (*of_stamps, *_asked(CHECKS, streams)):
             others = found.setdefault((each.cause, each.topic, each.field), [])
-            if not others or (each in told and not index):
+            if not others or (each in of_stamps and not index):
                 others.append(each)
     listed = [each for several in found.values() for each in several]
     return sorted(listed, key=lambda each: each.sure == "hint")
 
 
 def lint_log(log: Log, *, portions: int | None = None) -> list[Finding]:
-    """The findings of a log file, see `lint`; raises BadInput where it is damaged."""
+    """Return the findings of a log file, see `lint`; raises BadInput where it is damaged."""
     topics = [topic for topic in log.topics if _is_sensed(log, topic)]
     blocks = read_blocks(log, topics, block_messages=BLOCK) if topics else ()
     return lint(blocks, portions=portions)

@@ -1,4 +1,4 @@
-"""Checks of magnetic fields: their unit, and iron on board, by the circle of a full turn."""
+"""Checks magnetic fields: their unit, and iron on board, by the circle of a full turn."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -51,38 +51,38 @@ def units(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
 def iron(stream: Stream, _: Mapping[str, Stream]) -> Iterator[Finding]:
     """Fields whose circle in a full turn is off the origin (hard iron), or an ellipse (soft iron)."""
     field = _field(stream)
-    told = None if field is None else ellipse(field)
-    if told is None:
+    circle = None if field is None else ellipse(field)
+    if circle is None:
         return
-    share = float(np.linalg.norm(told.centre)) / told.radius
+    share = float(np.linalg.norm(circle.centre)) / circle.radius
     if share > HARD:
-        offsets = ", ".join(f"{-each:.4g}" for each in told.centre)
-        axis = int(np.argmax(np.abs(told.centre)))
+        offsets = ", ".join(f"{-each:.4g}" for each in circle.centre)
+        axis = int(np.argmax(np.abs(circle.centre)))
         yield Finding(
             "magnetometer",
             stream.topic,
             FIELD,
             share,
             f"{stream.topic}: hard iron: in a full turn {FIELD} goes round a centre that is {share:.2g} "
-            f"of the radius, {told.radius:.3g} uT, off zero",
+            f"of the radius, {circle.radius:.3g} uT, off zero",
             f"{stream.topic}.magnetic_field_{'xyz'[axis]}_bias",
-            digits(float(told.centre[axis])),
+            digits(float(circle.centre[axis])),
             f"offsets.{FIELD} = [{offsets}] in the mapping",
         )
-    elif told.ratio > SOFT:
+    elif circle.ratio > SOFT:
         yield Finding(
             "magnetometer",
             stream.topic,
             FIELD,
-            told.ratio,
+            circle.ratio,
             f"{stream.topic}: soft iron: in a full turn {FIELD} goes along an ellipse whose axes are "
-            f"{told.ratio:.3g} to 1",
+            f"{circle.ratio:.3g} to 1",
             mapping="calibrate its axes",
         )
 
 
 class Ellipse(NamedTuple):
-    """What a field goes along in a turn: its centre (3,), mean radius and ratio of axes."""
+    """Describes what a field goes along in a turn: its centre (3,), mean radius and ratio of axes."""
 
     centre: Floats
     radius: float

@@ -1,4 +1,4 @@
-"""Checks of names: frames by REP 103, units there twice by REP 145, topics alone in their namespace."""
+"""Checks names: frames by REP 103, units there twice by REP 145, topics alone in their namespace."""
 
 import re
 from collections.abc import Iterator, Mapping

@@ -1,4 +1,4 @@
-"""Checks of places: latitudes and longitudes that are none, or exchanged, and heights."""
+"""Checks places: latitudes and longitudes that are none, or exchanged, and heights."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

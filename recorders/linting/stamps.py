@@ -1,4 +1,4 @@
-"""Checks of stamps: their unit, order, regularity, and how they stand to the recorder's clock."""
+"""Checks stamps: their unit, order, regularity, and how they stand to the recorder's clock."""
 
 from collections.abc import Iterator, Mapping
 

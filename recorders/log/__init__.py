@@ -1,4 +1,4 @@
-"""The log contract: schemas, columns, and the reading and writing of MCAP files.
+"""Keeps the log contract: schemas, columns, and the reading and writing of MCAP files.
 
 Begin with `streams`, which is what a topic is in memory, then `reader` and `writer`.
 """

@@ -1,4 +1,4 @@
-"""Companions: messages of other makers' schemas beside a log's streams, for viewers alone.
+"""Writes companions: other makers' messages beside a log's streams, for viewers alone.
 
 A companion's channel states in its metadata which stream it accompanies, and is none of the log's
 topics. Its messages have no fixed layout; they are written one by one, into chunks of their own.
@@ -23,7 +23,7 @@ _HEAD = struct.Struct("<BQHIQQ")
 
 
 class Companion(NamedTuple):
-    """A message, its topic, the topic of the stream that it accompanies, and its two clocks."""
+    """Holds a message, its topic, the topic of the stream that it accompanies, and its two clocks."""
 
     topic: str
     of: str
@@ -33,7 +33,7 @@ class Companion(NamedTuple):
 
 
 class Numbered(NamedTuple):
-    """A companion with its channel and its number there."""
+    """Holds a companion with its channel and its number there."""
 
     channel_id: int
     sequence: int
@@ -41,7 +41,7 @@ class Numbered(NamedTuple):
 
 
 def descriptor_set(message: Message) -> bytes:
-    """The serialised FileDescriptorSet of a message with all that it is made of."""
+    """Return the serialised FileDescriptorSet of a message with all that it is made of."""
     files: dict[str, descriptor_pb2.FileDescriptorProto] = {}
 
     def add(file: Any) -> None:

@@ -85,11 +85,11 @@ class Decoder:
             )
 
     def empty(self) -> Stream:
-        """The topic without messages."""
+        """Return the topic without messages."""
         return empty_stream(self._topic.name, self.schema, self._topic.metadata)
 
     def decode(self, contents: Contents, rank: int) -> list[Stream]:
-        """The topic's messages in the region that is the file's `rank`th, channel by channel.
+        """Return the topic's messages in the region that is the file's `rank`th, channel by channel.
 
         Raises BadInput where a message cannot be decoded, or its fields make no columns.
         """

@@ -1,4 +1,4 @@
-"""The one byte layout that all messages of a stream share, as a NumPy type.
+"""Describes the one byte layout that all messages of a stream share, as a NumPy type.
 
 A message record of MCAP is opcode, length, channel, sequence, two clocks and the payload; the payload
 is protobuf whose fields all have a fixed width. So a structured array is the bytes of a chunk, and the
@@ -33,7 +33,7 @@ _WIRE_TYPES = {"time_ns": 1, "identifier": 5, "real": 1, "vector": 2}
 
 @dataclass(frozen=True)
 class Layout:
-    """The byte layout of one schema with given vector widths, its constant bytes told apart.
+    """Describes the bytes of one schema with given vector widths, its constant bytes told apart.
 
     An empty vector is absent from the wire, as proto3 has it, and so from `dtype`.
     """
@@ -43,7 +43,7 @@ class Layout:
     pattern: Pattern
 
     def build(self, stream: Stream, channel_id: int, first_sequence: int) -> NDArray[np.void]:
-        """The stream's message records as a structured array (n,)."""
+        """Return the stream's message records as a structured array (n,)."""
         rows = np.repeat(self.template.view(_opaque(self.dtype.itemsize)), len(stream))
         records = rows.view(self.dtype)
         records["mcap channel_id"] = channel_id
@@ -63,7 +63,7 @@ class Layout:
 
 
 def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
-    """The schema's columns, copied out of records; an empty vector has shape (n, 0)."""
+    """Return the schema's columns, copied out of records; an empty vector has shape (n, 0)."""
     return {
         field.name: np.ascontiguousarray(records[field.name])
         if field.name in (records.dtype.names or ())
@@ -82,7 +82,7 @@ def _opaque(size: int) -> np.dtype:
 
 
 def layout_of(schema: Schema, widths: Mapping[str, int]) -> Layout:
-    """The layout of `schema` when its vectors have these widths."""
+    """Return the layout of `schema` when its vectors have these widths."""
     return _layout(schema, tuple(widths.get(field.name, 0) for field in schema))
 
 

@@ -1,4 +1,4 @@
-"""The loops over the bytes of a chunk: find its records, and compare messages with a layout.
+"""Loops over the bytes of a chunk: finds its records, and compares messages with a layout.
 
 The loops see the bytes as 64-bit words, one of which starts at every byte, so that they compare eight
 bytes at a time. numba compiles them, and takes longer to import than plain Python to go through twenty
@@ -44,7 +44,7 @@ class Scan(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """The bytes that all records of one layout share: words at `places` within its `size` bytes."""
+    """Holds the bytes that all records of a layout share: words at `places` within its `size` bytes."""
 
     size: int
     places: NDArray[np.int64]
@@ -53,7 +53,7 @@ class Pattern(NamedTuple):
 
 
 def pattern_of(record: NDArray[np.uint8], is_fixed: NDArray[np.uint8]) -> Pattern:
-    """The pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
+    """Return the pattern of a record (size,), of which the bytes are fixed where `is_fixed` is 0xFF."""
     size = len(record)
     places = np.unique(np.minimum(np.arange(0, size, 8), size - 8))
     mask = words_of(is_fixed)[places]
@@ -75,7 +75,7 @@ def agree(data: NDArray[np.uint8], offsets: NDArray[np.int64], pattern: Pattern)
 
 
 def words_of(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """The words that start at every byte of `data` but the last seven, without a copy."""
+    """Return the words that start at every byte of `data` but the last seven, without a copy."""
     count = max(len(data) - 7, 0)
     return np.ndarray((count,), "<u8", data.data if count else None, strides=(1,))
 

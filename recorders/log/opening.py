@@ -1,4 +1,4 @@
-"""Opening a log: what it holds, by topic, and what is missing from it."""
+"""Opens a log: says what it holds, by topic, and what is missing from it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Log:
-    """An opened log: what it holds, not the messages themselves."""
+    """Represents an opened log: what it holds, not the messages themselves."""
 
     path: Path
     container: Container
@@ -48,7 +48,7 @@ class Log:
 
     @cached_property
     def topics(self) -> dict[str, Topic]:
-        """The topics by name, sorted; companions are none of them."""
+        """Return the topics by name, sorted; companions are none of them."""
         return {name: topic for name, topic in self._all.items() if COMPANION_OF not in topic.metadata}
 
     @cached_property
@@ -80,7 +80,7 @@ class Log:
         )
 
     def require(self, topic: str) -> Topic:
-        """The topic of this name; raises BadInput that lists what there is."""
+        """Return the topic of this name; raises BadInput that lists what there is."""
         if topic not in self.topics:
             raise BadInput(
                 f"{self.path}: no topic {topic}; it has {', '.join(self.topics) or 'no topics'}"

@@ -1,4 +1,4 @@
-"""The planes that positions are in: east, north and up of an origin on the earth, as channels state it.
+"""Reads the planes that positions are in: east, north, up of an origin, as channels state it.
 
 A channel that states no origin is in the plane of its log, unless it names a frame of its own.
 """
@@ -32,7 +32,7 @@ _PLANAR = {each.full_name for each in (POSITION_FIX, VELOCITY_FIX, POSE, COURSE_
 
 
 class Origin(NamedTuple):
-    """Where a plane touches: latitude and longitude (deg), height above the ellipsoid (m)."""
+    """States where a plane touches: latitude and longitude (deg), height above the ellipsoid (m)."""
 
     latitude_deg: float
     longitude_deg: float
@@ -48,7 +48,7 @@ class Origin(NamedTuple):
 
 
 def origin_of(parts: Sequence[str]) -> Origin | None:
-    """The origin that two or three numbers state; None where they state none."""
+    """Return the origin that two or three numbers state; None where they state none."""
     try:
         numbers = [float(part) for part in parts]
     except ValueError:
@@ -88,7 +88,7 @@ def is_framed(metadata: Mapping[str, str]) -> bool:
 
 
 def plane_in_words(metadata: Mapping[str, str]) -> str:
-    """The frame that a channel names, else that it is one of its own."""
+    """Return the frame that a channel names, else that it is one of its own."""
     return f"frame {metadata[FRAME]}" if metadata.get(FRAME) else "a frame of its own"
 
 

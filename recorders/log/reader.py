@@ -1,4 +1,4 @@
-"""Reading logs as columns, block by block in time order, with memory bounded by the blocks in hand."""
+"""Reads logs as columns, block by block in time order, with memory bounded by the blocks in hand."""
 
 import sys
 from collections import Counter
@@ -24,14 +24,14 @@ _ALWAYS = Span(-1, 1 << 64)
 
 
 class _Window(NamedTuple):
-    """The stamps that are asked for, and of which clock."""
+    """Holds the stamps that are asked for, and of which clock."""
 
     clock: Clock
     span: Span
 
 
 class _Ranked(NamedTuple):
-    """A region, and its rank in the file."""
+    """Holds a region, and its rank in the file."""
 
     rank: int
     region: Region
@@ -76,7 +76,7 @@ def read_span(log: Log, clock: Clock) -> tuple[int, int]:
 
 
 def read_empty(log: Log, topic: str) -> Stream:
-    """A topic without its messages: its schema and metadata."""
+    """Return a topic without its messages: its schema and metadata."""
     return Decoder(log, topic).empty()
 
 

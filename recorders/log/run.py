@@ -35,7 +35,7 @@ class RunMetadata:
     notes: dict[str, str] = field(default_factory=dict)
 
     def to_record(self) -> dict[str, str]:
-        """The text pairs of the MCAP metadata record."""
+        """Return the text pairs of the MCAP metadata record."""
         return {
             "format": str(FORMAT),
             "scenario": self.scenario,
@@ -48,7 +48,10 @@ class RunMetadata:
 
     @classmethod
     def from_record(cls, record: dict[str, str], path: object) -> "RunMetadata":
-        """Read the MCAP metadata record back; raises BadInput where damaged or of another format."""
+        """Read the MCAP metadata `record` of the file `path` back.
+
+        Raises BadInput where it is damaged or of another format.
+        """
         try:
             written_in = _stated({"format": "1", **record}, "format", int)
             check_format(path, written_in, FORMAT)

@@ -52,13 +52,13 @@ class Field:
 
     @property
     def dtype(self) -> np.dtype:
-        """The type of one element of this field's column."""
+        """Return the type of one element of this field's column."""
         return NUMPY_TYPES[self.kind]
 
 
 @dataclass(frozen=True)
 class Schema:
-    """A message type: its protobuf name without the package, what it says, and its fields.
+    """Describes a message type: its protobuf name without the package, what it says, and its fields.
 
     Attributes:
         name: the name of its protobuf message, without the package.
@@ -77,12 +77,12 @@ class Schema:
 
     @property
     def full_name(self) -> str:
-        """The protobuf name, such as `fuselog.Bearing`."""
+        """Return the protobuf name, such as `fuselog.Bearing`."""
         return f"{self.package}.{self.name}" if self.package else self.name
 
     @cached_property
     def descriptor_set(self) -> bytes:
-        """The serialised FileDescriptorSet that describes this message inside a file."""
+        """Return the serialised FileDescriptorSet that describes this message inside a file."""
         file = descriptor_pb2.FileDescriptorProto(
             name=f"{self.package}/{self.name}.proto", package=self.package, syntax="proto3"
         )
@@ -100,7 +100,7 @@ class Schema:
 
     @property
     def message_class(self) -> type[message.Message]:
-        """The protobuf class of this message, as any other program would build it from a file."""
+        """Return the protobuf class of this message, as any other program would build it from a file."""
         return message_class(self.descriptor_set, self.full_name)
 
 
@@ -117,7 +117,7 @@ def message_class(descriptor_set: bytes, full_name: str) -> type[message.Message
 
 
 def schema_of(message_type: type[message.Message]) -> Schema:
-    """The numeric fields of a message of any origin; fields of other kinds are left out.
+    """Return the numeric fields of a message of any origin; fields of other kinds are left out.
 
     Where the name is one of ours, what may be NaN is what we declare; else everything may.
     """

@@ -61,15 +61,15 @@ class Stream:
 
     @property
     def components(self) -> list[str]:
-        """The names of a state's or estimate's components, such as `x_m`."""
+        """Return the names of a state's or estimate's components, such as `x_m`."""
         return [name for name in self.metadata.get("components", "").split(",") if name]
 
     def times(self, clock: Clock) -> NDArray[np.int64]:
-        """The stamps (n,) of one of the two clocks, in ns."""
+        """Return the stamps (n,) of `clock`, "publish_time" or "log_time", in ns."""
         return self.publish_time_ns if clock == "publish_time" else self.log_time_ns
 
     def take(self, rows: NDArray[np.int64] | NDArray[np.bool_] | slice) -> "Stream":
-        """The messages of `rows`, in that order."""
+        """Return the messages of `rows`, in that order."""
         return replace(
             self,
             publish_time_ns=self.publish_time_ns[rows],
@@ -79,7 +79,7 @@ class Stream:
         )
 
     def pandas(self) -> "pd.DataFrame":
-        """A row for every message: both stamps in ns, then the fields.
+        """Return a row for every message: both stamps in ns, then the fields.
 
         A vector has a column for every entry, such as `mean_x_m`; where its entries have no names they
         have numbers, such as `covariance_0`.
@@ -89,13 +89,13 @@ class Stream:
         return pd.DataFrame(self._flat())
 
     def arrow(self) -> "pa.Table":
-        """The same table for Arrow."""
+        """Return the same table for Arrow."""
         import pyarrow as pa
 
         return pa.table(self._flat())
 
     def polars(self) -> "pl.DataFrame":
-        """The same table for polars; raises BadInput where that is not installed."""
+        """Return the same table for polars; raises BadInput where that is not installed."""
         try:
             import polars as pl
         except ImportError:
@@ -145,6 +145,9 @@ def make_stream(
         sensor_time_ns: (n,), the stamp by the clock of the sensor.
         metadata: what the channel states, as text.
         columns: by field, (n,), or (n, width) for a vector.
+
+    Returns:
+        The stream, with its messages in the order given.
 
     >>> from recorders.log import schemas
     >>> make_stream("/gyro", schemas.RANGE, [0, 10], target_id=[1, 1], range_m=[5.0])
@@ -296,7 +299,7 @@ def concatenate(parts: Sequence[Stream], where: str = "") -> Stream:
 
 
 def empty_stream(topic: str, schema: Schema, metadata: Mapping[str, str]) -> Stream:
-    """A stream without messages; its vectors have width 0."""
+    """Return a stream without messages; its vectors have width 0."""
     times = np.empty(0, np.int64)
     columns = {
         entry.name: np.empty((0, 0) if entry.kind == "vector" else 0, entry.dtype) for entry in schema

@@ -1,4 +1,4 @@
-"""Writing streams as a log: whole chunks at a time, and never half a file."""
+"""Writes streams as a log: whole chunks at a time, and never half a file."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ Companions = Callable[[Stream], Iterable[Companion]]
 
 @dataclass
 class _Topic:
-    """What a topic keeps from its first block to its last, and how many messages it has so far."""
+    """Holds what a topic keeps from its first block to its last, and how many messages it has so far."""
 
     channel_id: int
     schema: Schema
@@ -38,7 +38,7 @@ class _Topic:
 
 @dataclass
 class _Channel:
-    """The channel of a companion, and how many messages it has so far."""
+    """Holds the channel of a companion, and how many messages it has so far."""
 
     channel_id: int
     messages: int = 0

@@ -1,4 +1,4 @@
-"""Motion and measurement models: written once, for simulators and estimators alike.
+"""Models motion and measurements once, for simulators and estimators alike.
 
 Begin with `planar`, the robot's.
 """

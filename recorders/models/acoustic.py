@@ -17,7 +17,7 @@ SHOT_COMPONENTS = ("x_m", "y_m", "trajectory_rad")
 
 
 class Medium(NamedTuple):
-    """The air, and the bullet's constant speed in multiples of that of sound."""
+    """Describes the air, and the bullet's constant speed in multiples of that of sound."""
 
     speed_of_sound_mps: float = 342.0
     mach_number: float = 2.0
@@ -29,7 +29,7 @@ class Medium(NamedTuple):
 
 
 class Noise(NamedTuple):
-    """Standard deviations of what a sensor measures; `position_m` is that of its GPS, per axis."""
+    """Holds standard deviations of what a sensor measures; `position_m` is its GPS's, per axis."""
 
     muzzle_blast_rad: float
     shockwave_rad: float
@@ -74,17 +74,17 @@ def shockwave_azimuth(trajectory: Component, side: Component, medium: Medium) ->
 
 
 def measured_side(azimuth: Component, shockwave: Component) -> Component:
-    """The side of the line of fire that follows from the two directions of arrival alone."""
+    """Return the side of the line of fire that follows from the two directions of arrival alone."""
     return -np.sign(wrap_angle(azimuth - shockwave))
 
 
 def trajectory_from_shockwave(shockwave: Component, side: Component, medium: Medium) -> Component:
-    """The bullet's direction, eq (7) turned around."""
+    """Return the bullet's direction, eq (7) turned around."""
     return wrap_angle(shockwave + side * (0.5 * np.pi + medium.mach_angle_rad))
 
 
 def clear_side(azimuth: Component, shockwave: Component, noise: Noise) -> Component:
-    """The side that a sensor works out; 0 where it cannot be sure, or heard no shockwave.
+    """Return the side that a sensor works out; 0 where it cannot be sure, or heard no shockwave.
 
     That is where both directions of arrival are within three standard deviations of each other.
     """
@@ -107,7 +107,7 @@ def time_difference_gradient(
 
 
 def range_from_time_difference(delay: Component, separation: Component, medium: Medium) -> Component:
-    """The distance to the shooter in m; eq (9)."""
+    """Return the distance to the shooter in m; eq (9)."""
     return medium.speed_of_sound_mps * delay / (1.0 - np.cos(separation))
 
 
@@ -160,7 +160,7 @@ def local_estimate_covariance_gradients(
 
 
 def sensor_components(sensor: int) -> list[str]:
-    """The names of a sensor's coordinates in a state."""
+    """Return the names of a sensor's coordinates in a state."""
     return [f"sensor_{sensor}_{axis}_m" for axis in "xy"]
 
 

@@ -63,6 +63,17 @@ def delay_between(
     estimates under nonstandard conditions", 1967): of noise that is independent from frequency to
     frequency, however strong at which. It does not know of a wrong peak.
 
+    Args:
+        late: (samples,), the signal of the microphone where the sound comes later.
+        early: (samples,), that of the other, over the same time.
+        rate_hz: samples a second.
+        band_hz: the lowest and the highest frequency that count.
+        longest_s: no delay is longer, in s.
+        weighting: how frequencies count, see `Weighting`.
+
+    Returns:
+        The delay in s, its variance in s^2, and how alike the phases are.
+
     >>> rng = np.random.default_rng(1)
     >>> sound, noise = rng.normal(size=2000), 0.1 * rng.normal(size=(2, 1900))
     >>> late, early = sound[93:1993] + noise[0], sound[100:] + noise[1]
@@ -109,6 +120,16 @@ def arrivals(
     little the delays of three microphones add up to zero, in the median; and of a clock that is known to
     half a sample either way.
     The reference is the microphone whose delays to all others have the least variance.
+
+    Args:
+        recordings: (n, samples), of the same time.
+        rate_hz: samples a second.
+        band_hz: the lowest and the highest frequency that count.
+        longest_s: (n, n), no delay of a pair is longer, in s.
+        weighting: how frequencies count, see `Weighting`.
+
+    Returns:
+        When the sound came at each microphone, beside the reference.
     """
     count = len(recordings)
     pairs, triples = (np.array(list(combinations(range(count), size))) for size in (2, 3))

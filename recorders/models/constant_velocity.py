@@ -1,4 +1,4 @@
-"""A point that keeps its velocity but for white acceleration noise; state = (positions, velocities).
+"""Models a point whose velocity is constant but for white noise; state = (positions, velocities).
 
 Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 6.2.2.
 """

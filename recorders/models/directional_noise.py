@@ -1,4 +1,4 @@
-"""Exact samples of the noise on axes and orientations: Bingham, and Gaussian projected to the sphere."""
+"""Draws exact noise on axes and orientations: Bingham, and Gaussian projected to the sphere."""
 
 from typing import Literal, Self
 
@@ -38,6 +38,14 @@ def sample_bingham(
     Exact rejection sampling under an angular central Gaussian envelope (Kent, Ganeiban, Mardia, "A new
     unified approach for the simulation of a wide class of directional distributions", JCGS 27, 2018);
     at least 44 % of the proposals are taken. For many samples of one distribution broadcast it.
+
+    Args:
+        axes: (..., d, d), the principal axes as columns.
+        concentrations: (..., d), those along the axes, finite.
+        generator: draws the proposals.
+
+    Returns:
+        (..., d), of unit length.
     """
     axes, concentrations = np.asarray(axes, float), np.asarray(concentrations, float)
     if not np.all(np.isfinite(concentrations)):
@@ -71,13 +79,23 @@ def sample_projected_gaussian(
     shape: tuple[int, ...],
     generator: np.random.Generator,
 ) -> NDArray[np.float64]:
-    """Samples (*shape, d) of a Gaussian in R^d, each scaled to unit length."""
+    """Draw (*shape, d) of a Gaussian in R^d, each scaled to unit length.
+
+    Args:
+        mean: (d,).
+        covariance: (d, d).
+        shape: how many are drawn.
+        generator: draws them.
+
+    Returns:
+        (*shape, d), of unit length.
+    """
     drawn = generator.multivariate_normal(mean, covariance, shape, method="eigh")
     return drawn / np.linalg.norm(drawn, axis=-1, keepdims=True)
 
 
 class DirectionalNoise(Parameters):
-    """A distribution of unit vectors, along the components of a complex number or quaternion.
+    """Describes a distribution of unit vectors, along the components of a complex number or quaternion.
 
     Attributes:
         distribution: of which kind it is; samples of a Gaussian are scaled to unit length.

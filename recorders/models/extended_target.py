@@ -1,4 +1,4 @@
-"""An axis-aligned rectangle of which a sensor sees one noisy point at a time.
+"""Models an axis-aligned rectangle of which a sensor sees one noisy point at a time.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION

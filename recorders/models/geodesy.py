@@ -1,4 +1,4 @@
-"""Places in a local tangent plane (east, north, up) and on the WGS 84 ellipsoid."""
+"""Converts places between a local tangent plane (east, north, up) and the WGS 84 ellipsoid."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ ECCENTRICITY_SQUARED = FLATTENING * (2.0 - FLATTENING)
 def earth_centred(
     latitude_deg: Component, longitude_deg: Component, altitude_m: Component = 0.0
 ) -> tuple[Component, Component, Component]:
-    """A point at a height above the ellipsoid in the frame that turns with the earth, in m."""
+    """Return a point at a height above the ellipsoid in the frame that turns with the earth, in m."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     normal = SEMI_MAJOR_M / np.sqrt(1.0 - ECCENTRICITY_SQUARED * np.sin(latitude) ** 2)
     return (
@@ -25,7 +25,7 @@ def earth_centred(
 
 
 def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
-    """East, north and up at places (...,) as the rows of rotations (..., 3, 3) of earth-centred axes."""
+    """Return east, north and up at places (...,) as rows (..., 3, 3), in earth-centred axes."""
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     zero = np.zeros_like(latitude)
     rows = (

@@ -1,4 +1,4 @@
-"""Systems of two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
+"""Models two angles modulo 2 pi. Component-first: scalars and arrays alike, rad and not wrapped."""
 
 from typing import Annotated
 
@@ -14,7 +14,7 @@ Correlation = Annotated[float, Field(gt=-1, lt=1)]
 def turn_together(
     x1: Component, x2: Component, coupling: Component, drift1: Component, drift2: Component
 ) -> tuple[Component, Component]:
-    """Two headings that turn with each other, x+ = x + c (cos x2, sin x1) + drift, without noise.
+    """Return two headings that turn with each other, x+ = x + c (cos x2, sin x1) + drift, without noise.
 
     The system of Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular
     Estimation", 2016, section IV.
@@ -33,5 +33,5 @@ def turn_on(
 
 
 def equal_sigmas(sigma: float, correlation: float) -> NDArray[np.float64]:
-    """The covariance (2, 2) of two numbers with one standard deviation."""
+    """Return the covariance (2, 2) of two numbers with one standard deviation."""
     return sigma**2 * np.array([[1.0, correlation], [correlation, 1.0]])

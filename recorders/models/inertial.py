@@ -1,4 +1,4 @@
-"""Inertial navigation in a local plane of east, north, up: what an inertial unit makes of a motion.
+"""Models inertial navigation in east, north, up: what an inertial unit makes of a motion.
 
 The body's axes are forward, left, up; a unit quaternion w, x, y, z turns its vectors into the plane's.
 Component-first, as in `planar`. Groves, Principles of GNSS, Inertial, and Multisensor Integrated
@@ -47,7 +47,7 @@ def earth_rate(latitude_deg: Component) -> Vector:
 
 
 def cross(a: Components, b: Components) -> Vector:
-    """The vector product."""
+    """Return the vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -62,7 +62,7 @@ def product(p: Components, q: Components) -> tuple[Component, Component, Compone
 
 
 def rotation(x: Component, y: Component, z: Component) -> Components:
-    """The unit quaternion of a rotation vector."""
+    """Return the unit quaternion of a rotation vector."""
     half = 0.5 * np.sqrt(x * x + y * y + z * z)
     scale = 0.5 * np.sinc(half / np.pi)
     return np.cos(half), scale * x, scale * y, scale * z
@@ -77,13 +77,13 @@ def into_plane(q: Components, v: Components) -> Vector:
 
 
 def into_body(q: Components, v: Components) -> Vector:
-    """A vector of the plane in the body's axes."""
+    """Return a vector of the plane in the body's axes."""
     w, x, y, z = q
     return into_plane((w, -x, -y, -z), v)
 
 
 def from_mounting(roll: Component, pitch: Component, yaw: Component, v: Components) -> Vector:
-    """A vector of a unit's axes in those of the body that it is mounted on, turned so, in rad.
+    """Return a vector of a unit's axes in those of the body that it is mounted on, turned so, in rad.
 
     A turn by `yaw` about up, of one by `pitch` about left, of one by `roll` about forward.
     """

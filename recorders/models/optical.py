@@ -1,4 +1,4 @@
-"""Line of sight of an optical sensor whose attitude may be biased.
+"""Models the line of sight of an optical sensor whose attitude may be biased.
 
 Belfadel, Osborne and Bar-Shalom, "Bias Estimation and Observability for Optical Sensor Measurements
 with Targets of Opportunity", JAIF 2014. Component-first: `Components` are a tuple of components or an
@@ -114,20 +114,20 @@ def _about_z(angle: Component, x: Components) -> Triple:
 
 
 def target_components(target: int) -> list[str]:
-    """The names of a target's coordinates in a state."""
+    """Return the names of a target's coordinates in a state."""
     return [f"target_{target}_{axis}_m" for axis in "xyz"]
 
 
 def bias_components(sensor: int) -> list[str]:
-    """The names of a sensor's attitude biases in a state."""
+    """Return the names of a sensor's attitude biases in a state."""
     return [f"sensor_{sensor}_{angle}_bias_rad" for angle in ANGLES]
 
 
 def moving_target_components(target: int) -> list[str]:
-    """The names of a moving target's coordinates and velocities in a state."""
+    """Return the names of a moving target's coordinates and velocities in a state."""
     return target_components(target) + [f"target_{target}_v{axis}_mps" for axis in "xyz"]
 
 
 def clock_component(sensor: int) -> str:
-    """The name of how far a sensor's clock is ahead, in a state."""
+    """Return the name of how far a sensor's clock is ahead, in a state."""
     return f"sensor_{sensor}_clock_s"

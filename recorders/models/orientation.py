@@ -1,4 +1,4 @@
-"""Axes in the plane and orientations in space as unit complex numbers and quaternions, x and -x alike.
+"""Computes with axes and orientations as unit complex numbers and quaternions, x and -x alike.
 
 The algebra of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014,
 section 5.3. Quaternions are (w, x, y, z); all arrays keep their components on the last axis.
@@ -21,7 +21,7 @@ ORIENTATION_KINDS = {f"orientation_{part}": "quaternion" for part in "wxyz"}
 
 
 def left_matrix(left: ArrayLike) -> NDArray[np.float64]:
-    """The matrix (..., d, d) of y -> left (+) y, for `left` (..., d) with d = 2 or 4."""
+    """Return the matrix (..., d, d) of y -> left (+) y, for `left` (..., d) with d = 2 or 4."""
     left = np.asarray(left, float)
     d = left.shape[-1]
     other = XOR[:d, :d]
@@ -29,7 +29,7 @@ def left_matrix(left: ArrayLike) -> NDArray[np.float64]:
 
 
 def right_matrix(right: ArrayLike) -> NDArray[np.float64]:
-    """The matrix (..., d, d) of x -> x (+) right, for `right` (..., d) with d = 2 or 4."""
+    """Return the matrix (..., d, d) of x -> x (+) right, for `right` (..., d) with d = 2 or 4."""
     right = np.asarray(right, float)
     d = right.shape[-1]
     other = XOR[:d, :d]
@@ -37,31 +37,31 @@ def right_matrix(right: ArrayLike) -> NDArray[np.float64]:
 
 
 def compose(left: ArrayLike, right: ArrayLike) -> NDArray[np.float64]:
-    """The complex product (24) of left and right (..., 2), or Hamilton's product (34) of (..., 4)."""
+    """Multiply left and right (..., 2) as complex numbers (24), (..., 4) as quaternions (34)."""
     return np.einsum("...ij,...j->...i", left_matrix(left), np.asarray(right, float))
 
 
 def conjugate(x: ArrayLike) -> NDArray[np.float64]:
-    """The inverse of a unit complex number or quaternion (..., d)."""
+    """Return the inverse of a unit complex number or quaternion (..., d)."""
     x = np.asarray(x, float)
     return x * np.where(np.arange(x.shape[-1]) == 0, 1.0, -1.0)
 
 
 def rotate(orientation: ArrayLike, vector: ArrayLike) -> NDArray[np.float64]:
-    """The vectors (..., 3) turned by the orientations (..., 4), (33)."""
+    """Return the vectors (..., 3) turned by the orientations (..., 4), (33)."""
     vector = np.asarray(vector, float)
     pure = np.concatenate([np.zeros_like(vector[..., :1]), vector], axis=-1)
     return compose(compose(orientation, pure), conjugate(orientation))[..., 1:]
 
 
 def heading(orientation: ArrayLike) -> NDArray[np.float64]:
-    """The heading in rad, anticlockwise from x, of bodies with these orientations (..., 4)."""
+    """Return the heading in rad, anticlockwise from x, of bodies with these orientations (..., 4)."""
     w, x, y, z = np.moveaxis(np.asarray(orientation, float), -1, 0)
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
-    """The angle in rad, 0 to pi/2, between the axes of a and b (..., d), (67)-(68).
+    """Return the angle in rad, 0 to pi/2, between the axes of a and b (..., d), (67)-(68).
 
     For quaternions it is half the angle of the rotation from one orientation to the other.
     """
@@ -70,9 +70,17 @@ def axis_angle_between(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
 
 
 def require_unit(x: ArrayLike, what: str, tolerance: float = 1e-6) -> NDArray[np.float64]:
-    """`x` (..., d) with every vector scaled to exactly unit length.
+    """Scale every vector of `x` (..., d) to exactly unit length.
 
     Raises BadInput where d is not 2 or 4, or a length differs from 1 by more than `tolerance`.
+
+    Args:
+        x: (..., d), with d = 2 or 4.
+        what: what messages call it.
+        tolerance: how far a length may differ from 1.
+
+    Returns:
+        (..., d).
     """
     x = np.asarray(x, float)
     if x.ndim == 0 or x.shape[-1] not in (2, 4):

@@ -1,4 +1,4 @@
-"""Motion and sensors of a robot in the plane: pose = (x, y, heading), velocity = (forward, turn).
+"""Models a robot in the plane: pose = (x, y, heading), velocity = (forward, turn); its sensors.
 
 Component-first functions: each takes scalars or arrays in every component, so that one source serves
 the simulators (arrays over time) and the estimators (scalars inside a compiled loop).
@@ -14,7 +14,7 @@ Components = Any
 
 
 def wrap_angle(angle: Component) -> Component:
-    """The equal angle in [-pi, pi).
+    """Return the equal angle in [-pi, pi).
 
     >>> round(float(wrap_angle(3 * np.pi / 2) / np.pi), 12)
     -0.5

@@ -1,4 +1,4 @@
-"""A gas that reacts in a closed vessel, 2A -> B, in discrete time.
+"""Models a gas that reacts in a closed vessel, 2A -> B, in discrete time.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 (29) and (30); state = partial pressures (a, b), for which the paper has no unit.
@@ -11,7 +11,7 @@ PRODUCED = 0.16
 
 
 def react(pressures: Components, duration_s: Component) -> tuple[Component, Component]:
-    """The pressures after one time step, without noise."""
+    """Return the pressures after one time step, without noise."""
     reacted = duration_s * pressures[0] * pressures[0]
     return pressures[0] + CONSUMED * reacted, pressures[1] + PRODUCED * reacted
 

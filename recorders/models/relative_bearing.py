@@ -1,4 +1,4 @@
-"""Relative bearings: the angle between two landmarks as a robot in the plane sees them.
+"""Models relative bearings: the angle between two landmarks as a robot in the plane sees them.
 
 Component-first, as in `planar`. Needs no heading. Signed: positive where the first landmark lies
 anticlockwise of the second.

@@ -1,4 +1,4 @@
-"""Biometric matchers and their scores: every probe compared with every gallery entry, as columns.
+"""Describes biometric matchers and their scores: each probe with each gallery entry, as columns.
 
 Probe i and gallery entry i are of the same user. A score stands as the matcher gave it; the stream's
 metadata say which matchers are distances, and what a matcher gives where it could not enrol an image.
@@ -21,7 +21,7 @@ Name = Annotated[str, Field(pattern=r"^[^/,\s]+$")]
 
 
 class Matcher(Parameters):
-    """A matcher of biometric samples.
+    """Describes a matcher of biometric samples.
 
     Attributes:
         name: its name.
@@ -37,7 +37,7 @@ class Matcher(Parameters):
 
 
 class Comparisons(NamedTuple):
-    """All comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
+    """Holds all comparisons of one run: scores (users, users, matchers) by probe and gallery entry.
 
     Distances are negated: greater is more alike. `failed` marks the failures to enrol; `arrival_ns`
     (users,) says when each probe came.
@@ -52,7 +52,16 @@ class Comparisons(NamedTuple):
 def score_stream(
     matchers: Sequence[Matcher], scores: NDArray[np.float64], arrival_ns: ArrayLike
 ) -> Stream:
-    """The stream of scores (users, users, matchers), probe by probe as they arrive (users,)."""
+    """Return the stream of scores (users, users, matchers), probe by probe as they arrive (users,).
+
+    Args:
+        matchers: the matchers, in the order of the scores' last axis.
+        scores: (users, users, matchers), by probe and gallery entry.
+        arrival_ns: (users,), when each probe arrives.
+
+    Returns:
+        The stream, whose metadata describe the matchers.
+    """
     users = len(scores)
     metadata = {
         "matchers": ",".join(each.name for each in matchers),
@@ -74,7 +83,7 @@ def score_stream(
 
 
 def matchers_of(metadata: Mapping[str, str]) -> tuple[Matcher, ...]:
-    """The matchers that a score stream's metadata name; raises BadInput where they do not fit."""
+    """Return the matchers that a score stream's metadata name; raises BadInput where they do not fit."""
     keys = ("matchers", "modalities", "senses", "failure_scores")
     try:
         rows = zip(*(metadata[key].split(",") for key in keys), strict=True)

@@ -15,7 +15,7 @@ NAVIGATION = (
 
 
 def state_metadata(components: Sequence[str]) -> dict[str, str]:
-    """The metadata of a channel of states: its components, and of what kind each is.
+    """Return the metadata of a channel of states: its components, and of what kind each is.
 
     An angle is a component in rad that wraps; those of ORIENTATION are a quaternion.
     """

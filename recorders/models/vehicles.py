@@ -1,4 +1,4 @@
-"""Vehicles in the plane and sensors that see them in a frame of their own; state = (x, vx, y, vy).
+"""Models vehicles and sensors that see them in a frame of their own; state = (x, vx, y, vy).
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016, (12)-(14). Component-first: scalars or arrays.
@@ -12,7 +12,7 @@ from recorders.models.planar import Component, Components
 def turn(
     state: Components, turn_rate_radps: Component, duration_s: Component
 ) -> tuple[Component, Component, Component, Component]:
-    """The state after a coordinated turn (14); a turn rate of zero is constant velocity (12)."""
+    """Return the state after a coordinated turn (14); a turn rate of zero is constant velocity (12)."""
     angle = turn_rate_radps * duration_s
     along = duration_s * np.sinc(angle / np.pi)
     across = duration_s * 0.5 * angle * np.sinc(0.5 * angle / np.pi) ** 2
@@ -46,7 +46,7 @@ def into_frame(pose: Components, point: Components) -> tuple[Component, Componen
 
 
 def out_of_frame(pose: Components, point: Components) -> tuple[Component, Component]:
-    """The point (x, y) that a sensor with this pose has at `point` of its own frame."""
+    """Return the point (x, y) that a sensor with this pose has at `point` of its own frame."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     return (
         pose[0] + cosine * point[0] - sine * point[1],

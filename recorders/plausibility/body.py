@@ -1,4 +1,4 @@
-"""The motion of one body as its topics say it: places, velocities, wheels, turn rates, orientations.
+"""Describes the motion of a body as its topics say it: places, velocities, wheels, turns.
 
 All are columns over time in seconds since the log's first stamp. What holds from one message to the
 next, or lies between two samples, is integrated: a window's distance and turn need no common stamps.
@@ -19,7 +19,7 @@ FEWEST = 20  # messages, below which nothing is said of a topic
 
 @dataclass(frozen=True)
 class Series:
-    """One quantity of a topic over time.
+    """Holds one quantity of a topic over time.
 
     Attributes:
         topic, field: where it stands.
@@ -54,7 +54,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Fixes(Series):
-    """Places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
+    """Holds places (n, 2) east and north, or along x and y, with the variances (n,) that they state.
 
     `is_flat` says that they are metres and not latitudes, so that they may have a scale.
     """
@@ -89,7 +89,7 @@ class Body:
 
     @property
     def roles(self) -> list[Sequence[Series]]:
-        """All lists."""
+        """Return all lists."""
         measured = self.rates, self.forces, self.orientations, self.references
         return [self.fixes, self.velocities, self.speeds, self.turns, *measured]
 
@@ -102,9 +102,9 @@ def bodies(streams: Mapping[str, Stream]) -> list[Body]:
     first_ns = min(
         (int(each.publish_time_ns.min()) for each in streams.values() if len(each)), default=0
     )
-    told = {topic: stream for topic, stream in streams.items() if len(stream) >= FEWEST}
-    together, apart = Body(), {topic.rpartition("/")[0]: Body() for topic in told}
-    for topic, stream in told.items():
+    long_enough = {topic: stream for topic, stream in streams.items() if len(stream) >= FEWEST}
+    together, apart = Body(), {topic.rpartition("/")[0]: Body() for topic in long_enough}
+    for topic, stream in long_enough.items():
         _add(together, stream, first_ns)
         space = topic.rpartition("/")[0]
         for name, body in apart.items():

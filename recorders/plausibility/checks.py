@@ -1,4 +1,4 @@
-"""The checks, in the order in which what they find is named, and what they read of a log.
+"""Lists the checks in the order in which findings are named, and reads what they need of a log.
 
 A check of motion takes a body's topics compared in pairs, one of stamps a topic and all others.
 """
@@ -34,7 +34,7 @@ OF_MOTION: tuple[Callable[[Motion], Iterator[Finding]], ...] = (
 
 
 def findings(streams: Mapping[str, Stream]) -> list[Finding]:
-    """What topics say of their own faults, the worst first; see `finding.Finding`.
+    """Return what topics say of their own faults, the worst first; see `finding.Finding`.
 
     Estimates are not looked at. A log without a fault has none: thresholds are far from chance.
     """
@@ -46,14 +46,14 @@ def findings(streams: Mapping[str, Stream]) -> list[Finding]:
     found = [each for stream in sensed.values() for check in OF_STAMPS for each in check(stream, sensed)]
     for body in bodies(sensed):
         motion = Motion(body)
-        told = [each for check in OF_MOTION for each in check(motion)]
+        of_motion = [each for check in OF_MOTION for each in check(motion)]
         known = {(each.cause, each.topic) for each in found}
-        found += [each for each in told if (each.cause, each.topic) not in known]
+        found += [each for each in of_motion if (each.cause, each.topic) not in known]
     return found + list(stamps.drifts(sensed))
 
 
 def findings_in(blocks: Iterable[Mapping[str, Stream]]) -> list[Finding]:
-    """The findings of blocks that follow one another in time, by the first `MOST` messages."""
+    """Return the findings of blocks that follow one another in time, by the first `MOST` messages."""
     parts: dict[str, list[Stream]] = {}
     count = 0
     for block in blocks:

@@ -23,7 +23,7 @@ Surety = Literal["fact", "likely", "hint"]  # counted in the log; far from chanc
 
 
 class Finding(NamedTuple):
-    """A fault that no filter is needed to see.
+    """Describes a fault that no filter is needed to see.
 
     Attributes:
         cause: what kind of fault it is.
@@ -48,11 +48,11 @@ class Finding(NamedTuple):
 
     @property
     def mended(self) -> str:
-        """The sentence, with what to do."""
+        """Return the sentence, with what to do."""
         tries = [f"--set {self.key}={self.setting}"] * bool(self.key) + [self.mapping]
         return "; ".join(filter(None, (self.words, " or ".join(filter(None, tries)))))
 
 
 def digits(value: float) -> float:
-    """A number in four digits, as a setting states it."""
+    """Return a number in four digits, as a setting states it."""
     return float(f"{value:.4g}")

@@ -1,4 +1,4 @@
-"""A body's topics, compared in pairs: what lags behind what, and by which factor or angle they differ.
+"""Compares a body's topics in pairs: what lags behind what, by which factor or angle they differ.
 
 Lags come first: what is 18 s late turns the other way.
 """
@@ -32,7 +32,7 @@ ALIKE, PLAIN = 0.8, 0.95  # correlations; the latter where the course need not b
 
 
 class Slope(NamedTuple):
-    """What one topic says of windows, as a multiple of what another says.
+    """States what one topic says of windows, as a multiple of what another says.
 
     Attributes:
         value: the multiple, by least squares through zero.
@@ -49,12 +49,12 @@ class Slope(NamedTuple):
     @property
     def sign(self) -> int:
         """1 or -1, or 0 where the two are not alike."""
-        is_told = self.windows >= FEWEST and abs(self.likeness) > ALIKE
-        return int(np.sign(self.value)) if is_told else 0
+        is_clear = self.windows >= FEWEST and abs(self.likeness) > ALIKE
+        return int(np.sign(self.value)) if is_clear else 0
 
 
 def slope(x: Floats, y: Floats) -> Slope:
-    """The slope of y (k,) on x (k,) through zero, over windows where both are known."""
+    """Return the slope of y (k,) on x (k,) through zero, over windows where both are known."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     xx, xy, yy = x @ x, x @ y, y @ y
@@ -72,7 +72,7 @@ def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
 
 
 class Lag(NamedTuple):
-    """One topic beside another that it was compared with, which is later by the lag."""
+    """Holds one topic beside another that it was compared with, which is later by the lag."""
 
     source: str
     against: str
@@ -80,7 +80,7 @@ class Lag(NamedTuple):
 
 
 class Motion:
-    """A body, and what comparing its topics in pairs tells."""
+    """Holds a body, and what comparing its topics in pairs tells."""
 
     def __init__(self, body: Body) -> None:
         self.body = body
@@ -109,14 +109,14 @@ class Motion:
         windows = turned(self.courses, 1.0)
         found = []
         for source in self.body.turns:
-            told = timing(windows, source, turn_between, tolerance_s=_hold_s(source))
-            if told is not None:
-                found.append(Lag(source.topic, self.courses.topic, told))
+            lag = timing(windows, source, turn_between, tolerance_s=_hold_s(source))
+            if lag is not None:
+                found.append(Lag(source.topic, self.courses.topic, lag))
         return found
 
     @cached_property
     def delays_s(self) -> dict[str, float]:
-        """How late each topic's stamps are beside the most of them, where that is sure.
+        """Return how late each topic's stamps are beside the most of them, where that is sure.
 
         Of two topics the later one is late: messages come late, and never early.
         """
@@ -151,11 +151,11 @@ class Motion:
 
     @cached_property
     def gains(self) -> dict[str, float]:
-        """How many seconds a second the clocks of topics gain beside that of the places."""
+        """Return how many seconds a second the clocks of topics gain beside that of the places."""
         return {each.source: each.timing.gain for each in self.speed_lags if each.timing.gain}
 
     def aligned(self, source: Series) -> Series:
-        """A topic on the clock of the places, or of the courses where it has no other."""
+        """Return a topic on the clock of the places, or of the courses where it has no other."""
         for each in (*self.speed_lags, *self.turn_lags):
             if each.source == source.topic:
                 late_s = self.delays_s.get(each.source, 0.0) - self.delays_s.get(each.against, 0.0)
@@ -165,7 +165,7 @@ class Motion:
         return source
 
     def timed(self, source: Series) -> Series:
-        """A topic on the clock that most topics have."""
+        """Return a topic on the clock that most topics have."""
         if source.topic in self.gains:
             return self.aligned(source)
         return source.moved(self.delays_s.get(source.topic, 0.0))
@@ -175,22 +175,22 @@ class Motion:
         aligned = self.aligned(source)
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
-                told = each.timing
-                if told.evidence > SURE and abs(told.likeness) > ALIKE:
-                    return source.moved(-told.lag_s, told.gain)
+                lag = each.timing
+                if lag.evidence > SURE and abs(lag.likeness) > ALIKE:
+                    return source.moved(-lag.lag_s, lag.gain)
         return aligned
 
     def speed(self, source: Series) -> Slope | None:
-        """How far places move for each metre of a speed or velocity."""
+        """Return how far places move for each metre of a speed or velocity."""
         if self.places is None or source.topic == self.places.topic:
             return None
         if (moved := clear_moves(self.places)) is None:
             return None
-        told = travelled(self.aligned(source), moved.begin_s, moved.end_s)
-        return slope(told, np.linalg.norm(moved.values, axis=1))
+        distances = travelled(self.aligned(source), moved.begin_s, moved.end_s)
+        return slope(distances, np.linalg.norm(moved.values, axis=1))
 
     def turn(self, source: Series) -> Slope | None:
-        """How much the course turns for each radian of a turn rate.
+        """Return how much the course turns for each radian of a turn rate.
 
         One that is like the course as it is needs no lag: half a period of a winding road is none.
         """
@@ -198,19 +198,19 @@ class Motion:
             return None
         windows = turned(self.courses, self.turn_span_s)
         for moved in (source, self.aligned(source), self.likened(source)):
-            told = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
-            if told.sign > 0:
+            ratio = slope(turn_between(moved, windows.begin_s, windows.end_s), windows.values)
+            if ratio.sign > 0:
                 break
-        return told
+        return ratio
 
     def heading_turn(self, orientation: Series, source: Series) -> Slope:
-        """How much a heading turns for each radian of a turn rate."""
+        """Return how much a heading turns for each radian of a turn rate."""
         angles = Series("", "", orientation.times_s, heading(orientation.values))
         windows = turned(angles, self.turn_span_s)
         return slope(turn_between(self.timed(source), windows.begin_s, windows.end_s), windows.values)
 
     def heading_course(self, orientation: Series) -> Slope | None:
-        """How much a heading turns for each radian of the course."""
+        """Return how much a heading turns for each radian of the course."""
         if self.courses is None:
             return None
         windows = turned(self.timed(self.courses), self.turn_span_s)
@@ -242,8 +242,8 @@ class Motion:
         speed = np.abs(v)
         is_clear = np.minimum(speed[step:], speed[:-step]) > 0.1 * np.quantile(speed, 0.95)
         change = (v[step:] - v[:-step]) * middle
-        told = force.integral(end_s) - force.integral(begin_s)
-        pushed = told[:, 0] + 1j * told[:, 1]
+        impulse = force.integral(end_s) - force.integral(begin_s)
+        pushed = impulse[:, 0] + 1j * impulse[:, 1]
         known = np.isfinite(pushed) & is_clear & (end_s - begin_s < 2.0)
         resting = np.isfinite(pushed) & ~is_clear
         still = resting if resting.sum() >= FEWEST else known
@@ -265,7 +265,7 @@ def heading_at(orientation: Series, times_s: Floats) -> Floats:
 
 
 class Forces(NamedTuple):
-    """By what angle (rad) horizontal forces are to be turned to be those of the course.
+    """States by what angle (rad) horizontal forces are to be turned to be those of the course.
 
     `fit` is how well they then do, up to 1, and `mirrored` how well their mirror image would.
     """
@@ -281,8 +281,8 @@ def _hold_s(source: Series) -> float:
     return step_s if source.values.ndim > 1 else 0.5 * step_s
 
 
-def _sure_lag_s(told: Timing) -> float:
+def _sure_lag_s(lag: Timing) -> float:
     """The lag where it is one; a clock that gains has none."""
-    is_lag = abs(told.lag_s) > max(LEAST_LAG_S, told.tolerance_s)
-    is_sure = told.evidence > SURE and abs(told.likeness) > ALIKE and not told.gain
-    return told.lag_s if is_lag and is_sure else 0.0
+    is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
+    is_sure = lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
+    return lag.lag_s if is_lag and is_sure else 0.0

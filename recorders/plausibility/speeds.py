@@ -1,4 +1,4 @@
-"""Checks of when topics speak, and of how far they say that a body comes."""
+"""Checks when topics speak, and how far they say that a body comes."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -67,18 +67,18 @@ def clocks(motion: Motion) -> Iterator[Finding]:
 def factors(motion: Motion) -> Iterator[Finding]:
     """Speeds in other units, by how far places move."""
     for source in chain(motion.body.speeds, motion.body.velocities):
-        told = motion.speed(source)
-        if told is None or not told.sign or told.spread > SPREAD or SCALE[0] < told.value < SCALE[1]:
+        ratio = motion.speed(source)
+        if ratio is None or not ratio.sign or ratio.spread > SPREAD or SCALE[0] < ratio.value < SCALE[1]:
             continue
         assert motion.places is not None
         known = {**UNITS, **{1 / factor: name for factor, name in UNITS.items()}}
-        nearest = min(known, key=lambda each: abs(np.log(each * told.value)))
-        is_unit = abs(np.log(nearest * told.value)) < NEAR
-        factor = nearest if is_unit else 1.0 / told.value
+        nearest = min(known, key=lambda each: abs(np.log(each * ratio.value)))
+        is_unit = abs(np.log(nearest * ratio.value)) < NEAR
+        factor = nearest if is_unit else 1.0 / ratio.value
         of = f"{source.topic}: {source.field}"
         moved = (
-            f"{motion.places.topic} moves {told.value:.4g} m for each metre of it "
-            f"(in {told.windows} windows)"
+            f"{motion.places.topic} moves {ratio.value:.4g} m for each metre of it "
+            f"(in {ratio.windows} windows)"
         )
         if not is_unit:
             what, mapping = f"is {factor:.3g} times what it must be", ""
@@ -128,7 +128,7 @@ def rest(motion: Motion) -> Iterator[Finding]:
 
 
 def scatter(fixes: Fixes, source: Series) -> tuple[float, int, float] | None:
-    """How fixes scatter while a speed says that the body rests.
+    """Return how fixes scatter while a speed says that the body rests.
 
     Returns the variance as a multiple of what is stated, its degrees of freedom, and the correlation of
     an error with the next; None where the body does not rest, or no variance is stated.
@@ -164,7 +164,7 @@ def _filled(values: Floats) -> Floats:
 
 
 def chance(degrees: int, sigmas: float) -> float:
-    """A quantile of chi-square over its degrees of freedom, by that of a Gaussian.
+    """Return a quantile of chi-square over its degrees of freedom, by that of a Gaussian.
 
     Wilson and Hilferty, PNAS 17, 1931: within 2 % from 18 degrees on.
     """

@@ -1,4 +1,4 @@
-"""Checks of stamps, topic by topic: messages that are lost or there twice, clocks that drift."""
+"""Checks stamps, topic by topic: messages that are lost or there twice, clocks that drift."""
 
 from collections.abc import Iterator, Mapping
 
@@ -130,7 +130,7 @@ def drifts(streams: Mapping[str, Stream]) -> Iterator[Finding]:
 
 
 def clock_rate(stream: Stream) -> float | None:
-    """How long 1 s of a topic's stamps lasts for the recorder; None where that cannot be told."""
+    """Return how long 1 s of a topic's stamps lasts for the recorder; None where that cannot be told."""
     if len(stream) < FEWEST:
         return None
     measured = (stream.publish_time_ns - stream.publish_time_ns[0]) * 1e-9

@@ -1,4 +1,4 @@
-"""When a topic's account of a motion is most like another's: by its delay, and by its clock's gain."""
+"""Finds when a topic's account of a motion is most like another's: by delay, and clock's gain."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -34,7 +34,7 @@ class Timing(NamedTuple):
 
 
 def timing(windows: Windows, source: Series, account: Account, *, tolerance_s: float) -> Timing | None:
-    """The lag, and gain, of the best correlation; None where too few windows can tell."""
+    """Return the lag, and gain, of the best correlation; None where too few windows can tell."""
     if len(windows) < FEWEST or not np.ptp(windows.values):
         return None
     count = _independent(windows)
@@ -78,11 +78,11 @@ def _gained(windows: Windows, source: Series, account: Account) -> tuple[float, 
 def _likeness(windows: Windows, source: Series, account: Account, lags_s: Floats) -> Floats:
     """The correlation for each lag; NaN where less than half of the windows are in the source's span."""
     begin_s, end_s = (each - lags_s[:, None] for each in (windows.begin_s, windows.end_s))
-    told = account(source, begin_s, end_s)
-    is_in = np.isfinite(told)
+    moves = account(source, begin_s, end_s)
+    is_in = np.isfinite(moves)
     count = is_in.sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        x, y = np.where(is_in, told, 0.0), np.where(is_in, windows.values, 0.0)
+        x, y = np.where(is_in, moves, 0.0), np.where(is_in, windows.values, 0.0)
         x = np.where(is_in, x - (x.sum(axis=1) / count)[:, None], 0.0)
         y = np.where(is_in, y - (y.sum(axis=1) / count)[:, None], 0.0)
         found = np.sum(x * y, axis=1) / np.sqrt(np.sum(x * x, axis=1) * np.sum(y * y, axis=1))

@@ -1,4 +1,4 @@
-"""Checks of angles: turn rates, courses and headings, and how an inertial unit is mounted."""
+"""Checks angles: turn rates, courses and headings, and how an inertial unit is mounted."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -33,12 +33,12 @@ def signs(motion: Motion) -> Iterator[Finding]:
     beside = motion.heading_course(orientation) if orientation else None
     headed = beside.sign if beside else 0
     for source in motion.body.turns:
-        told = motion.turn(source)
-        course = told.sign if told else 0
+        ratio = motion.turn(source)
+        course = ratio.sign if ratio else 0
         heading = motion.heading_turn(orientation, source).sign if orientation else 0
-        if course < 0 and told and (abs(told.value) > HALF or _is_degrees(told)):
+        if course < 0 and ratio and (abs(ratio.value) > HALF or _is_degrees(ratio)):
             assert motion.courses is not None
-            yield from _mirrored(motion, source, told, witness=heading or _by_forces(motion, source))
+            yield from _mirrored(motion, source, ratio, witness=heading or _by_forces(motion, source))
         elif orientation and heading < 0 and (course > 0 or headed < 0):
             yield _compass(orientation, f"{source.topic} and the course turn")
         elif orientation and heading < 0 and headed > 0:
@@ -51,17 +51,17 @@ def _by_forces(motion: Motion, source: Series) -> int:
     """What horizontal forces say of a frame: -1 where it is as it must be, so that the rate is wrong."""
     for force in motion.body.forces:
         if force.topic == source.topic:
-            told = motion.forces(motion.aligned(force))
-            if told and max(told.fit, told.mirrored) > FITS:
-                return 1 if told.mirrored > told.fit else -1
+            found = motion.forces(motion.aligned(force))
+            if found and max(found.fit, found.mirrored) > FITS:
+                return 1 if found.mirrored > found.fit else -1
     return 0
 
 
-def _mirrored(motion: Motion, source: Series, told: Slope, witness: int) -> Iterator[Finding]:
+def _mirrored(motion: Motion, source: Series, ratio: Slope, witness: int) -> Iterator[Finding]:
     """One of a rate and a frame is mirrored; a witness that goes with the rate says that it is right."""
     assert motion.courses is not None
     course = motion.courses
-    evidence = f"the course of {course.topic} turns {told.value:.3g} rad for each rad of it"
+    evidence = f"the course of {course.topic} turns {ratio.value:.3g} rad for each rad of it"
     if witness > 0:
         field = course.field
         yield Finding(
@@ -70,7 +70,7 @@ def _mirrored(motion: Motion, source: Series, told: Slope, witness: int) -> Iter
             field,
             -1.0,
             f"{course.topic}: its frame is mirrored, as where east and north are exchanged: the course "
-            f"turns {told.value:.3g} rad for each rad of {source.topic}, which another sensor confirms",
+            f"turns {ratio.value:.3g} rad for each rad of {source.topic}, which another sensor confirms",
             mapping=f"in the mapping exchange the columns of {field}",
         )
         return
@@ -109,15 +109,15 @@ def _compass(orientation: Series, others: str) -> Finding:
 def degrees(motion: Motion) -> Iterator[Finding]:
     """Turn rates in deg/s, or taken for such, by the course or because no body turns so fast."""
     for source in motion.body.turns:
-        told = motion.turn(source)
+        ratio = motion.turn(source)
         rates = np.abs(
             next((each for each in motion.body.rates if each.topic == source.topic), source).values
         )
-        if told and told.sign and _is_degrees(told):
+        if ratio and ratio.sign and _is_degrees(ratio):
             assert motion.courses is not None
-            evidence = f"the course of {motion.courses.topic} turns {told.value:.3g} rad for each of it"
-            is_large = abs(told.value) < 1.0
-        elif not (told and told.sign) and np.mean(rates > TOO_FAST_RADPS) > 1e-3:
+            evidence = f"the course of {motion.courses.topic} turns {ratio.value:.3g} rad for each of it"
+            is_large = abs(ratio.value) < 1.0
+        elif not (ratio and ratio.sign) and np.mean(rates > TOO_FAST_RADPS) > 1e-3:
             evidence, is_large = f"in rad/s it would be up to {rates.max():.3g}", True
         else:
             continue
@@ -136,18 +136,18 @@ def degrees(motion: Motion) -> Iterator[Finding]:
         )
 
 
-def _is_degrees(told: Slope) -> bool:
+def _is_degrees(ratio: Slope) -> bool:
     return any(
-        abs(abs(told.value) / each - 1.0) < NEAR_DEGREES for each in (np.pi / 180.0, 180.0 / np.pi)
+        abs(abs(ratio.value) / each - 1.0) < NEAR_DEGREES for each in (np.pi / 180.0, 180.0 / np.pi)
     )
 
 
 def headings(motion: Motion) -> Iterator[Finding]:
     """Headings that are off the course by one angle, of bodies that go where they head."""
     for orientation in motion.body.orientations:
-        told = motion.heading_course(orientation)
+        ratio = motion.heading_course(orientation)
         offsets = motion.heading_offsets(orientation)
-        if told is None or told.sign < 1 or len(offsets) < FEWEST:
+        if ratio is None or ratio.sign < 1 or len(offsets) < FEWEST:
             continue
         mean = float(np.angle(np.mean(np.exp(1j * offsets))))
         rest = wrapped(offsets - mean)
@@ -169,16 +169,20 @@ def headings(motion: Motion) -> Iterator[Finding]:
 def mounting(motion: Motion) -> Iterator[Finding]:
     """Units whose forward is not the body's, by the forces in curves and at changes of speed."""
     for force in motion.body.forces:
-        told = motion.forces(motion.aligned(force))
-        if told and told.fit > max(FITS, CLEARER * told.mirrored) and abs(told.angle_rad) > TURNED_RAD:
-            angle = np.degrees(told.angle_rad)
+        found = motion.forces(motion.aligned(force))
+        if (
+            found
+            and found.fit > max(FITS, CLEARER * found.mirrored)
+            and abs(found.angle_rad) > TURNED_RAD
+        ):
+            angle = np.degrees(found.angle_rad)
             yield Finding(
                 "mounting",
                 force.topic,
                 force.field,
-                told.angle_rad,
+                found.angle_rad,
                 f"{force.topic}: it is mounted turned about the vertical: its horizontal forces are "
-                f"those of the course if turned by {angle:.3g} deg (fit {told.fit:.2f} of 1)",
+                f"those of the course if turned by {angle:.3g} deg (fit {found.fit:.2f} of 1)",
                 mapping=f"mounting_deg = [0, 0, {round(angle)}] in the mapping",
             )
 
@@ -210,8 +214,8 @@ def gravity(motion: Motion) -> Iterator[Finding]:
         moves = motion.places is not None or motion.courses is not None
         if moves and mean[2] < -LARGEST_SHARE * norm and np.median(force.values[:, 2]) < 0.0:
             turns = next((each for each in motion.body.turns if each.topic == force.topic), None)
-            told = motion.turn(turns) if turns else None
-            is_down = told is not None and told.sign < 0
+            ratio = motion.turn(turns) if turns else None
+            is_down = ratio is not None and ratio.sign < 0
             yield Finding(
                 "gravity",
                 force.topic,
@@ -284,9 +288,9 @@ def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
     first, second = pairs(orientation.times_s, 0.1)
     begin_s, end_s = orientation.times_s[first], orientation.times_s[second]
     duration_s = (end_s - begin_s)[:, None]
-    told = (rates.integral(end_s) - rates.integral(begin_s)) / duration_s
-    known = np.isfinite(told).all(axis=1)
-    if known.sum() < FEWEST or np.sqrt(np.mean(told[known] ** 2)) < TURNS_RADPS:
+    rate = (rates.integral(end_s) - rates.integral(begin_s)) / duration_s
+    known = np.isfinite(rate).all(axis=1)
+    if known.sum() < FEWEST or np.sqrt(np.mean(rate[known] ** 2)) < TURNS_RADPS:
         return {}
     found = {}
     for name, (order, is_opposite) in ORDERS.items():
@@ -294,5 +298,5 @@ def rate_errors(orientation: Series, rates: Series) -> dict[str, float]:
         q = conjugate(q) if is_opposite else q
         step = compose(conjugate(q[first]), q[second])
         turned = 2.0 * step[:, 1:] * np.sign(step[:, :1] + 1e-300) / duration_s
-        found[name] = float(np.sqrt(np.mean(np.sum((turned - told)[known] ** 2, axis=1))))
+        found[name] = float(np.sqrt(np.mean(np.sum((turned - rate)[known] ** 2, axis=1))))
     return found

@@ -1,4 +1,4 @@
-"""Windows of a motion: how far and by what angle places moved, and a topic's own account of the same."""
+"""Cuts a motion into windows: how far and by what angle places moved, and a topic's account."""
 
 from dataclasses import dataclass, replace
 
@@ -16,7 +16,7 @@ MOST = 2000  # windows; of more every second, third, ... is taken
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows (k,) from one stamp to a later one, and what was measured in each."""
+    """Holds windows (k,) from one stamp to a later one, and what was measured in each."""
 
     begin_s: Floats
     end_s: Floats
@@ -26,12 +26,12 @@ class Windows:
         return len(self.begin_s)
 
     def take(self, rows: NDArray[np.bool_] | slice) -> "Windows":
-        """Some of them."""
+        """Return some of them."""
         return Windows(self.begin_s[rows], self.end_s[rows], self.values[rows])
 
 
 def thinned(count: int, most: int) -> slice:
-    """Every second, third, ... of so many, so that at most so many are left."""
+    """Return every second, third, ... of so many, so that at most so many are left."""
     return slice(None, None, max(1, -(-count // most)))
 
 
@@ -45,7 +45,7 @@ def noise_of(places: Floats) -> float:
 
 
 def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The rows of stamps that are a span apart, or a step where the steps are longer."""
+    """Return the rows of stamps that are a span apart, or a step where the steps are longer."""
     step_s = float(np.median(np.diff(times_s)))
     later = np.searchsorted(times_s, times_s + max(span_s, step_s) - 1e-6)
     first = np.flatnonzero(later < len(times_s))
@@ -56,7 +56,7 @@ def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np
 
 
 def chords(fixes: Series, span_s: float) -> Windows:
-    """How places move (k, 2) in windows of a span."""
+    """Return how places move (k, 2) in windows of a span."""
     first, second = pairs(fixes.times_s, span_s)
     return Windows(
         fixes.times_s[first], fixes.times_s[second], fixes.values[second] - fixes.values[first]
@@ -64,7 +64,7 @@ def chords(fixes: Series, span_s: float) -> Windows:
 
 
 def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """How far a speed or velocity says that one comes in windows, forward or not."""
+    """Return how far a speed or velocity says that one comes in windows, forward or not."""
     moved = source.integral(end_s) - source.integral(begin_s)
     return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
 
@@ -88,7 +88,7 @@ def places_of(body: Body) -> Series | None:
 
 
 def distances(places: Series, span_s: float) -> Windows | None:
-    """How far places move in windows of a span, or longer ones where that varies too little."""
+    """Return how far places move in windows of a span, or longer ones where that varies too little."""
     for each_s in (span_s, *SPANS_S):
         moved = chords(places, each_s)
         found = replace(moved, values=np.linalg.norm(moved.values, axis=1))
@@ -109,7 +109,7 @@ def clear_moves(places: Series) -> Windows | None:
 
 
 def courses(body: Body) -> Series | None:
-    """The course (n,) in rad where the body moves clearly: of velocities, else of places."""
+    """Return the course (n,) in rad where the body moves clearly: of velocities, else of places."""
     of: Series | None
     if body.velocities:
         of = body.velocities[0]

@@ -1,1 +1,1 @@
-"""Simulators of sensor streams, one file per scenario family; begin with `landmarks`."""
+"""Simulates sensor streams, one file per scenario family; begin with `landmarks`."""

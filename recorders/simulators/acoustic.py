@@ -1,4 +1,4 @@
-"""Shots heard by acoustic sensors with position fixes: detections, fixes, truth.
+"""Simulates shots heard by acoustic sensors with position fixes: detections, fixes, truth.
 
 Osborne, Bar-Shalom, George and Kaplan, JAIF 2014. Each shot is heard by each sensor when its muzzle
 blast arrives; the shockwave and its lead over the muzzle blast only where the geometry lets it be heard.
@@ -30,7 +30,7 @@ Place = tuple[float, float]
 
 
 class AcousticParameters(Parameters):
-    """Shooter, sensors and air.
+    """A shooter fires, and sensors hear the shot through the air.
 
     Attributes:
         shooter_position_m: where the shooter stands (x, y).
@@ -68,7 +68,7 @@ class AcousticParameters(Parameters):
 
     @property
     def medium(self) -> Medium:
-        """The air and the bullet."""
+        """Return the air and the bullet."""
         return Medium(self.speed_of_sound_mps, self.mach_number)
 
     @property

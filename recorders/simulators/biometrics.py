@@ -1,4 +1,4 @@
-"""Scores of two face and two finger matchers, alike to NIST BSSR1 set 1 in marginals and dependences.
+"""Simulates scores of two face and two finger matchers, alike to NIST BSSR1 set 1.
 
 A standard normal per comparison goes through a table of knots to a score. The normals have a part of
 the probe's user, a part of the gallery's user and a rest; the tables were fitted to the real scores.
@@ -72,7 +72,7 @@ LOWEST = 0.1
 
 
 class BiometricScoresParameters(Parameters):
-    """Users and the special ones among them, whose numbers are those of the real 517.
+    """States how many users and special ones among them there are: by default as of the real 517.
 
     Attributes:
         users: number of users.

@@ -1,4 +1,4 @@
-"""Targets that cross, go side by side and manoeuvre, seen by a radar in unordered scans with clutter.
+"""Simulates targets that cross, go side by side and manoeuvre, seen by a radar in scans with clutter.
 
 Two targets meet at an angle in the middle of the run, two go side by side, and one turns left and right.
 The whole scene is turned at random, so that no run is like another.
@@ -25,7 +25,7 @@ STRAIGHT_S, TURN_RAD = 15.0, np.pi / 2
 
 
 class CrossingParameters(Parameters):
-    """Five targets in a square, and the radar in its middle that scans it.
+    """Five targets move in a square, which a radar in its middle scans.
 
     Attributes:
         duration_s: length of the run.

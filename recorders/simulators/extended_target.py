@@ -1,4 +1,4 @@
-"""A rectangle that stands still, of which one noisy surface point is seen per time step.
+"""Simulates a rectangle that stands still, of which one noisy surface point is seen per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B: points are uniform over the surface, their noise is Gaussian.
@@ -22,7 +22,7 @@ Target = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 
 
 class ExtendedTargetParameters(Parameters):
-    """A rectangle, the points that are measured of it, and what a filter assumes.
+    """States a rectangle, the points that are measured of it, and what a filter assumes.
 
     Attributes:
         points: number of points, one per time step.

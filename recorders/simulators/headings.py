@@ -1,4 +1,4 @@
-"""Two headings that turn with each other, and correlated measurements of both, modulo 2 pi.
+"""Simulates two headings that turn with each other, and correlated measurements of both, mod 2 pi.
 
 x+ = x + c (cos x2, sin x1) + drift + w and z = x + v: the system of Kurz and Hanebeck, "Deterministic
 Sampling on the Torus for Bivariate Circular Estimation", 2016, section IV, with noise. The measurements'
@@ -19,7 +19,7 @@ HEADINGS = {"components": "heading1_rad,heading2_rad", "kinds": "angle,angle"}
 
 
 class HeadingsParameters(Parameters):
-    """Two headings that turn each other.
+    """Two headings turn each other.
 
     Attributes:
         steps: number of time steps.

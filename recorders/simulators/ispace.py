@@ -1,4 +1,4 @@
-"""A room of networked sensor nodes that follow one moving thing: an intelligent space of DIND nodes.
+"""Simulates a room of networked sensor nodes that follow one moving thing: DIND nodes.
 
 Jin, Lee, Hashimoto, DIND networks, sections 3 to 5; the room's numbers are ours, the paper prints none.
 Every node hears the thing with a sensor and at a rate of its own, sends what it knows over directed
@@ -24,7 +24,7 @@ Index = Annotated[int, Field(ge=1)]
 
 
 class Node(Parameters):
-    """The sensor of a node.
+    """States what the sensor of a node is like.
 
     Attributes:
         components: those of the state that it measures.
@@ -49,7 +49,7 @@ ROOM = (
 
 
 class NodeOutage(Parameters):
-    """A span in which a node neither measures nor sends nor receives.
+    """During this span a node neither measures nor sends nor receives.
 
     Attributes:
         node: number of the node, from 1.
@@ -63,7 +63,7 @@ class NodeOutage(Parameters):
 
 
 class IspaceParameters(Parameters):
-    """A room with sensor nodes, the links between them, and the target that moves there.
+    """Sensor nodes in a room, with links between them, follow a target that moves there.
 
     Attributes:
         steps: number of time steps.

@@ -1,4 +1,4 @@
-"""Robots drive among landmarks: odometry, ranges, bearings, relative bearings, fixes, truth.
+"""Simulates robots that drive among landmarks: odometry, ranges, bearings, fixes, truth.
 
 Odometry reads the velocity that holds from its stamp to the next; the robot drives that velocity plus
 white noise. Robots are the targets 1, 2, ..., landmarks the numbers after them.
@@ -210,8 +210,8 @@ def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Gener
             altitude_m=altitude,
             covariance_m2=spread,
         )
-    told = [_outages(f"{topic}/outages", outages_s)] if receiver.outages_per_minute > 0 else []
-    return [fixes, *told]
+    outages = [_outages(f"{topic}/outages", outages_s)] if receiver.outages_per_minute > 0 else []
+    return [fixes, *outages]
 
 
 def _targets(

@@ -1,4 +1,4 @@
-"""Parameters of the scenario of robots among landmarks: their drive, sensors and fixes."""
+"""Defines the parameters of robots among landmarks: their drive, sensors and fixes."""
 
 from typing import Annotated
 
@@ -19,7 +19,7 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 
 
 class Sensor(Parameters):
-    """What the sensors of a robot have in common.
+    """All sensors of a robot have these in common.
 
     Attributes:
         rate_hz: measurements per second; 0 switches the sensor off.
@@ -57,7 +57,7 @@ class Sensor(Parameters):
 
 
 class Fixes(Parameters):
-    """A receiver of positions.
+    """A receiver measures positions.
 
     Attributes:
         rate_hz: fixes per second; 0 switches it off.
@@ -76,7 +76,7 @@ class Fixes(Parameters):
 
 
 class LandmarksParameters(Parameters):
-    """Robots in a square arena with landmarks, their odometry and their sensors.
+    """Robots with odometry and sensors drive among landmarks in a square arena.
 
     Attributes:
         duration_s: length of the run.

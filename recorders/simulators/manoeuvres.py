@@ -1,4 +1,4 @@
-"""A vehicle that drives straight on, turns, brakes, stands and starts again, and tells where it is.
+"""Simulates a vehicle that drives on, turns, brakes, stands and starts again, and tells its place.
 
 It drives at one speed between manoeuvres; a turn is an arc at that speed, and stops are on the straight.
 How long it drives and stands is drawn anew each time.
@@ -20,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 class ManoeuvresParameters(Parameters):
-    """A vehicle that drives straight, turns, stops and starts, and its position fixes.
+    """A vehicle drives straight, turns, stops and starts, and gets position fixes.
 
     A turn is by a sixth to five twelfths of a circle to either side.
 
@@ -55,7 +55,7 @@ class ManoeuvresParameters(Parameters):
 
 
 class Part(NamedTuple):
-    """A part of a drive: how long, and its turn rate and acceleration along the track."""
+    """Describes a part of a drive: how long, and its turn rate and acceleration along the track."""
 
     duration_s: float
     turn_radps: float

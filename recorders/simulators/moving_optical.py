@@ -1,4 +1,4 @@
-"""Optical sensors on aircraft see moving targets: each by its own clock, turned by biases that drift.
+"""Simulates optical sensors on aircraft: each has its own clock, and is turned by biases that drift.
 
 Sensors fly at known poses, straight or weaving, and see the targets in turn, each at times of its own.
 The frame is that of `recorders.models.optical`: y points up, and a sensor looks ahead, along its own z.
@@ -38,7 +38,7 @@ FIRST_S = 0.5  # before the first sighting, and so before any clock that is off
 
 
 class MovingOpticalParameters(Parameters):
-    """Sensors on aircraft, targets, and the errors of attitudes and clocks.
+    """Sensors on aircraft see targets; their attitudes and clocks err.
 
     Attributes:
         duration_s: length of the run.
@@ -79,14 +79,14 @@ class MovingOpticalParameters(Parameters):
 
 
 class Course(NamedTuple):
-    """The truth at some times (n,): targets (n, targets, 6) and biases (n, sensors, 3)."""
+    """Holds the truth at some times (n,): targets (n, targets, 6) and biases (n, sensors, 3)."""
 
     times_s: Floats
     targets: Floats
     bias_rad: Floats
 
     def rows(self, times_s: Floats) -> NDArray[np.int64]:
-        """The rows of times that are among its own."""
+        """Return the rows of times that are among its own."""
         return np.searchsorted(self.times_s, times_s)
 
 

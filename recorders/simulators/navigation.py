@@ -1,4 +1,4 @@
-"""A vehicle, a person or a quadrotor that moves with an inertial unit and a GNSS receiver on it.
+"""Simulates a vehicle, a person or a quadrotor with an inertial unit and a GNSS receiver on it.
 
 Its path is a spline through way-points, of which velocity and acceleration are exact, so that the unit
 measures what belongs to the path and not to an integration. It begins at rest. The unit's errors are
@@ -25,7 +25,7 @@ GRID_S = 0.05  # between the knots of the path
 
 
 class Path(NamedTuple):
-    """The way of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
+    """Holds the way of the body: splines over time of its position (3,) and its yaw, pitch, roll."""
 
     position: BSpline
     attitude: BSpline
@@ -326,18 +326,18 @@ def _prior(
 
     The turn is about what the mean takes for up: a heading that nobody knows leaves the tilt as it is.
     """
-    told, unit = parameters.prior, parameters.unit
+    prior, unit = parameters.prior, parameters.unit
     sigma = np.repeat(
         [
-            told.sigma_m,
-            told.sigma_mps,
-            told.tilt_sigma_rad,
+            prior.sigma_m,
+            prior.sigma_mps,
+            prior.tilt_sigma_rad,
             unit.gyro_bias_sigma_radps,
             unit.force_bias_sigma_mps2,
         ],
         3,
     )
-    sigma[8] = told.heading_sigma_rad
+    sigma[8] = prior.heading_sigma_rad
     error = sigma * rng.normal(size=15)
     mean = truth.copy()
     mean[:6] += error[:6]
@@ -349,8 +349,8 @@ def _prior(
     mean[10:] = 0.0  # the biases are drawn about zero
     covariance = np.diag(sigma**2)
     up = (turned * tilt).inv().apply([0.0, 0.0, 1.0])
-    level = told.tilt_sigma_rad**2 * (np.eye(3) - np.outer(up, up))
-    covariance[6:9, 6:9] = level + told.heading_sigma_rad**2 * np.outer(up, up)
+    level = prior.tilt_sigma_rad**2 * (np.eye(3) - np.outer(up, up))
+    covariance[6:9, 6:9] = level + prior.heading_sigma_rad**2 * np.outer(up, up)
     return make_stream(
         "/body/prior",
         schemas.GAUSSIAN_ESTIMATE,

@@ -1,4 +1,4 @@
-"""Parameters of the scenario of a body that carries an inertial unit and a GNSS receiver."""
+"""Defines the parameters of a body that carries an inertial unit and a GNSS receiver."""
 
 from typing import Annotated, Literal
 
@@ -13,7 +13,7 @@ Span = tuple[float, float]
 
 
 class Unit(Parameters):
-    """The errors of an inertial unit; without settings those of a telephone's.
+    """States how an inertial unit errs; without settings as a telephone's does.
 
     Attributes:
         rate_hz: samples per second.
@@ -45,7 +45,7 @@ class Unit(Parameters):
 
 
 class Receiver(Parameters):
-    """A GNSS receiver and its weak times; spans are [begin, end] in s since the run's epoch.
+    """States what a GNSS receiver gives, and its weak times: spans [begin, end] in s since the epoch.
 
     Attributes:
         rate_hz: positions per second.
@@ -82,7 +82,7 @@ class Receiver(Parameters):
 
 
 class Carried(Parameters):
-    """Further sensors on board.
+    """A body may carry these further sensors.
 
     Attributes:
         wheel_rate_hz: forward speeds of the wheels per second; 0 leaves them out.
@@ -106,7 +106,7 @@ class Carried(Parameters):
 
 
 class Prior(Parameters):
-    """The prior of the log; the standard deviations of the biases are the unit's.
+    """States the prior of the log; the standard deviations of the biases are the unit's.
 
     Attributes:
         is_told: whether the log has a prior.
@@ -124,7 +124,7 @@ class Prior(Parameters):
 
 
 class NavigationParameters(Parameters):
-    """What moves, where, and its sensors.
+    """States what moves, where, and its sensors.
 
     A person sways, bobs with each step and turns to both sides of the path; a quadrotor leans into its
     acceleration and may look in any direction.

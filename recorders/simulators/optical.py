@@ -1,4 +1,4 @@
-"""Optical sensors with biased attitudes see targets of opportunity: lines of sight, truth.
+"""Simulates optical sensors with biased attitudes that see targets: lines of sight, truth.
 
 Belfadel, Osborne and Bar-Shalom, JAIF 2014. Sensors stand at known places; their true attitude is the
 nominal one plus a bias. Targets are points, seen one after another, as those of one trajectory, or all
@@ -26,7 +26,7 @@ Triples = Annotated[list[Triple], Field(min_length=1)]
 
 
 class OpticalParameters(Parameters):
-    """Sensors, targets and what is seen.
+    """States sensors, targets and what is seen.
 
     Attributes:
         sensor_position_m: where the sensors are (x, y, z).

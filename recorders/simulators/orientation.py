@@ -1,4 +1,4 @@
-"""Axes in the plane and orientations in space that turn at random, and are measured with noise.
+"""Simulates axes in the plane and orientations in space that turn at random, measured with noise.
 
 x+ = x (+) w and z = x (+) v, with Bingham noise or Gaussian noise scaled to unit length; the evaluation
 of Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter", JAIF 9(2), 2014, section 7. The
@@ -20,7 +20,7 @@ from recorders.recording import Recording, Simulator, simulation_stamps_ns
 
 
 class AxisParameters(Parameters):
-    """The paper's two-dimensional evaluation: (54)-(56); the truth starts off the prior's mode.
+    """Describes the paper's two-dimensional evaluation, (54)-(56); truth starts off the prior's mode.
 
     Attributes:
         steps: number of time steps.
@@ -51,12 +51,12 @@ class AxisParameters(Parameters):
 
     @classmethod
     def dimension(cls) -> int:
-        """The number of components."""
+        """Return the number of components."""
         return 2
 
 
 class OrientationParameters(AxisParameters):
-    """The paper's four-dimensional evaluation: (61)-(65)."""
+    """Describes the paper's four-dimensional evaluation, (61)-(65)."""
 
     start: tuple[float, ...] = (0.0, 1.0, 0.0, 0.0)
     prior: DirectionalNoise = DirectionalNoise(diagonal=(-1.0, -1.0, -1.0, 0.0))
@@ -65,7 +65,7 @@ class OrientationParameters(AxisParameters):
 
     @classmethod
     def dimension(cls) -> int:
-        """The number of components."""
+        """Return the number of components."""
         return 4
 
 

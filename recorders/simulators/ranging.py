@@ -1,4 +1,4 @@
-"""A trolley in a warehouse whose tags measure ranges to anchors on the walls.
+"""Simulates a trolley in a warehouse whose tags measure ranges to anchors on the walls.
 
 It moves as the model `ranging-pose` says: accelerations are white. Ranges err by white noise, by a
 common bias, by an error of each anchor that lasts for seconds (a first-order Gauss-Markov process, the
@@ -25,7 +25,7 @@ POSE = ("x_m", "y_m", "heading_rad", "vx_mps", "vy_mps", "turn_radps")
 
 
 class Blocked(Parameters):
-    """Blocked lines of sight; an anchor is blocked for all tags at once.
+    """Lines of sight are blocked at times; an anchor is blocked for all tags at once.
 
     Attributes:
         times_per_minute: mean number of times per minute that an anchor is blocked.
@@ -41,7 +41,7 @@ class Blocked(Parameters):
 
 
 class RangingParameters(Parameters):
-    """Anchors, the tags on a trolley, its motion, and the errors of ranges.
+    """Tags on a trolley measure ranges to anchors, with errors, while it moves.
 
     Anchors and tags are numbered from 0; all tags measure ranges to all anchors at once. Channels state
     the white noise of ranges alone.

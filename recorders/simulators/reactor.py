@@ -1,4 +1,4 @@
-"""A batch reactor whose total pressure is read once per time step.
+"""Simulates a batch reactor whose total pressure is read once per time step.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A. The prior is the paper's, far from the truth and the same in every run.
@@ -20,7 +20,7 @@ Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
 
 
 class ReactorParameters(Parameters):
-    """Partial pressures of a gas reaction, in the paper's units.
+    """States partial pressures of a gas reaction, in the paper's units.
 
     Attributes:
         steps: number of time steps.

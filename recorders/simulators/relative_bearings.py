@@ -1,4 +1,4 @@
-"""A robot at rest that measures relative bearings to landmarks, with errors that keep a known bound.
+"""Simulates a robot at rest that measures relative bearings, whose errors keep a known bound.
 
 Briechle, Hanebeck (2004), section V, and random scenes. Every look measures all pairs of landmarks, or
 the pairs given.
@@ -21,7 +21,7 @@ PAPER_PAIRS = ((3, 1), (1, 2), (2, 3))
 
 
 class RelativeBearingsParameters(Parameters):
-    """The scene of section V of the paper (without noise, its first pairs), or random scenes.
+    """Chooses the scene of section V of the paper (without noise, its first pairs), or random scenes.
 
     Attributes:
         scene: which of the two.

@@ -1,4 +1,4 @@
-"""Shots of one shooter who moves, heard by sensors of known places: detections, some wrong, and truth.
+"""Simulates shots of one shooter who moves, heard by sensors of known places; some detections err.
 
 The velocity changes by white acceleration, the aim from shot to shot by as much as a random walk of this
 density would; each shot is heard from where it was fired, when its sound arrives. A sensor may miss a
@@ -37,7 +37,7 @@ PATH_S = 0.1
 
 
 class ShotSequenceParameters(AcousticParameters):
-    """The scenario of a shot, and how the shooter moves and sensors err.
+    """States the scenario of a shot, and how the shooter moves and sensors err.
 
     The shooter begins near `shooter_position_m`, aiming near `trajectory_deg`.
 

@@ -1,4 +1,4 @@
-"""A sound in noise at microphones: what they record, and differences of its arrivals found in that.
+"""Simulates a sound in noise at microphones: recordings, and differences of arrivals in them.
 
 The sound is Gaussian noise in a band that swells and fades; it is weaker with the distance, and comes
 after it by the speed of sound, to a fraction of a sample. Clocks are off by up to half a sample.
@@ -23,7 +23,7 @@ Point = tuple[float, float, float]
 
 
 class SoundSourceParameters(Parameters):
-    """Microphones and a sound.
+    """Microphones record a sound.
 
     Attributes:
         microphones_m: where the microphones are (x, y, z).

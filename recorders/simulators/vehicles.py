@@ -1,4 +1,4 @@
-"""Vehicles tell a network where they are, and a sensor by the road sees them, nobody knows from where.
+"""Simulates vehicles that tell a network their places, and a sensor by the road of unknown place.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016, section 4. Vehicle N's own fixes are on
@@ -39,7 +39,7 @@ POSE = ("x_m", "y_m", "heading_rad")
 
 
 class Delayed(Parameters):
-    """How late messages arrive.
+    """States how late messages arrive.
 
     Attributes:
         latency_s: least time from measurement to arrival.
@@ -51,7 +51,7 @@ class Delayed(Parameters):
 
 
 class Fixes(Delayed):
-    """The position fixes of the vehicles.
+    """Vehicles get position fixes.
 
     Attributes:
         rate_hz: fixes per second of each vehicle.
@@ -65,7 +65,7 @@ class Fixes(Delayed):
 
 
 class Scans(Delayed):
-    """Unordered scans.
+    """Detections come in unordered scans.
 
     Attributes:
         detection_probability: probability that a scan detects a vehicle.
@@ -77,7 +77,7 @@ class Scans(Delayed):
 
 
 class Infrastructure(Scans):
-    """The sensor by the road.
+    """A sensor by the road sees the vehicles.
 
     Attributes:
         rate_hz: scans per second; 0 has it never report.
@@ -91,7 +91,7 @@ class Infrastructure(Scans):
 
 
 class VehiclesParameters(Parameters):
-    """Vehicles in the plane, and who detects them.
+    """Vehicles drive in the plane, and sensors detect them.
 
     Attributes:
         duration_s: length of the run.
@@ -147,13 +147,13 @@ class Drive(NamedTuple):
     accelerations: Floats
 
     def states_at(self, times_s: Floats) -> Floats:
-        """The exact states (n, vehicles, 4) at any times within the drive."""
+        """Return the exact states (n, vehicles, 4) at any times within the drive."""
         steps = len(self.accelerations)
         step = np.minimum((times_s / self.step_s + 1e-9).astype(int), steps - 1)
         return self.after(step, times_s - step * self.step_s)
 
     def after(self, step: Integers, duration_s: Floats) -> Floats:
-        """The states (n, vehicles, 4) so long (n,) after the beginning of steps (n,)."""
+        """Return the states (n, vehicles, 4) so long (n,) after the beginning of steps (n,)."""
         span_s, acceleration = duration_s[:, None], self.accelerations[step]
         moved = turn(np.moveaxis(self.states[step], -1, 0), self.turn_rate_radps, span_s)
         states = np.stack(moved, axis=-1)
@@ -163,7 +163,7 @@ class Drive(NamedTuple):
 
 
 class Detections(NamedTuple):
-    """Unordered scans: how many detections each has, and all of them (n, 2), scan after scan."""
+    """Holds unordered scans: how many detections each has, and all of them (n, 2), scan after scan."""
 
     counts: Integers
     places: Floats
@@ -177,7 +177,7 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
     scan_s = _times(parameters, parameters.infrastructure.rate_hz)
     fixes = drive.states_at(fix_s)[..., 0::2]
     fixes += np.sqrt(parameters.fix.variance_m2) * fix_rng.normal(size=fixes.shape)
-    told = fix_rng.uniform(size=fixes.shape[:2]) >= parameters.fix.dropout_probability
+    is_received = fix_rng.uniform(size=fixes.shape[:2]) >= parameters.fix.dropout_probability
     seen = np.stack(
         into_frame(
             parameters.infrastructure.pose, np.moveaxis(drive.states_at(scan_s)[..., 0::2], -1, 0)
@@ -185,13 +185,13 @@ def simulate(parameters: VehiclesParameters, rng: np.random.Generator) -> Record
         axis=-1,
     )
     seen += np.sqrt(parameters.infrastructure.variance_m2) * sensor_rng.normal(size=seen.shape)
-    network = _scan(parameters, parameters.network, fixes, told, network_rng)
+    network = _scan(parameters, parameters.network, fixes, is_received, network_rng)
     everyone = np.ones(seen.shape[:2], bool)
     sensor = _scan(parameters, parameters.infrastructure, seen, everyone, sensor_rng)
     truth_s = np.union1d(np.append(0.0, fix_s), scan_s)
     streams = [
         *_vehicle_streams(parameters, drive, truth_s),
-        *_fix_streams(parameters, fix_s, fixes, told, delay_rng),
+        *_fix_streams(parameters, fix_s, fixes, is_received, delay_rng),
         *_scan_streams("/network", parameters, parameters.network, fix_s, network, delay_rng),
         *_scan_streams(
             "/infrastructure", parameters, parameters.infrastructure, scan_s, sensor, delay_rng
@@ -296,14 +296,14 @@ def _fix_streams(
     parameters: VehiclesParameters,
     times_s: Floats,
     fixes: Floats,
-    told: NDArray[np.bool_],
+    is_received: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> list[Stream]:
     """Every vehicle's fixes, in the plane and as latitude and longitude."""
     covariance = (parameters.fix.variance_m2 * np.eye(2)).reshape(1, 4)
     streams = []
     for index in range(fixes.shape[1]):
-        rows = told[:, index]
+        rows = is_received[:, index]
         places = fixes[rows, index]
         published, logged = _clocks(parameters.fix, times_s[rows], rng)
         latitude, longitude, _ = out_of_tangent_plane(places.T, parameters.origin_deg)

@@ -1,1 +1,1 @@
-"""Distributions on the torus and on the sphere of axes and orientations; begin with `bingham`."""
+"""Computes with distributions on the torus, of axes and of orientations; begin with `bingham`."""

@@ -1,4 +1,4 @@
-"""Batch axes of the public functions laid flat for the compiled loops."""
+"""Lays batch axes of the public functions flat for the compiled loops."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""The Bingham distribution on axes (d = 2) and orientations (d = 4), f(x) = exp(x^T M Z M^T x) / F.
+"""Computes with the Bingham distribution, f(x) = exp(x^T M Z M^T x) / F, on axes and orientations.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
 Degree Symmetry", JAIF 9(2), 2014. Every function takes batch axes first; the numbers come from
@@ -19,7 +19,7 @@ from replay.distributions.batches import flatten
 
 
 class Bingham(NamedTuple):
-    """Bingham distributions with any batch axes.
+    """Represents Bingham distributions with any batch axes.
 
     Attributes:
         axes: M (..., d, d), orthogonal, principal axes in columns, the mode last.
@@ -31,14 +31,18 @@ class Bingham(NamedTuple):
 
     @property
     def mode(self) -> NDArray[np.float64]:
-        """The most probable axis (..., d); its negative is the same."""
+        """Return the most probable axis (..., d); its negative is the same."""
         return self.axes[..., -1]
 
 
 def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """A checked distribution from axes (..., d, d) and concentrations (..., d) in any order and offset.
+    """Make a checked distribution of axes and concentrations in any order and offset.
 
     Raises BadInput where d is not 2 or 4, a number is not finite, or the axes are not orthonormal.
+
+    Args:
+        axes: (..., d, d), orthonormal, as columns.
+        concentrations: (..., d), along these; only their differences count.
     """
     axes, z = np.asarray(axes, float), np.asarray(concentrations, float)
     d = z.shape[-1] if z.ndim else 0
@@ -59,10 +63,14 @@ def make_bingham(axes: ArrayLike, concentrations: ArrayLike) -> Bingham:
 
 
 def around(mode: ArrayLike, concentrations: ArrayLike) -> Bingham:
-    """Distributions about modes (..., d) with concentrations (..., d - 1) along mode (+) e_2, ..., e_d.
+    """Make distributions about modes, with concentrations along mode (+) e_2, ..., e_d.
 
     Small errors of an orientation about its own axis i have the standard deviation sigma_rad for the
     concentration -2 / sigma_rad^2, half angles being what a quaternion holds.
+
+    Args:
+        mode: (..., d), unit vectors.
+        concentrations: (..., d - 1), at most 0.
     """
     mode = require_unit(mode, "mode of a Bingham distribution")
     z = np.asarray(concentrations, float)
@@ -72,7 +80,7 @@ def around(mode: ArrayLike, concentrations: ArrayLike) -> Bingham:
 
 
 def from_parameter_matrix(matrix: ArrayLike) -> Bingham:
-    """The distributions proportional to exp(x^T A x) for symmetric A (..., d, d)."""
+    """Return the distributions proportional to exp(x^T A x) for symmetric A (..., d, d)."""
     eigenvalues, axes = np.linalg.eigh(_symmetric(matrix, "Bingham parameter matrix"))
     return Bingham(axes, eigenvalues - eigenvalues[..., -1:])
 
@@ -103,7 +111,12 @@ def covariance(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
-    """The log density (...) at unit vectors x (..., d); F stands for 1 / F in the print's (10)-(11)."""
+    """Compute the log density (...) at unit vectors; F stands for 1 / F in the print's (10)-(11).
+
+    Args:
+        bingham: the distributions, batch axes (...).
+        x: (..., d), unit vectors.
+    """
     along = np.einsum("...ij,...i->...j", bingham.axes, np.asarray(x, float))
     exponent = (bingham.concentrations * along**2).sum(-1)
     return exponent - log_normaliser(bingham.concentrations)
@@ -134,14 +147,18 @@ def fit(second_moment: ArrayLike) -> Bingham:
 
 
 def product(first: Bingham, second: Bingham) -> Bingham:
-    """The normalised product of two densities: lemma 1."""
+    """Return the normalised product of two densities: lemma 1."""
     return from_parameter_matrix(parameter_matrix(first) + parameter_matrix(second))
 
 
 def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
-    """The density of x given z = x (+) v, v ~ `noise`, alone: the factor of an update, (52)-(53).
+    """Return the density of x given z = x (+) v, v ~ `noise`, alone: the factor of an update, (52)-(53).
 
     M is z (+) (D M^v), where (53) and algorithm 2 misprint M^p, and the left factor in (52) is Q_z.
+
+    Args:
+        noise: of the measurement.
+        measurement: z (..., d), unit vectors.
     """
     z = require_unit(measurement, "measurement")
     mirrored = np.swapaxes(conjugate(np.swapaxes(noise.axes, -1, -2)), -1, -2)
@@ -149,13 +166,18 @@ def likelihood(noise: Bingham, measurement: ArrayLike) -> Bingham:
 
 
 def rotate(bingham: Bingham, increment: ArrayLike) -> Bingham:
-    """The distributions of x (+) u for known unit increments u (..., d), such as a gyro's."""
+    """Return the distributions of x (+) u for known unit increments u (..., d), such as a gyro's.
+
+    Args:
+        bingham: the distributions, batch axes (...).
+        increment: u (..., d), unit vectors.
+    """
     turned = right_matrix(require_unit(increment, "increment")) @ bingham.axes
     return Bingham(turned, np.broadcast_to(bingham.concentrations, turned.shape[:-1]))
 
 
 def compose(first: Bingham, second: Bingham) -> Bingham:
-    """The Bingham distributions with the second moments of x (+) y, x ~ `first` and y ~ `second`.
+    """Return the Bingham distributions with the second moments of x (+) y, x ~ `first` and y ~ `second`.
 
     Lemmas 2 and 4 with (13)-(14); a fit that does not converge is NaN.
     """
@@ -187,10 +209,14 @@ def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
 
 
 def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> Bingham:
-    """The Bingham distribution with the second moment of g / |g|, g ~ N(mean, covariance), mean (d,).
+    """Fit the Bingham distribution with the second moment of g / |g|, g ~ N(mean, covariance).
 
     Exact up to rounding: 1 / |g|^2 = int exp(-t |g|^2) dt leaves one integral over t > 0, and the
     trapezoidal rule in log t converges geometrically.
+
+    Args:
+        mean: (d,), with d = 2 or 4.
+        gaussian_covariance: (d, d).
     """
     variance, axes = np.linalg.eigh(_symmetric(gaussian_covariance, "Gaussian covariance"))
     if variance[0] < -1e-12 * variance[-1]:

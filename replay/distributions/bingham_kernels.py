@@ -1,4 +1,4 @@
-"""Scalar kernels of the Bingham distribution, d = 2 and 4.
+"""Computes the Bingham distribution by scalar kernels, d = 2 and 4.
 
 The normalisation constant is an inverse Laplace transform at 1, from which the saddlepoint approximation
 of Kume and Wood (Biometrika 92, 2005) starts too:
@@ -48,7 +48,7 @@ Complex = tuple[float, float]
 
 
 def times(x: Complex, y: Complex) -> Complex:
-    """The product of two complex numbers."""
+    """Return the product of two complex numbers."""
     return x[0] * y[0] - x[1] * y[1], x[0] * y[1] + x[1] * y[0]
 
 
@@ -64,7 +64,7 @@ def reciprocal(x: Complex) -> Complex:
 
 
 def root(x: Complex) -> Complex:
-    """The square root of a complex number whose real part is the larger one, as C takes it."""
+    """Return the square root of a complex number whose real part is the larger one, as C takes it."""
     size = math.sqrt((abs(x[0]) + math.hypot(x[0], x[1])) * 0.5)
     if size == 0.0:
         return 0.0, x[1]
@@ -74,7 +74,7 @@ def root(x: Complex) -> Complex:
 
 
 def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
-    """The moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
+    """Return the moments of x_i^2 under a Bingham distribution with concentrations z (d,), z[-1] = 0.
 
     Args:
         z: concentrations, none above 0.

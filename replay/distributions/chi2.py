@@ -1,4 +1,4 @@
-"""The chi-squared distribution, by the names and with the numbers of `scipy.stats.chi2`.
+"""Computes the chi-squared distribution, by names and with numbers of `scipy.stats.chi2`.
 
 Importing scipy.stats takes a quarter of the time that a short command of the command line does, and
 scipy.special half of that, which is why it is imported by what needs it.
@@ -13,7 +13,15 @@ from replay.engine.compiling.notices import done_once
 
 
 def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
-    """Return what is exceeded with one minus this probability, by that many degrees of freedom."""
+    """Return what is exceeded with one minus this probability, by that many degrees of freedom.
+
+    Args:
+        probability: (...), from 0 to 1.
+        degrees: (...), of freedom.
+
+    Returns:
+        (...), or one number.
+    """
     with done_once():
         from scipy.special import gammaincinv
 
@@ -21,7 +29,15 @@ def ppf(probability: ArrayLike, degrees: ArrayLike) -> Any:
 
 
 def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
-    """Return what is exceeded with this probability."""
+    """Return what is exceeded with this probability.
+
+    Args:
+        probability: (...), from 0 to 1.
+        degrees: (...), of freedom.
+
+    Returns:
+        (...), or one number.
+    """
     with done_once():
         from scipy.special import chdtri
 
@@ -29,7 +45,15 @@ def isf(probability: ArrayLike, degrees: ArrayLike) -> Any:
 
 
 def sf(value: ArrayLike, degrees: ArrayLike) -> Any:
-    """The probability with which a value, which is not negative, is exceeded."""
+    """Return the probability with which a value, which is not negative, is exceeded.
+
+    Args:
+        value: (...), not negative.
+        degrees: (...), of freedom.
+
+    Returns:
+        (...), or one number.
+    """
     with done_once():
         from scipy.special import chdtrc
 

@@ -1,4 +1,4 @@
-"""Kernels of the Gaussian distribution: small definite systems and direct measurements."""
+"""Computes with Gaussians in kernels: small definite systems and direct measurements."""
 
 import math
 

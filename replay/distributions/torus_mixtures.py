@@ -1,4 +1,4 @@
-"""Mixtures on the torus, fitted by maximum likelihood: wrapped normals and von Mises densities.
+"""Fits mixtures on the torus by maximum likelihood: wrapped normals and von Mises densities.
 
 Angles (n, 2) in rad. A mixture of wrapped normals is fitted by expectation maximisation over components
 and turns; one of bivariate von Mises densities by its gradient, from the mixture of wrapped normals.
@@ -26,7 +26,7 @@ _NODES = 2.0 * np.pi / 1024 * np.arange(1024)
 
 
 class WrappedMixture(NamedTuple):
-    """Wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of the angles unwrapped."""
+    """Holds wrapped normals: weights (k,), means (k, 2), covariances (k, 2, 2) of angles unwrapped."""
 
     weights: Floats
     mean: Floats
@@ -38,7 +38,7 @@ class WrappedMixture(NamedTuple):
 
 
 class VonMisesMixture(NamedTuple):
-    """Bivariate von Mises densities of one kind.
+    """Represents bivariate von Mises densities of one kind.
 
     exp(k1 cos a + k2 cos b + k3 sin a sin b) over its integral, a and b the deviations from the mean
     (Singh, Hnizdo, Demchuk, "Probabilistic model for two dependent circular variables", 2002), or with
@@ -66,10 +66,15 @@ class VonMisesMixture(NamedTuple):
 
 
 def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) -> WrappedMixture:
-    """The most likely wrapped normals near the clusters that k-means finds.
+    """Return the most likely wrapped normals near the clusters that k-means finds.
 
     With one component it is the maximum-likelihood fit of a wrapped normal. Raises BadInput where there
     are fewer than ten angles a component.
+
+    Args:
+        angles: (n, 2), in rad.
+        components: how many densities are fitted.
+        iterations: of the search, at most.
     """
     if len(angles) < 10 * components:
         raise BadInput(
@@ -120,7 +125,13 @@ def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[F
 def fit_von_mises_mixture(
     angles: Floats, interaction: Interaction, start: WrappedMixture
 ) -> VonMisesMixture:
-    """The most likely von Mises densities, as many as the wrapped normals that the search begins at."""
+    """Fit the most likely von Mises densities, as many as the wrapped normals of the start.
+
+    Args:
+        angles: (n, 2), in rad.
+        interaction: how the two angles of a density depend on each other.
+        start: where the search begins.
+    """
     k = len(start.weights)
     precision = np.linalg.inv(start.covariance)
     third = -precision[:, 0, 1]

@@ -1,4 +1,4 @@
-"""The bivariate wrapped normal distribution on the torus, and its deterministic samples.
+"""Computes with bivariate wrapped normals on the torus, and draws their deterministic samples.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. Angles
 in rad; every function takes batch axes first and is accurate for variances from 1e-6 to where the
@@ -22,7 +22,7 @@ _product_mixture = compiled(kernels.product_mixture, allocates=False)
 
 
 class WrappedNormal(NamedTuple):
-    """Wrapped normals: mean (..., 2) in [-pi, pi), covariance (..., 2, 2) of the angles unwrapped."""
+    """Holds wrapped normals: mean (..., 2) in [-pi, pi), covariance (..., 2, 2) of angles unwrapped."""
 
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -43,14 +43,14 @@ class CircularMoments(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Weighted samples: positions (..., n, 2), weights (..., n) with sum 1."""
+    """Holds weighted samples: positions (..., n, 2), weights (..., n) with sum 1."""
 
     positions: NDArray[np.float64]
     weights: NDArray[np.float64]
 
 
 def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal:
-    """A checked distribution; BadInput where the covariance is not finite and positive definite."""
+    """Make a checked distribution; BadInput where the covariance is not finite, positive definite."""
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
         raise BadInput(
@@ -70,7 +70,12 @@ def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal
 
 
 def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
-    """The density (...) at angles x (..., 2)."""
+    """Return the density (...) at angles x (..., 2).
+
+    Args:
+        distribution: with batch axes (...).
+        x: (..., 2), in rad.
+    """
     deviation = np.asarray(x, float) - distribution.mean
     batch = np.broadcast_shapes(deviation.shape[:-1], distribution.covariance.shape[:-2])
     covariance = flatten(distribution.covariance, batch, 2, 2)
@@ -118,7 +123,7 @@ def require_central_weight(central_weight: float) -> None:
 
 
 def fit_moments(moments: CircularMoments) -> WrappedNormal:
-    """The wrapped normal with these circular moments.
+    """Return the wrapped normal with these circular moments.
 
     Raises BadInput where a variance is not positive and finite, or no positive definite covariance has
     this r_c; `fit_mixed_mle` always finds one.
@@ -153,7 +158,7 @@ def product_mixture(first: WrappedNormal, second: WrappedNormal) -> Mixture:
 
 
 def product(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:
-    """The wrapped normal with the circular moments and r_c of the product of two densities."""
+    """Return the wrapped normal with the circular moments and r_c of the product of two densities."""
     batch = np.broadcast_shapes(first.mean.shape[:-1], second.mean.shape[:-1])
     parameters = kernels.fit_product_each(
         flatten(first.mean, batch, 2),

@@ -1,4 +1,4 @@
-"""Kernels of the bivariate wrapped normal distribution: fits to samples and products.
+"""Computes bivariate wrapped normals in kernels: fits to samples and products.
 
 Component-first functions run on arrays as well. A covariance is handed on as c11, c12, c22.
 """
@@ -28,7 +28,7 @@ _GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 
 class Mixture(NamedTuple):
-    """A wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
+    """Holds a wrapped Gaussian mixture: means (n, 2), weights (n,), one covariance (2, 2) for all."""
 
     mean: NDArray[np.float64]
     weights: NDArray[np.float64]
@@ -45,7 +45,7 @@ def circular_correlation(c11: Component, c12: Component, c22: Component) -> Comp
 
 
 def covariance_of(correlation: Component, c11: Component, c22: Component) -> Component:
-    """The c12 with which a wrapped normal has this r_c; the inverse of `circular_correlation`."""
+    """Return the c12 with which a wrapped normal has this r_c; the inverse of `circular_correlation`."""
     return np.arcsinh(correlation * np.sqrt(np.sinh(c11) * np.sinh(c22)))
 
 
@@ -255,7 +255,7 @@ def _turns(variance: float) -> int:
 def fit_product(
     mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
 ) -> Components:
-    """The wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
+    """Return the wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
     Where no positive definite covariance has them (modes far apart), the components' correlation stays.
     `mixture` is memory, see `blank_mixture`.

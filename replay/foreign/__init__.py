@@ -1,4 +1,4 @@
-"""Filters of others in a replay: a library behind `fuselog_filter.h`, a program, a program that streams.
+"""Runs filters of others in a replay: a library of `fuselog_filter.h`, or a program, streaming or not.
 
 Begin with `filters`, which makes estimators of them; `description` has what a filter says of itself.
 """

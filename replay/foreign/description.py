@@ -18,7 +18,7 @@ MOST_COMPONENTS = 1000  # of a state: its covariance has a million numbers
 
 
 class ForeignParameters(Parameters):
-    """How a foreign filter is run; beside these it has the parameters of its description.
+    """States how a foreign filter is run; beside these it has the parameters of its description.
 
     Attributes:
         time_limit_s: a run fails where one message takes longer.
@@ -34,6 +34,8 @@ class ForeignParameters(Parameters):
 
 
 class _Part(BaseModel):
+    """Refuses unknown names, NaN and infinity in a part of a description."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
@@ -69,7 +71,7 @@ class TopicRead(_Part):
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """How many numbers a vector field has; 0 for a field that is one number."""
+        """Count how many numbers a vector field has; 0 for a field that is one number."""
         parts = (field.partition("[") for field in self.fields)
         return {name: int(size[:-1]) if size else 0 for name, _, size in parts}
 
@@ -223,4 +225,6 @@ _TAKEN = {"kind", "path", "command", "in_process", "topics", "truth", "model_con
 
 
 class _Described(Parameters):
+    """Holds what a program answers when it is asked to describe itself."""
+
     description: Description

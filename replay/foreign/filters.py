@@ -54,7 +54,7 @@ FollowRuns = Callable[[Sequence[RunGiven | None], Limits], list[Ran | None]]
 
 
 class LibraryParameters(ForeignParameters):
-    """A filter of a shared library.
+    """Names a filter of a shared library.
 
     Attributes:
         path: the library, which has the functions of `fuselog_filter.h`.

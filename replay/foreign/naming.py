@@ -74,7 +74,7 @@ def _label(kind: str, rest: str) -> str:
 
 
 def split_command(command: str) -> list[str]:
-    """The words of a command; raises BadInput where a quote is open."""
+    """Return the words of a command; raises BadInput where a quote is open."""
     try:
         words = shlex.split(command)
     except ValueError as error:

@@ -35,7 +35,7 @@ TRUTH, ESTIMATE = schemas.TRUTH_STATE.full_name, "/estimates/"
 
 
 class StreamParameters(ForeignParameters):
-    """A program that answers messages.
+    """Names a program that answers messages.
 
     Attributes:
         command: what is started, with its arguments.
@@ -45,7 +45,7 @@ class StreamParameters(ForeignParameters):
 
 
 class ProgramParameters(StreamParameters):
-    """A program that reads a log and writes estimates.
+    """Names a program that reads a log and writes estimates.
 
     Attributes:
         time_limit_s: a run fails where the program takes longer for it.

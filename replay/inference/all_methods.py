@@ -36,6 +36,9 @@ def modelled(model: Model, method: str) -> Estimator[Any]:
         model: how the state moves and what sensors measure of it.
         method: as `fuselog models NAME` lists them, such as "ukf", "lrkf:s2kf-50" or "imm:ekf".
 
+    Returns:
+        The estimator, which `replay` takes.
+
     Raises BadInput where there is no such method or variant, or the model lacks what it needs.
 
     >>> from replay.estimators.models.landmarks import ROBOT

@@ -164,15 +164,17 @@ def _any_parameters(method: Method) -> type[Parameters]:
     What one model wants of a parameter is checked when it is known which model fits the log.
     """
     fields: dict[str, Any] = {"model": (str | None, Field(None, description=_MODEL))}
-    told: dict[str, dict[str, list[str]]] = {}
+    models_of: dict[str, dict[str, list[str]]] = {}
     for model_name, model in registered_models().items():
         meaning_of = meanings(model.parameters)
         for name, field in model.parameters.model_fields.items():
             if name not in method.parameters.model_fields:
-                told.setdefault(name, {}).setdefault(meaning_of.get(name, ""), []).append(model_name)
+                models_of.setdefault(name, {}).setdefault(meaning_of.get(name, ""), []).append(
+                    model_name
+                )
                 kind = _accepted(field)
                 other = fields.get(name, (kind,))[0]
-                meaning = _of_models(told[name])
+                meaning = _of_models(models_of[name])
                 unset = Field(None, description=meaning, validate_default=False)
                 fields[name] = (kind if other == kind else Any, unset)
     return _created(f"Any{method.parameters.__name__}", (method.parameters,), fields)

@@ -29,6 +29,9 @@ def formulas(model: str | Model) -> str:
     Args:
         model: a registered one's name (`models` has them), or a model.
 
+    Returns:
+        The text, a paragraph for each function.
+
     Raises BadInput for an unknown name, or a function that cannot be traced.
 
     >>> print(formulas("robot").partition("v3")[0].strip())
@@ -88,8 +91,8 @@ def _of_sensor(model: Model, sensor: Sensor) -> Iterator[tuple[str, list[str]]]:
     noise = [f"noise{number}" for number in range(1, sensor.noises + 1)]
     entering = {"noise": noise} if noise else {}
     reference: Given = {"reference": reference_names(sensor), "parameters": None}
-    told = [f"measured_{each}" if each in model.state else each for each in measured]
-    yield "measure", _lines(sensor.measure, {"state": state, **entering, **reference}, told)
+    names = [f"measured_{each}" if each in model.state else each for each in measured]
+    yield "measure", _lines(sensor.measure, {"state": state, **entering, **reference}, names)
     spread = [f"variance of {each}" for each in noise] or _spread(measured)
     yield "noise", _lines(sensor.noise, {"parameters": None}, spread)
     yield (

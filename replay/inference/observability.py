@@ -65,7 +65,7 @@ WEAK = 10.0  # priors
 
 
 class ObservabilityParameters(MethodParameters):
-    """Windows and scales of the Gramian.
+    """States windows and scales of the Gramian.
 
     Attributes:
         window_s: length of a window; without one, the whole run.
@@ -194,7 +194,9 @@ class Observability(IteratedSmoother):
         window_of = self._windows(way, state.carried.time_ns)
         found, offsets = self._gramians(state, way, window_of)
         run = np.repeat(np.arange(len(scales)), np.diff(offsets))
-        told = [spectrum(each, scale) for each, scale in zip(found.covariance, scales[run], strict=True)]
+        spectra = [
+            spectrum(each, scale) for each, scale in zip(found.covariance, scales[run], strict=True)
+        ]
         is_first = np.ones(len(run), bool)
         is_first[1:] = run[1:] != run[:-1]
         before_ns = np.append(0, found.time_ns[:-1])
@@ -205,10 +207,10 @@ class Observability(IteratedSmoother):
             found.time_ns,
             metadata={"components": ",".join(self.components)},
             begin_time_ns=np.where(is_first, state.carried.time_ns[run], before_ns),
-            rank=np.array([each.rank for each in told], np.int64),
+            rank=np.array([each.rank for each in spectra], np.int64),
             measurements=found.mean[:, 0].astype(np.int64),
-            eigenvalues=np.array([each.eigenvalues for each in told]).reshape(-1, t),
-            direction=np.array([each.direction for each in told]).reshape(-1, t),
+            eigenvalues=np.array([each.eigenvalues for each in spectra]).reshape(-1, t),
+            direction=np.array([each.direction for each in spectra]).reshape(-1, t),
         )
         return [Ragged(stream, offsets)]
 
@@ -274,7 +276,7 @@ class Observability(IteratedSmoother):
 
 
 class Spectrum(NamedTuple):
-    """Eigenvalues of a scaled Gramian, ascending (t,), its rank, and the least one's direction (t,)."""
+    """Holds a scaled Gramian's eigenvalues, ascending (t,), rank, and the least's direction (t,)."""
 
     eigenvalues: Floats
     rank: int
@@ -282,7 +284,7 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(information: Floats, scales: Floats) -> Spectrum:
-    """Rank and eigenvalues of D W D, and the direction D e of the least, of length one in state units.
+    """Return rank and eigenvalues of D W D, and D e of the least, of length one in state units.
 
     A component whose scale is zero, as something known exactly, has no part: its eigenvalue is infinite.
     """
@@ -300,17 +302,17 @@ def spectrum(information: Floats, scales: Floats) -> Spectrum:
     return Spectrum(np.append(values, np.full(known.sum(), np.finfo(float).max)), rank, direction)
 
 
-def in_words(told: Spectrum, components: Sequence[str]) -> str:
+def in_words(found: Spectrum, components: Sequence[str]) -> str:
     """Describe the weakest direction in a sentence."""
-    largest = np.abs(told.direction).max(initial=0.0)
+    largest = np.abs(found.direction).max(initial=0.0)
     moved = [
         f"{share:+.3g} {name}"
-        for name, share in zip(components, told.direction, strict=True)
+        for name, share in zip(components, found.direction, strict=True)
         if abs(share) > 1e-3 * largest
     ]
-    weakest = float(told.eigenvalues[0])
+    weakest = float(found.eigenvalues[0])
     strength = f"as much as {weakest:.3g} priors"
-    if told.rank < len(components):
+    if found.rank < len(components):
         strength = "not observable, weaker than the prior"
     elif weakest < WEAK:
         strength += ", weaker than the prior"

@@ -74,7 +74,7 @@ def _fit(parts: Sequence["Part"]) -> int:
 
 
 class Part(NamedTuple):
-    """Something that a model needs, and whether a log has it."""
+    """Describes something that a model needs, and whether a log has it."""
 
     words: str
     is_here: bool

@@ -1,4 +1,4 @@
-"""Functions at weighted samples of a Gaussian as graphs, see `replay.inference.kalman.regression`.
+"""Traces functions at weighted samples as graphs, see `replay.inference.kalman.regression`.
 
 Samples and rounds are left to loops: a graph is of one sample, or of one round of a mean.
 """

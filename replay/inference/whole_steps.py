@@ -1,4 +1,4 @@
-"""A filter's whole steps as graphs: its prediction, each sensor's innovation, and the correction.
+"""Traces a filter's whole steps: its prediction, each sensor's innovation, and the correction.
 
 The functions that kernels are compiled from are called with traced numbers, see `step_graphs`. Products
 of covariances with Jacobians are left to loops, which go over the entries that the graphs give, and so

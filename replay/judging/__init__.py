@@ -1,1 +1,1 @@
-"""Estimates against the truth: errors, consistency, sets, tracks, verification; begin with `judge`."""
+"""Judges estimates by truth: errors, consistency, sets, tracks, verification; begin with `judge`."""

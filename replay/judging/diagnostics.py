@@ -1,4 +1,4 @@
-"""What a replay says of itself: failures, what was skipped or assumed, and how much was estimated."""
+"""Collects what a replay says of itself: failures, what was skipped or assumed, how much came out."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The judge: what the outputs of a replay are worth, block by block as they come.
+"""Judges what the outputs of a replay are worth, block by block as they come.
 
 What it keeps are sums: of every metric, by step over the runs, and for each run by time. So memory does
 not grow with the length of a log, except by two numbers for each step of NEES.
@@ -214,7 +214,7 @@ class Judge:
 
     @property
     def metrics(self) -> dict[str, float]:
-        """The numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
+        """Return the numbers, as `estimator.quantity[.case]`; raises BadInput where a metric raises."""
         return self._measured.finish()
 
     @property

@@ -15,7 +15,7 @@ from replay.judging.metrics.quantities import InnovationSums, Quantities
 
 
 def joined(tables: Iterable[pd.DataFrame]) -> pd.DataFrame:
-    """The rows of all tables; what one of them has no column for is NaN there."""
+    """Return the rows of all tables; what one of them has no column for is NaN there."""
     filled = [table for table in tables if len(table)]
     return pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
 

@@ -1,4 +1,4 @@
-"""Regions of the plane that bounded errors leave: exact sets, pseudo-ellipsoids, and sets that move.
+"""Computes the regions that bounded errors leave: exact sets, pseudo-ellipsoids, sets that move.
 
 Begin with `feasible_sets`.
 """

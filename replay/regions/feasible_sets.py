@@ -1,4 +1,4 @@
-"""Exact sets of robot positions that bounded relative bearings leave: areas, boxes, borders.
+"""Computes exact sets of positions that bounded relative bearings leave: areas, boxes, borders.
 
 Briechle, Hanebeck, Localization of a Mobile Robot Using Relative Bearing Measurements (2004), (2)-(4),
 (20), (21). Everything is an intersection of generalised discs a |x|^2 + b'x + c <= 0: discs, their
@@ -17,7 +17,7 @@ from replay.engine.arrays import Floats, Integers
 
 
 class Pairs(NamedTuple):
-    """Relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), one bound.
+    """Holds relative bearings of a frame: landmarks `first`, `second` (n, 2), `angle_rad` (n,), bound.
 
     angle = bearing of first - bearing of second, wrong by at most `bound_rad`.
     """
@@ -29,14 +29,14 @@ class Pairs(NamedTuple):
 
 
 class Arena(NamedTuple):
-    """The rectangle that the robot is known to be in."""
+    """Bounds the rectangle that the robot is known to be in."""
 
     low: Floats
     high: Floats
 
 
 class Arcs(NamedTuple):
-    """The border of a set as arcs with the set on the left; a set without border is empty.
+    """Holds a set's border as arcs with the set on the left; a set without border is empty.
 
     Each begins at `start` (m, 2) in direction `heading_rad` (m,) and runs `length` (m,) at a constant
     `curvature` (m,), negative where the set is outside the circle.
@@ -48,7 +48,7 @@ class Arcs(NamedTuple):
     length: Floats
 
     def at(self, distance: Floats) -> Floats:
-        """The points at `distance` (m,) along the arcs."""
+        """Return the points at `distance` (m,) along the arcs."""
         pose = (*self.start.T, self.heading_rad)
         return np.stack(drive(pose, (1.0, self.curvature), distance)[:2], axis=-1)
 
@@ -58,6 +58,12 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
 
     Raises BadInput where shapes differ, a number is not finite, two landmarks coincide, or the bound is
     not above 0 and below pi / 2 (from there on the set is no longer an intersection).
+
+    Args:
+        first: (n, 2), a landmark of each pair, in m.
+        second: (n, 2), the other one.
+        angle_rad: (n,), from the first to the second.
+        bound_rad: the largest error of an angle.
     """
     pairs = Pairs(
         np.asarray(first, float).reshape(-1, 2),
@@ -83,7 +89,7 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
 
 
 def arena_around(points: ArrayLike, margin_m: float) -> Arena:
-    """The rectangle around points (n, 2), larger by a margin on every side."""
+    """Return the rectangle around points (n, 2), larger by a margin on every side."""
     places = np.asarray(points, float)
     return Arena(places.min(axis=0) - margin_m, places.max(axis=0) + margin_m)
 
@@ -92,6 +98,13 @@ def excess_rad(pairs: Pairs, points: Floats) -> Floats:
     """Compute how far each pair's bound is exceeded at points (..., 2): (..., n), feasible where <= 0.
 
     The exact membership test, (4). NaN on a landmark itself, where the angle has no value.
+
+    Args:
+        pairs: the relative bearings of a frame.
+        points: (..., 2), in m.
+
+    Returns:
+        (..., n), in rad.
     """
     seen = relative_bearing((points[..., None, 0], points[..., None, 1]), pairs.first.T, pairs.second.T)
     excess: Floats = np.abs(wrap_angle(seen - pairs.angle_rad)) - pairs.bound_rad
@@ -102,11 +115,15 @@ def excess_rad(pairs: Pairs, points: Floats) -> Floats:
 
 
 def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
-    """The discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
+    """Return the discs D(g) of (20), (21) as coefficients a, b_x, b_y, c: (n, 4), for any angle g.
 
     D(g) holds sin(gamma - g) >= 0: its circle passes through both landmarks and, on one side of their
     chord, sees it at the angle g. The sign of (20) needs Delta_perp turned by +90 degrees, which the
     paper does not say. A sine of zero gives the half-plane.
+
+    Args:
+        pairs: the n relative bearings of a frame.
+        angle_rad: g (n,).
     """
     sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
     sine = np.where(np.abs(sine) < 1e-15, 0.0, sine)
@@ -120,7 +137,7 @@ def circles(pairs: Pairs, angle_rad: Floats) -> Floats:
 
 
 def discs(pairs: Pairs) -> Floats:
-    """The two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
+    """Return the two generalised discs whose intersection is each pair's exact set, (n, 2, 4).
 
     Between g1 = angle - bound and g2 = angle + bound: D(g1) without D(g2). That is a lune, a lens where
     g2 passes pi, the outside of two discs where g1 passes 0; no case needs its own formula.
@@ -131,7 +148,7 @@ def discs(pairs: Pairs) -> Floats:
 
 
 def half_planes(arena: Arena) -> Floats:
-    """The arena's four sides as generalised discs (4, 4)."""
+    """Return the arena's four sides as generalised discs (4, 4)."""
     sides = np.zeros((4, 4))
     sides[[0, 1], [1, 2]] = -1.0
     sides[[2, 3], [1, 2]] = 1.0
@@ -140,20 +157,30 @@ def half_planes(arena: Arena) -> Floats:
 
 
 def evaluate(constraints: Floats, points: Floats) -> Floats:
-    """The values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k)."""
+    """Return the values a |x|^2 + b'x + c of constraints (k, 4) at points (..., 2): (..., k).
+
+    Args:
+        constraints: (k, 4), a, b_x, b_y, c.
+        points: x (..., 2).
+    """
     squared = np.sum(points**2, axis=-1)[..., None]
     linear = points @ constraints[:, 1:3].T
     return constraints[:, 0] * squared + linear + constraints[:, 3]
 
 
 def exact_set(pairs: Pairs, arena: Arena) -> Arcs:
-    """The exact feasible set (4) of a frame inside an arena; no arcs where it is empty."""
+    """Return the exact feasible set (4) of a frame inside an arena; no arcs where it is empty."""
     constraints = np.concatenate([discs(pairs).reshape(-1, 4), half_planes(arena)])
     return intersection(constraints, arena)
 
 
 def intersection(constraints: Floats, arena: Arena) -> Arcs:
-    """The border of an intersection of generalised discs (k, 4), the arena's sides among them."""
+    """Return the border of an intersection of generalised discs (k, 4), the arena's sides among them.
+
+    Args:
+        constraints: (k, 4), a, b_x, b_y, c.
+        arena: whose sides are among the constraints.
+    """
     pieces = _cut(constraints, arena)
     middle = pieces.at(0.5 * pieces.length)
     tolerance = 1e-11 * float(np.linalg.norm(arena.high - arena.low))
@@ -215,7 +242,7 @@ def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
 
 
 def area(border: Arcs) -> float:
-    """The area inside, by Green's theorem: chords and circular segments."""
+    """Return the area inside, by Green's theorem: chords and circular segments."""
     end = border.at(border.length)
     chords = border.start[:, 0] * end[:, 1] - border.start[:, 1] * end[:, 0]
     turn = border.curvature * border.length
@@ -226,7 +253,7 @@ def area(border: Arcs) -> float:
 
 
 def box(border: Arcs) -> Arena:
-    """The tightest axis-parallel box; raises BadInput for an empty set."""
+    """Return the tightest axis-parallel box; raises BadInput for an empty set."""
     if len(border.length) == 0:
         raise BadInput("the set is empty, so that it has no bounding box")
     points = [border.start, border.at(border.length)]
@@ -269,7 +296,7 @@ def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
 
 
 def signed_area(ring: Floats) -> float:
-    """The area inside a polygon (n, 2), positive where it runs anticlockwise."""
+    """Return the area inside a polygon (n, 2), positive where it runs anticlockwise."""
     following = np.roll(ring, -1, axis=0)
     return float(0.5 * np.sum(ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]))
 

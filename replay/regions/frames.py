@@ -48,7 +48,7 @@ class Known(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """The relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
+    """Holds the relative bearings of one stamp, the numbers (n, 2) of their landmarks, and the arena."""
 
     time_ns: int
     pairs: Pairs
@@ -57,7 +57,7 @@ class Frame(NamedTuple):
 
 
 def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
-    """The frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
+    """Yield the frames of a bearing, range-bearing or relative-bearing stream that see enough landmarks.
 
     What is not on the map is left out, and so are pairs of one landmark seen twice. Raises BadInput
     where nothing says how far the robot can be from what it sees.
@@ -129,7 +129,7 @@ STATED = (*ERRORS, "bearing_bound_rad")
 
 
 class Bearings(NamedTuple):
-    """The bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
+    """Holds the bearings (n,) of one stamp, and the places (n, 2) of their landmarks."""
 
     place_m: Floats
     bearing_rad: Floats

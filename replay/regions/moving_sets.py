@@ -1,4 +1,4 @@
-"""Sets of positions and headings that hold a robot for certain, moved by odometry with bounded errors.
+"""Moves sets of positions and headings that hold a robot for certain, by odometry of bounded error.
 
 A position set is a shapely geometry, which may be in several pieces; headings lie in one interval. What
 is computed holds the exact result: disc offsets are polygons around it, and what rounding could lose is
@@ -36,7 +36,7 @@ L8_MOST_GROWTH = 3.0
 
 
 class Headings(NamedTuple):
-    """An interval of headings; all of them where the half width is pi."""
+    """Holds an interval of headings; all of them where the half width is pi."""
 
     middle_rad: float
     half_rad: float
@@ -46,7 +46,7 @@ ALL_HEADINGS = Headings(0.0, np.pi)
 
 
 class Odometry(NamedTuple):
-    """Poses (n, 3) that the odometry alone leads to, and the velocities (n, 2) from their stamps on."""
+    """Holds poses (n, 3) that odometry alone leads to, and velocities (n, 2) from their stamps on."""
 
     time_ns: Integers
     pose: Floats
@@ -60,13 +60,13 @@ class Odometry(NamedTuple):
 
 
 class Growth(NamedTuple):
-    """The largest error of odometry over a span: `offset` + `rate` times its length in s."""
+    """Bounds the error of odometry over a span: `offset` + `rate` times its length in s."""
 
     offset: float
     rate: float
 
     def over(self, span_s: Any) -> Any:
-        """The largest error over a span, or over each of several."""
+        """Return the largest error over a span, or over each of several."""
         return self.offset + self.rate * span_s
 
 
@@ -83,7 +83,12 @@ class Motion(NamedTuple):
 
 
 def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
-    """Poses from the origin on, by velocities (n, 2) that each hold until the next stamp."""
+    """Compute poses from the origin on, by velocities that each hold until the next stamp.
+
+    Args:
+        time_ns: (n,), the stamps.
+        velocity: (n, 2), forward in m/s and turn in rad/s.
+    """
     duration_s = np.diff(time_ns, append=time_ns[-1:]) * 1e-9
     heading = np.concatenate([[0.0], np.cumsum(velocity[:, 1] * duration_s)])[:-1]
     x, y, _ = drive((0.0, 0.0, heading), velocity.T, duration_s)
@@ -96,7 +101,15 @@ def odometry_of(time_ns: Integers, velocity: Floats) -> Odometry:
 
 
 def relative_pose(first: Floats, second: Floats) -> Floats:
-    """The second of two poses (..., 3) as seen from the first: displacement and turn, not wrapped."""
+    """Return the second of two poses as seen from the first: displacement and turn, not wrapped.
+
+    Args:
+        first: (..., 3), x, y in m and heading in rad.
+        second: (..., 3), likewise.
+
+    Returns:
+        (..., 3), in the axes of the first.
+    """
     away = second[..., :2] - first[..., :2]
     cosine, sine = np.cos(first[..., 2]), np.sin(first[..., 2])
     ahead = cosine * away[..., 0] + sine * away[..., 1]
@@ -105,7 +118,7 @@ def relative_pose(first: Floats, second: Floats) -> Floats:
 
 
 def common_headings(one: Headings, other: Headings) -> Headings | None:
-    """The headings that are in both intervals; None where there are none.
+    """Return the headings that are in both intervals; None where there are none.
 
     Where wide intervals meet at both ends, the narrower of them holds what they have in common.
     """
@@ -120,7 +133,7 @@ def common_headings(one: Headings, other: Headings) -> Headings | None:
 
 
 def all_headings_of(one: Headings, other: Headings) -> Headings:
-    """The least interval that holds both."""
+    """Return the least interval that holds both."""
     apart = float(wrap_angle(other.middle_rad - one.middle_rad))
     low = min(-one.half_rad, apart - other.half_rad)
     high = max(one.half_rad, apart + other.half_rad)
@@ -156,7 +169,7 @@ def moved(
 
 
 def directions(places: shapely.Geometry, target: Floats) -> Headings:
-    """The directions in which a point is seen from a set; all of them where it is in the set's hull."""
+    """Return directions in which a point is seen from a set; all of them where it is in its hull."""
     hull = places.convex_hull
     if hull.covers(shapely.Point(target)):
         return ALL_HEADINGS
@@ -170,7 +183,7 @@ def directions(places: shapely.Geometry, target: Floats) -> Headings:
 
 
 def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
-    """A set from its borders (n, 2), holes the other way round."""
+    """Return a set from its borders (n, 2), holes the other way round."""
     places: shapely.Geometry = shapely.Polygon()
     for ring in rings:
         places = places.symmetric_difference(shapely.make_valid(shapely.Polygon(ring)))
@@ -178,12 +191,12 @@ def from_rings(rings: Sequence[Floats]) -> shapely.Geometry:
 
 
 def corners_of(places: shapely.Geometry) -> shapely.Geometry:
-    """A set without the vertices on its edges, which are there or not as rounding has it."""
+    """Return a set without the vertices on its edges, which are there or not as rounding has it."""
     return shapely.simplify(places, ON_A_LINE_M)
 
 
 def to_rings(places: shapely.Geometry) -> list[Floats]:
-    """The borders (n, 2) of a set: on their left is the set."""
+    """Return the borders (n, 2) of a set: on their left is the set."""
     found = []
     for part in shapely.get_parts(corners_of(places)):
         if isinstance(part, shapely.Polygon) and not part.is_empty:
@@ -195,7 +208,7 @@ def to_rings(places: shapely.Geometry) -> list[Floats]:
 
 
 def within_l8(places: shapely.Geometry) -> shapely.Geometry:
-    """A pseudo-ellipsoid with L = 8 around a set, as a polygon.
+    """Return a pseudo-ellipsoid with L = 8 around a set, as a polygon.
 
     It is the level set of the least ellipsoid around the monomials T of the set's points (by
     Titterington's weights of 1976, which need no step length), grown until it holds the set. A set that

@@ -1,4 +1,4 @@
-"""The pseudo-ellipsoid filter: sets of positions that are ellipsoids in a space of monomials.
+"""Filters by pseudo-ellipsoids: position sets that are ellipsoids in a space of monomials.
 
 Briechle, Hanebeck (2004), III and IV. A pair's exact set lies between two circles for each of its two
 generalised discs: in u = (z - centre) / half width it is |u| <= 1, and u is linear in the monomials
@@ -27,7 +27,7 @@ ROUNDING = 1e-11
 
 
 class PseudoEllipsoid(NamedTuple):
-    """The set T'A T - 2 b'T + c <= 0 of monomials T (order,) of the positions (x - origin) / scale.
+    """Represents the set T'A T - 2 b'T + c <= 0 of monomials T (order,) of (x - origin) / scale.
 
     Zero information, the prior of V, is all zeros; a huge covariance would only lose digits.
     """
@@ -40,7 +40,7 @@ class PseudoEllipsoid(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
+    """Holds nodes x (n,), y (n,) and points (n, n, 2), rows along y."""
 
     x: Floats
     y: Floats
@@ -48,14 +48,19 @@ class Grid(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """A set's border as closed polygons (n, 2), holes the other way round, and the area inside."""
+    """Holds a set's border as closed polygons (n, 2), holes the other way round, and the area inside."""
 
     rings: list[Floats]
     area_m2: float
 
 
 def monomials(points: Floats, order: Order) -> Floats:
-    """T(x) of (9), (25): points (..., 2) to (..., order)."""
+    """Compute T(x) of (9), (25): points (..., 2) to (..., order).
+
+    Args:
+        points: (..., 2), scaled.
+        order: how many monomials there are.
+    """
     x, y = points[..., 0], points[..., 1]
     squared = x**2 + y**2
     columns = [x, y, x**2, y**2]
@@ -122,7 +127,7 @@ def slack(ring: Floats, points: Floats, order: Order) -> Floats:
 
 
 def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
-    """H (m, order), z (m,) and V (m, m) of a ring, such that e'V^-1 e = 1 - slack with e = z - H T."""
+    """Return H (m, order), z (m,) and V (m, m) of a ring: e'V^-1 e = 1 - slack with e = z - H T."""
     a, bx, by, c = ring
     row = np.array([bx, by, a, a])
     if order == 4:
@@ -144,7 +149,7 @@ def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
 
 
 def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid:
-    """The filter step (18) in information form: one sum per parameter; `ring` in scaled positions."""
+    """Filter by (18) in information form: one sum per parameter; `ring` in scaled positions."""
     rows, value, size = measurement(ring, order_of(prior))
     weighted = weight * np.linalg.inv(size)
     return prior._replace(
@@ -160,14 +165,22 @@ def order_of(ellipsoid: PseudoEllipsoid) -> Order:
 
 
 def room(ellipsoid: PseudoEllipsoid, points: Floats) -> Floats:
-    """The fused slack at points (..., 2): the set is where it is >= 0."""
+    """Return the fused slack at points (..., 2): the set is where it is >= 0.
+
+    Args:
+        ellipsoid: the set.
+        points: (..., 2), in m.
+
+    Returns:
+        (...).
+    """
     raised = monomials((points - ellipsoid.origin) / ellipsoid.scale_m, order_of(ellipsoid))
     quadratic = np.einsum("...i,...i->...", raised @ ellipsoid.information, raised)
     return 2 * raised @ ellipsoid.vector - quadratic - ellipsoid.constant
 
 
 def most_room(ellipsoid: PseudoEllipsoid) -> float:
-    """The greatest fused slack of any monomials, s of (7), at least its rounding error.
+    """Return the greatest fused slack of any monomials, s of (7), at least its rounding error.
 
     Raises BadInput where it is negative by more than that: the sets have no common point.
     """
@@ -307,7 +320,7 @@ def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllip
 
 
 def outline(ellipsoid: PseudoEllipsoid, arena: Arena, nodes: int = 400) -> Outline:
-    """The part of the set inside the arena, on a grid of nodes x nodes around it."""
+    """Return the part of the set inside the arena, on a grid of nodes x nodes around it."""
     window = _window(lambda points: room(ellipsoid, points), arena, nodes)
     grid = _grid(window, nodes)
     return _outline(room(ellipsoid, grid.points), grid)

@@ -1,4 +1,4 @@
-"""Sample sets of N(0, I) for linear regression Kalman filters, and where they are kept.
+"""Makes and keeps sample sets of N(0, I) for linear regression Kalman filters.
 
 Begin with `samplers`.
 """

@@ -1,4 +1,4 @@
-"""The sample cache: LCD sets are computed once, kept on disk, and never trusted when damaged.
+"""Keeps LCD sets on disk: each is computed once, and never trusted when damaged.
 
 A file (see `replay.engine.compiling.cache`) holds a NumPy npz archive whose members are named after
 their sets. Common sets ship with the package (see `replay.sampling.ship`); others are kept in the user's

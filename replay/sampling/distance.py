@@ -34,7 +34,7 @@ E2_SERIES = (np.euler_gamma - 1, *((-1.0) ** k / (k * factorial(k + 1)) for k in
 
 
 class _Quadrature(NamedTuple):
-    """Integrals over b as sums: D2(s) = sum_q factors[q] exp(-rates[q] |s|^2)."""
+    """Approximates integrals over b by sums: D2(s) = sum_q factors[q] exp(-rates[q] |s|^2)."""
 
     rates: Array
     factors: Array

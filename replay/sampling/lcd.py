@@ -1,4 +1,4 @@
-"""Equally weighted samples of N(0, I) that are as close to it as can be: LCD sampling.
+"""Computes equally weighted samples of N(0, I) that are as close to it as can be: LCD sampling.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section V.A. The paper does not say that the optimum's covariance is too small (eigenvalues of .82 for 5

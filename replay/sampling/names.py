@@ -1,4 +1,4 @@
-"""The names of samplings, as a command line writes them, and what each name stands for.
+"""Names samplings as a command line writes them, and says what each name stands for.
 
 ukf  ukf:kappa=0              unscented
 gf-25                         25 Gaussian-filter points on each axis
@@ -33,7 +33,7 @@ PATTERN = re.compile(r"(?P<family>[a-z0-9]+)(-(?P<number>\d+))?(?P<options>(:[a-
 
 
 class Sampling(BaseModel, ABC):
-    """A way to sample N(0, I) in any dimension; `str` gives its name back."""
+    """Names a way to sample N(0, I) in any dimension; `str` gives its name back."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     family: ClassVar[str]
@@ -65,7 +65,7 @@ class Sampling(BaseModel, ABC):
 
 
 class Unscented(Sampling):
-    """The points of the unscented transform; equal weights by default."""
+    """Names the points of the unscented transform; equal weights by default."""
 
     family = "ukf"
     kappa: FiniteFloat = 0.5
@@ -75,7 +75,7 @@ class Unscented(Sampling):
 
 
 class GaussianFilter(Sampling):
-    """Points on the axes only, as many on each as wanted."""
+    """Names points on the axes only, as many on each as wanted."""
 
     family = "gf"
     number = "per_axis"
@@ -86,7 +86,7 @@ class GaussianFilter(Sampling):
 
 
 class RandomisedUnscented(Sampling):
-    """Unscented sets, turned and stretched at random, new ones for every run and step."""
+    """Names unscented sets, turned and stretched at random, new ones for every run and step."""
 
     family = "rukf"
     number = "iterations"
@@ -97,7 +97,7 @@ class RandomisedUnscented(Sampling):
 
 
 class SmartSampling(Sampling):
-    """The S2KF's LCD samples; rotation 0 leaves the set as it was found."""
+    """Names the S2KF's LCD samples; rotation 0 leaves the set as it was found."""
 
     family = "s2kf"
     number = "count"

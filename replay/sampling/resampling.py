@@ -1,4 +1,4 @@
-"""Systematic resampling: as many particles as before, each as often as its weight says.
+"""Resamples systematically: as many particles as before, each as often as its weight says.
 
 Kitagawa, Journal of Computational and Graphical Statistics 5(1), 1996.
 """

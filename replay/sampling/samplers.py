@@ -1,4 +1,4 @@
-"""Sample sets of N(0, I), and the one interface through which a filter takes them.
+"""Makes sample sets of N(0, I), through the one interface that a filter takes.
 
 Sources: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section I.B; the randomised set is that of Dunik, Straka and Simandl, "The Development of a Randomised
@@ -20,7 +20,7 @@ Shape = tuple[int, ...]
 
 
 class Samples(NamedTuple):
-    """Points (..., L, N) and their weights (..., L), which sum to 1 and may be negative."""
+    """Holds points (..., L, N) and their weights (..., L), which sum to 1 and may be negative."""
 
     points: Array
     weights: Array
@@ -28,7 +28,7 @@ class Samples(NamedTuple):
 
 @dataclass(frozen=True)
 class Sampler:
-    """A sampling at one dimension.
+    """Draws by a sampling at one dimension.
 
     `draw(generator, batch)` gives points (*batch, count, dimension) and weights (*batch, count). Unless
     `redrawn`, they are read-only views of one set and the generator is not used. Batches drawn one after

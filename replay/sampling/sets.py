@@ -1,4 +1,4 @@
-"""Sample sets as compiled filters take them: one that serves every step, or a new one for each.
+"""Gives sample sets to compiled filters: one that serves every step, or a new one for each.
 
 A randomised sampling draws from a generator of each run's own, which the run's own data seed: so a run
 gives the same estimates alone and in an ensemble.
@@ -21,7 +21,7 @@ _UNUSED = np.random.default_rng(0)  # for sets that are not drawn
 
 
 class SampleSets(NamedTuple):
-    """Points (sets, L, N) and weights (sets, L); use number u takes the set (u - first) * stride."""
+    """Holds points (sets, L, N), weights (sets, L); use number u takes the set (u - first) * stride."""
 
     points: Array
     weights: Array
@@ -32,7 +32,7 @@ class SampleSets(NamedTuple):
 def sets_by_runs(
     sampler: Sampler, generators: Sequence[Generator | None], offsets: NDArray[np.int64]
 ) -> Iterator[tuple[slice, SampleSets]]:
-    """The sets of all runs, as many runs at once as memory should hold.
+    """Yield the sets of all runs, as many runs at once as memory should hold.
 
     Run r has the uses offsets[r]:offsets[r + 1]. A randomised sampling needs every run's generator, and
     moves it on.

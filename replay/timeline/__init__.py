@@ -1,1 +1,1 @@
-"""The Rerun timeline: sinks, columns, and one blueprint per scenario family; begin with `show`."""
+"""Draws the Rerun timeline: sinks, columns, one blueprint per scenario family; begin with `show`."""

@@ -1,4 +1,4 @@
-"""Copies of an estimate that fan out from it: how far each is away, over time, below all else."""
+"""Draws copies of an estimate that fan out from it: how far each is away, over time."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -14,7 +14,7 @@ Board = rrb.Container | rrb.View
 
 
 class Fan(NamedTuple):
-    """How far one copy is from its estimate.
+    """States how far one copy is from its estimate.
 
     Attributes:
         estimate: what it is a copy of; those of one estimate share a plot.
@@ -30,7 +30,7 @@ class Fan(NamedTuple):
 
 
 def draw_fans(canvas: Canvas, layout: Board, fans: Sequence[Fan]) -> rrb.Container:
-    """The layout above a plot for each estimate that copies fan out from."""
+    """Return the layout above a plot for each estimate that copies fan out from."""
     plots = []
     for estimate in dict.fromkeys(fan.estimate for fan in fans):
         plot = entity_path("plots", "stress", estimate)

@@ -1,4 +1,4 @@
-"""The timeline of a log that no family draws: all that it holds, by schema.
+"""Draws a log that no family draws: all that it holds, by schema.
 
 Places are on a plane, one for each frame of the log, and on a map of the earth: truths, estimates,
 fixes, poses, landmarks with what is seen of them. What a sensor sees is drawn about it, what it measures

@@ -29,7 +29,7 @@ LIVE_MESSAGES = 20_000
 
 
 class Drawing:
-    """The timeline of one run, drawn while it is replayed.
+    """Draws the timeline of one run while it is replayed.
 
     A receiver is sent every block as it comes. A file is drawn when all is there, from what is kept: the
     run itself while it is short, else evenly in time. Use it as a context: it is finished at the end,

@@ -1,4 +1,4 @@
-"""Estimators side by side: a family's scenes once for each, and by how much one is farther off.
+"""Puts estimators side by side: a family's scenes once for each, and by how much one is off more.
 
 The family has drawn everything once: a scene beside the other shows the same entities, but for those of
 the other estimators. So colours, cursor and all else are the same in both.
@@ -21,7 +21,7 @@ Board = rrb.Container | rrb.View
 def draw_side_by_side(
     canvas: Canvas, scene: Scene, layout: Board, estimators: Sequence[str]
 ) -> rrb.Container:
-    """The layout with a scene for each estimator, above the differences of their errors."""
+    """Return the layout with a scene for each estimator, above the differences of their errors."""
     plots = [view for case in scene.cases for view in _draw_differences(canvas, scene, case, estimators)]
     board = _split(layout, estimators)
     if not plots:

@@ -63,7 +63,7 @@ def open_recording(
 
 
 def rerun_path(path: Path) -> str:
-    """A file's name where Rerun takes it as UTF-8, whatever the locale is.
+    """Return a file's name where Rerun takes it as UTF-8, whatever the locale is.
 
     Raises BadInput where the name is not UTF-8.
     """

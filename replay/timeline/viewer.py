@@ -1,4 +1,4 @@
-"""Rerun's viewer, which rerun-sdk brings along: a picture without a screen, and the desktop window.
+"""Starts Rerun's viewer, which rerun-sdk brings along: a picture without a screen, or the window.
 
 It listens on the loopback interface only, reports no usage, reaches no network, and ends with the
 process that started it, however that ends.
@@ -36,7 +36,7 @@ _PICTURES = 7
 
 
 class Listener(NamedTuple):
-    """A running Rerun process and the address that it receives at."""
+    """Represents a running Rerun process and the address that it receives at."""
 
     url: str
     process: subprocess.Popen[bytes]

@@ -1,4 +1,4 @@
-"""A graph as C99 that a person can read: a line for what is used more than once.
+"""Writes a graph as C99 that a person can read: a line for what is used more than once.
 
 Sums and products stand in the order in which kernels compute them, so that a compiler that contracts and
 reorders nothing (`-ffp-contract=off`, no `-ffast-math`) gives the same bits.
@@ -124,7 +124,7 @@ DOUBLE, SINGLE = Precision(), Precision("float", "f")
 
 
 class _Text(NamedTuple):
-    """An expression, and how tightly its last operation binds."""
+    """Holds an expression, and how tightly its last operation binds."""
 
     text: str
     binds: int

@@ -1,4 +1,4 @@
-"""Exact derivatives of graphs, forward: how every number changes with chosen inputs.
+"""Differentiates graphs exactly, forward: how every number changes with chosen inputs.
 
 Griewank and Walther, Evaluating Derivatives, chapter 3. Only what can differ from zero is followed, so
 that the pattern of a Jacobian is known with it. Where a derivative does not exist or is infinite at one

@@ -1,4 +1,4 @@
-"""A graph as instructions of a kernel, and as Python."""
+"""Emits a graph as instructions of a kernel, and as Python."""
 
 import operator
 from collections.abc import Sequence
@@ -74,7 +74,7 @@ _SIGNS = {
 
 
 def python_of(outputs: Sequence[Node], inputs: dict[Any, str]) -> list[str]:
-    """The lines of Python that compute a graph's outputs, and return them as a list."""
+    """Return the lines of Python that compute a graph's outputs, and return them as a list."""
     lines: list[str] = []
     names: dict[Node, str] = {}
     for node in needed(outputs):
@@ -91,7 +91,7 @@ def python_of(outputs: Sequence[Node], inputs: dict[Any, str]) -> list[str]:
 
 
 def expression(node: Node, given: Sequence[str]) -> str:
-    """A node as an expression of its arguments."""
+    """Return a node as an expression of its arguments."""
     operation = node.operation
     if operation is SELECT:
         return f"{given[1]} if {given[0]} else {given[2]}"

@@ -1,4 +1,4 @@
-"""A graph as formulas that a person can read, which are Python: it computes the same of them.
+"""Writes a graph as formulas that a person can read, which are Python: it computes the same.
 
 What is used more than once, unless that is short, and what would not fit in a line get lines of their
 own.
@@ -47,7 +47,7 @@ _KNOWN: dict[float, tuple[str, int]] = {
 
 
 class _Text(NamedTuple):
-    """A formula, and how tightly its last operation binds."""
+    """Holds a formula, and how tightly its last operation binds."""
 
     text: str
     binds: int
@@ -118,8 +118,8 @@ def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str]) -> _Text
         return _constant(node.value)
     if operation is SELECT:
         condition, yes, no = given
-        said = f"{yes.within(_OR)} if {condition.within(_OR)} else {no.within(_CHOICE)}"
-        return _Text(said, _CHOICE)
+        choice = f"{yes.within(_OR)} if {condition.within(_OR)} else {no.within(_CHOICE)}"
+        return _Text(choice, _CHOICE)
     if operation is POWER:
         return _Text(f"{given[0].within(_WHOLE)} ** {node.value}", _POWER)
     if operation is operator.neg:

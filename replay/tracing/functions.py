@@ -1,4 +1,4 @@
-"""Functions of models, traced: called as they are where kernels are plain Python, graphs elsewhere.
+"""Traces functions of models: called as they are where kernels are plain Python, graphs elsewhere.
 
 A model's function takes tuples of numbers, numbers, parameters (a NamedTuple of numbers), and sometimes
 arrays that it changes; it returns a tuple of numbers, or one number. What it is given is described by
@@ -38,7 +38,7 @@ _NOT_THEIRS = (Path(__file__).parent, Path(np.__file__).parent)
 
 
 class Shape(NamedTuple):
-    """An array of these sizes, which the function reads and changes."""
+    """Describes an array of these sizes, which the function reads and changes."""
 
     sizes: tuple[int, ...]
 
@@ -59,7 +59,7 @@ class Result(NamedTuple):
 
 
 class TracedFunction:
-    """A function of a model, with its graph."""
+    """Represents a function of a model, with its graph."""
 
     def __init__(self, function: Callable[..., Any], arguments: Sequence[Argument]) -> None:
         self.function = function
@@ -76,7 +76,7 @@ class TracedFunction:
 
     @cached_property
     def graph(self) -> Graph:
-        """The graph, with that of derivatives as they are asked for."""
+        """Return the graph, with that of derivatives as they are asked for."""
         return Graph()
 
     @cached_property
@@ -112,7 +112,7 @@ class TracedFunction:
 
 
 class Derivative:
-    """The values of a traced function and chosen derivatives, as one function that returns a tuple.
+    """Represents a function that gives the values of a traced function and chosen derivatives.
 
     Args:
         function: the function.
@@ -134,7 +134,7 @@ class Derivative:
 
     @cached_property
     def entries(self) -> dict[Any, Node]:
-        """The derivatives by place; zero where there is none."""
+        """Return the derivatives by place; zero where there is none."""
         trace = Trace(self.function.graph, {})
         returned = self.function.result.returned
         slopes = slopes_of(trace, returned, self._seeds(trace))
@@ -148,7 +148,7 @@ class Derivative:
 
     @property
     def outputs(self) -> list[Node]:
-        """The values and then the derivatives."""
+        """Return the values and then the derivatives."""
         return [*self.function.result.returned, *self.entries.values()]
 
     def kernel_identity(self) -> str:
@@ -281,10 +281,10 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
     try:
         return follow({})
     except Exception as error:
-        raise BadInput(f"{place_of(function, error)}: {_said(error)}") from error
+        raise BadInput(f"{place_of(function, error)}: {_reason(error)}") from error
 
 
-def _said(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """What stopped a function; what NumPy says of traced numbers in our words."""
     if isinstance(error, CannotTrace | BadInput):
         return str(error)
@@ -331,7 +331,7 @@ def _joined(graph: Graph, condition: Node, yes: Result, no: Result) -> Result:
 
 
 def place_of(function: Callable[..., Any], error: Exception | None = None) -> str:
-    """A function's name, with its file and line, or with those at which its own code stopped."""
+    """Return a function's name, with its file and line, or with those at which its own code stopped."""
     own = [
         frame
         for frame in (traceback.extract_tb(error.__traceback__) if error else ())
@@ -357,7 +357,7 @@ _KNOWN: dict[Any, tuple[TracedFunction, Reads | None]] = {}
 
 
 def traced(function: Any, *arguments: Argument) -> Any:
-    """A function as a traced one; the same again while it does the same.
+    """Return a function as a traced one; the same again while it does the same.
 
     It is called anew where what it reads has changed, or may have changed unseen; see `reads`.
     None for None, and what is traced already is as it was.

@@ -1,4 +1,4 @@
-"""Expression graphs: numbers that are made of others, each once, with what is known folded.
+"""Defines expression graphs: numbers that are made of others, each once, constants folded.
 
 A node is an operation of Python's or NumPy's on other nodes; equal nodes are one. What is simplified has
 the same bits, but for one thing: zero times anything is zero here, so that what does not depend on
@@ -41,7 +41,7 @@ _COMMUTATIVE = (operator.add, operator.mul)
 
 
 class Node:
-    """A number or a truth: an operation, what it is applied to, and a constant that goes with it."""
+    """Represents a number or a truth: an operation, what it is applied to, and its constant."""
 
     __slots__ = ("arguments", "is_truth", "number", "operation", "value")
 
@@ -65,7 +65,7 @@ class Node:
 
 
 class Graph:
-    """The nodes of one function, in the order in which they can be computed."""
+    """Holds the nodes of one function, in the order in which they can be computed."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -87,13 +87,13 @@ class Graph:
         return self._node(INPUT, (), place, (INPUT, place))
 
     def constant(self, value: Any) -> Node:
-        """A number, or a truth."""
+        """Return a number, or a truth."""
         value = bool(value) if isinstance(value, bool | np.bool_) else float(value)
         sign = math.copysign(1.0, value)
         return self._node(CONSTANT, (), value, (CONSTANT, type(value), sign, repr(value)))
 
     def power(self, base: Node, exponent: int) -> Node:
-        """A number to the power of an integer: by multiplication."""
+        """Return a number to the power of an integer: by multiplication."""
         if exponent == 1:
             return base
         if exponent == 0:
@@ -113,7 +113,7 @@ class Graph:
         )
 
     def apply(self, operation: Any, *arguments: Node) -> Node:
-        """An operation on nodes, or what is known to be the same."""
+        """Return an operation on nodes, or what is known to be the same."""
         if all(each.is_constant for each in arguments):
             return self.constant(evaluated(operation, *(each.value for each in arguments)))
         simpler = self._simpler(operation, arguments)
@@ -181,7 +181,7 @@ def _power(base: float, exponent: int) -> float:
 
 
 def needed(outputs: Iterable[Node], known: Collection[Node] = ()) -> list[Node]:
-    """All nodes that some are made of, and these, in the order in which they can be computed.
+    """Return all nodes that some are made of, and these, in the order in which they can be computed.
 
     What is known already stands among them, and nothing that only this is made of.
     """
@@ -223,6 +223,6 @@ def described(outputs: Iterable[Node]) -> Iterator[str]:
         parts = [words[each] for each in node.arguments]
         if node.operation in _COMMUTATIVE:
             parts.sort()
-        said = f"{name} {' '.join(parts)} {node.value!r}"
-        words[node] = blake2b(said.encode(), digest_size=16).hexdigest()
+        text = f"{name} {' '.join(parts)} {node.value!r}"
+        words[node] = blake2b(text.encode(), digest_size=16).hexdigest()
     yield from (words[each] for each in outputs)

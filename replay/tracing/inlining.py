@@ -1,4 +1,4 @@
-"""Graphs as parts of others: what a traced function gives when it is called with traced numbers."""
+"""Inlines graphs in others: a traced function that is called with traced numbers."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ from replay.tracing.traced import Trace, Traced
 
 
 class Parameters:
-    """The parameters of a function that is traced."""
+    """Holds the parameters of a function that is traced."""
 
     def __init__(self, trace: Trace, argument: int, names: tuple[str, ...]) -> None:
         self.trace, self._argument, self._names = trace, argument, names

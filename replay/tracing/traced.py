@@ -1,4 +1,4 @@
-"""Traced numbers: what a model's function is called with so that its graph is known afterwards.
+"""Defines traced numbers: a model's function is called with them, and its graph is known after.
 
 They work with Python's operators and with NumPy's functions of numbers, also inside arrays of objects. A
 condition that depends on them is tried both ways (see `functions`). What would freeze a value that is
@@ -34,13 +34,13 @@ _INTO_AN_ARRAY = re.compile(r"\]\s*\S{0,2}=(?!=)")  # `a[k] = x`, `a[k] += x`
 
 
 def refused(what: str) -> CannotTrace:
-    """The sentence for something that is refused."""
+    """Return the sentence for something that is refused."""
     mend = _MENDS.get(what, "write it with operators, np.where and functions such as np.exp")
     return CannotTrace(f"it uses {what} of a number that is not known before; {mend}")
 
 
 def too_many_ways() -> CannotTrace:
-    """The sentence for conditions that are too many, also of a loop that does not end."""
+    """Return the sentence for conditions that are too many, also of a loop that does not end."""
     return CannotTrace(
         f"there are more than {MOST_WAYS} ways through its `if`s and `while`s of numbers that are not "
         "known before; write np.clip or np.where, and a fixed number of rounds"
@@ -48,7 +48,7 @@ def too_many_ways() -> CannotTrace:
 
 
 class Traced(np.lib.mixins.NDArrayOperatorsMixin):
-    """A number of a graph that grows as it is used."""
+    """Represents a number of a graph that grows as it is used."""
 
     __slots__ = ("node", "trace")
 
@@ -124,11 +124,11 @@ class Trace:
         return self.decisions[node]
 
     def number(self, node: Node) -> Traced:
-        """A node as a traced number."""
+        """Return a node as a traced number."""
         return Traced(self, node)
 
     def node_of(self, value: Any) -> Node:
-        """The node of a traced number or a known one."""
+        """Return the node of a traced number or a known one."""
         if isinstance(value, Traced):
             return value.node
         return self.graph.constant(value)

@@ -16,21 +16,12 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[2]
-ROOMS = ("recorders", "replay", "pipeline")
-PATHS = [path.relative_to(ROOT) for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+from tests.house import sources
+from tests.house.sources import ROOT, nodes_of, text_of
+
+PATHS = [path for path in sources.PATHS if path.parts[0] != "fuselog"]  # whose names are of others
 DOTTED = re.compile(r"`([A-Za-z]\w*(?:\.[A-Za-z]\w*)+)(?:\(.*?\))?`")
 PATH = re.compile(r"(?<![\w./])(?:recorders|replay|pipeline|tests|docs|data)/[\w./-]*\w")
-
-
-@cache
-def text_of(path: Path) -> str:
-    return (ROOT / path).read_text(encoding="utf-8")
-
-
-@cache
-def nodes_of(path: Path) -> list[ast.AST]:
-    return list(ast.walk(ast.parse(text_of(path))))
 
 
 def bound_in(statements: list[ast.stmt]) -> Iterator[str]:

@@ -8,12 +8,9 @@ import re
 from collections import Counter
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-FILES = {
-    path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
-    for room in ("fuselog", "pipeline", "recorders", "replay")
-    for path in sorted((ROOT / room).rglob("*.py"))
-}
+from tests.house.sources import PATHS, ROOT, text_of, tree_of
+
+FILES = {path.as_posix(): text_of(path) for path in PATHS}
 MODULES, LEAVES, LINES, PARAMETERS = 12, 20, 400, 8
 
 # Rooms of leaves, which one enters by a family's name.
@@ -89,8 +86,8 @@ def test_files_fit_in_a_head() -> None:
 
 def test_functions_have_few_parameters() -> None:
     wide: dict[str, set[str]] = {}
-    for name, text in FILES.items():
-        for each in functions_of(ast.parse(text)):
+    for name in FILES:
+        for each in functions_of(tree_of(Path(name))):
             if parameters_of(each) > PARAMETERS and not is_command(each) and not is_kernel(name, each):
                 wide.setdefault(name, set()).add(each.name)
     assert wide == WIDER
@@ -98,10 +95,10 @@ def test_functions_have_few_parameters() -> None:
 
 def test_packages_open_with_what_belongs_there_and_where_to_begin() -> None:
     """What they name as the beginning is a file or a room in them."""
-    for name, text in FILES.items():
+    for name in FILES:
         folder, _, file = name.rpartition("/")
         if file == "__init__.py" and folder != "fuselog":
-            opening = ast.get_docstring(ast.parse(text)) or ""
+            opening = ast.get_docstring(tree_of(Path(name))) or ""
             assert opening.partition("\n\n")[0].endswith("."), name
             begin = re.search(
                 r"\b[Bb]egin (?:reading in|here|with) ?((?:`[\w.]+`|, then | and )*)", opening

@@ -305,7 +305,7 @@ DRAWN = [
     Fault(
         "recorders/simulators/vehicles.py",
         "seen, everyone, sensor_rng)",
-        "seen, told, sensor_rng)",
+        "seen, is_received, sensor_rng)",
         "tests/recorders/test_vehicles.py tests/recorders/test_plausibility.py tests/pipeline/test_spans.py",
     ),
     Fault(
@@ -334,8 +334,8 @@ DRAWN = [
     ),
     Fault(
         "replay/engine/replaying/monitor.py",
-        "self._told.setdefault(topic, []).append(each)\n                continue",
-        "self._told.setdefault(topic, []).append(each)",
+        "self._failures.setdefault(topic, []).append(each)\n                continue",
+        "self._failures.setdefault(topic, []).append(each)",
         "tests/replay/engine/test_estimator_api_messages.py tests/replay/engine/test_estimator_api.py tests/replay/engine/test_failing_runs.py",
     ),
     Fault(
@@ -850,8 +850,8 @@ DRAWN = [
     ),
     Fault(
         "pipeline/tuning/objective.py",
-        "self._told.append(told)",
-        "self._told.insert(0, told)",
+        "self._counts.append(count)",
+        "self._counts.insert(0, count)",
         "tests/pipeline/test_tuning.py",
     ),
     Fault(

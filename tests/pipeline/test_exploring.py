@@ -234,9 +234,7 @@ def test_the_page_draws_and_says_what_was_replayed(
     is_out = {"Error of y (m)": most > sigma, "NIS per component": None, "NEES": None}
     low, high = case.nees_interval
     is_out["NEES"] = (case.errors.nees < low) | (case.errors.nees > high)
-    is_out["NIS per component"] = (case.nis.mean < case.nis.low) | (
-        case.nis.mean > case.nis.high
-    )
+    is_out["NIS per component"] = (case.nis.mean < case.nis.low) | (case.nis.mean > case.nis.high)
     for (words, outside), name in zip(is_out.items(), ("error", "nis", "nees"), strict=True):
         share = np.mean(outside)
         said = f"{words}: outside {100 * share:.{int(share < 0.1)}f} %; 5 % is right"

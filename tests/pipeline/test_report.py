@@ -32,7 +32,7 @@ from pipeline.output.charts import (
 from pipeline.output.claims import Claim
 from pipeline.output.report import write_report
 from pipeline.output.report.first_run import Followed
-from pipeline.output.report.kinds import said
+from pipeline.output.report.kinds import run_sentences
 from pipeline.output.report.naming import DARK, LIGHT, contrast, text_colours
 from pipeline.output.report.scene import typical_second
 from pipeline.output.results import Outcome, read_result, result_folder, write_outcome
@@ -225,10 +225,10 @@ def test_a_comparison_and_a_sweep_open_with_their_verdicts(
     assert fuselog("compare", *logs, "-e", "ekf", "-e", "ukf", "--out", compare).code == 0
     over = ["--over", "ekf.sigma_range_m=0.05:0.2:log3", "--set", "duration_s=2", "--runs", "2"]
     assert fuselog("sweep", "landmarks", *over, "--out", sweep).code == 0
-    tried, came = said(read_result(compare), compare)
+    tried, came = run_sentences(read_result(compare), compare)
     assert tried == "ekf and ukf over the same 5 runs, run by run."
     assert "Over 5 runs" in came
-    tried, came = said(read_result(sweep), sweep)
+    tried, came = run_sentences(read_result(sweep), sweep)
     assert tried.startswith(
         "Standard deviation of a range (ekf.sigma_range_m) from 0.05 to 0.2 m: 3 points, 2 runs of "
         "landmarks at each"
@@ -261,7 +261,7 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     assert (cause.estimator, key) == ("ekf", "ekf.sigma_range_m")
     assert float(value) == pytest.approx(0.1, rel=0.15)
     assert cause.mended.startswith("With that, over 2 runs: position error, RMS ")
-    assert f"The likeliest cause: {cause.short}." in said(read_result(folder), folder)[1]
+    assert f"The likeliest cause: {cause.short}." in run_sentences(read_result(folder), folder)[1]
     write_report([folder], tmp_path / "page.html")
     assert f"<code>--set {cause.setting}</code>" in (tmp_path / "page.html").read_text(encoding="utf-8")
     again = fuselog("run", "landmarks", *broken, "--out", folder)  # which is ours still
@@ -321,10 +321,10 @@ def test_a_damaged_or_older_result_is_one_sentence(
 ) -> None:
     shutil.copytree(result, tmp_path / "r")
     damage(tmp_path / "r")
-    said = fuselog("report", str(tmp_path / "r"), "-o", str(tmp_path / "page.html"))
-    assert said.code == 2
-    assert len(said.err.splitlines()) == 1
-    assert all(part in said.err for part in parts), said.err
+    run_sentences = fuselog("report", str(tmp_path / "r"), "-o", str(tmp_path / "page.html"))
+    assert run_sentences.code == 2
+    assert len(run_sentences.err.splitlines()) == 1
+    assert all(part in run_sentences.err for part in parts), run_sentences.err
     assert not (tmp_path / "page.html").exists()
 
 
@@ -397,17 +397,17 @@ def shown(request: pytest.FixtureRequest, browser: Any, page_file: Path) -> Iter
     """The page in windows of each width and colour scheme, drawn; no error, and nothing is fetched."""
     width, scheme = request.param
     page = browser.new_page(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    said: list[str] = []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
-    page.on("request", lambda request: said.append(request.url))
+    run_sentences: list[str] = []
+    page.on("console", lambda message: run_sentences.append(message.text))
+    page.on("pageerror", lambda error: run_sentences.append(str(error)))
+    page.on("request", lambda request: run_sentences.append(request.url))
     page.goto(page_file.as_uri())
     page.locator(".looks figure").first.scroll_into_view_if_needed()  # drawn when it comes near
     page.wait_for_selector(".plot .main-svg")
     page.evaluate("scrollTo(0, 0)")
     yield page
     page.close()
-    assert [each for each in said if not each.startswith(("file:", "data:"))] == []
+    assert [each for each in run_sentences if not each.startswith(("file:", "data:"))] == []
 
 
 def test_in_a_browser_the_verdict_and_the_cards_are_seen_at_once(shown: Any) -> None:

@@ -64,7 +64,7 @@ def test_the_local_level_of_the_nile() -> None:
     variances = found.parameters["value"] ** 2
     assert variances.tolist() == pytest.approx([15098.518, 1469.176], rel=1e-5)
     assert 0.5 * np.log(variance) - found.costs[1] == pytest.approx(-633.464563636, abs=1e-6)
-    told = found.found.told
+    told = found.found.confidence
     assert told is not None
     assert (2.0 * told.errors).tolist() == pytest.approx([0.2083, 0.8715], abs=5e-5)
     eigenvalues = np.linalg.eigvalsh(told.curvature)
@@ -80,7 +80,7 @@ def test_the_robot_of_the_sheet() -> None:
     sigmas = found.parameters["value"] / [DENSITY, DENSITY, 1.0, 1.0]
     assert sigmas.tolist() == pytest.approx([0.07487878, 0.04285785, 0.18738070, 0.02942065], rel=1e-4)
     assert -found.costs[1] == pytest.approx(425.88893017, abs=1e-7)
-    told = found.found.told
+    told = found.found.confidence
     assert told is not None
     assert told.errors.tolist() == pytest.approx([0.442, 0.1724, 0.0526, 0.0598], rel=2e-3)
     assert np.linalg.eigvalsh(told.curvature).tolist() == pytest.approx(

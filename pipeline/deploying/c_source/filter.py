@@ -1,4 +1,4 @@
-"""The source of a filter in C99, of the graphs of its steps."""
+"""Writes the source of a filter in C99 from the graphs of its steps."""
 
 import re
 
@@ -77,11 +77,11 @@ def _as_tuned(made: CFilter) -> str:
         if part != "motion":
             bounds = [number(each) for each in made.filtering.gates[row - 1][: made.most + 1]]
             options = made.robustness(row)
-            said = [
+            settings = [
                 f".{name} = {number(value) if name != 'reopens_s' else repr_double(value)}"
                 for name, value in options.items()
             ]
-            entries.append(f".gate = {{.nis = {{{', '.join(bounds)}}}, {', '.join(said)}}}")
+            entries.append(f".gate = {{.nis = {{{', '.join(bounds)}}}, {', '.join(settings)}}}")
         entries = entries or [".unused = 0"]
         lines.append(
             f"    .{part} = {{" + ",".join(f"\n        {each}" for each in entries) + "\n    },"

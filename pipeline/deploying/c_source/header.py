@@ -1,4 +1,4 @@
-"""The header of a filter in C99: types, names of components, functions."""
+"""Writes the header of a filter in C99: types, names of components, functions."""
 
 from collections.abc import Iterator, Sequence
 
@@ -98,10 +98,10 @@ def _struct(made: CFilter) -> Iterator[str]:
     for part, values in made.values.items():
         yield "    struct {"
         for name in values:
-            told = " ".join(meaning.get(name, "").split()).replace("*/", "")
+            words = " ".join(meaning.get(name, "").split()).replace("*/", "")
             unit = unit_of(name)
             comment = ", ".join(
-                filter(None, (told.rstrip("."), f"in {unit}" if unit and unit not in told else ""))
+                filter(None, (words.rstrip("."), f"in {unit}" if unit and unit not in words else ""))
             )
             yield f"        {made.precision.real} {identifier(name)};" + (
                 f" /* {comment} */" if comment else ""

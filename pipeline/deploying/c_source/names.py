@@ -1,4 +1,4 @@
-"""What is written of a filter in C99: its names, sizes and numbers, and the text that they fill in."""
+"""Names what is written of a filter in C99: names, sizes and numbers, and the text they fill in."""
 
 import re
 from hashlib import sha256

@@ -1,4 +1,4 @@
-"""The functions of a filter in C that predict: over a step, between two controls, and over a gap."""
+"""Writes a C filter's functions that predict: over a step, between two controls, over a gap."""
 
 import re
 

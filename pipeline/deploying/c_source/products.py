@@ -1,4 +1,4 @@
-"""Products of covariances with Jacobians in C, as loops over the entries that are not known to be zero.
+"""Writes products of covariances with Jacobians in C, as loops over entries not known to be zero.
 
 Sums keep the order of `replay.inference.linear_algebra.sparse`. Names as in `algebra`; `columns` lists
 those of a matrix row by row, each row ended by -1.

@@ -1,4 +1,4 @@
-"""Functions at weighted samples in C, operation by operation `replay.inference.kalman.regression`.
+"""Writes functions at weighted samples in C, as `replay.inference.kalman.regression` has them.
 
 Names as in `algebra`; SAMPLES, DRAWN, VALUES and PLACES are how many samples, numbers of one, tangent
 components and components of a function's values there are at most.

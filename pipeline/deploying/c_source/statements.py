@@ -1,4 +1,4 @@
-"""Names, declarations and loops that the functions of a filter in C are put together of."""
+"""Writes the names, declarations and loops that a C filter's functions are put together of."""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""The functions of a filter in C that update it: what its sensors measure, and how the state moves."""
+"""Writes a C filter's functions that update it: what sensors measure, how the state moves."""
 
 import re
 

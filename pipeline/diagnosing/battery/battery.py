@@ -1,4 +1,4 @@
-"""The battery: cars with one fault planted, and how often it is the first that a diagnosis names.
+"""Counts how often the planted fault of a car's log is the first that a diagnosis names.
 
 The inertial unit's faults are told without a filter.
 """
@@ -23,7 +23,7 @@ from pipeline.diagnosing.findings import FIRST, without_filter
 from pipeline.diagnosing.hypotheses.hypothesis import Kind
 from pipeline.runs.ensemble import Progress
 from recorders.plausibility.checks import findings
-from recorders.plausibility.finding import Cause as Told
+from recorders.plausibility.finding import Cause as Estimated
 
 ODOMETRY, FIX, HEADING = "/car/odometry", "/car/fix", "/car/heading"
 UNIT, VELOCITY = "/car/inertial", "/car/velocity"
@@ -31,7 +31,7 @@ UNIT_RUNS = 5  # of each fault of the unit, for one of each cell: they cost a te
 
 
 class Right(NamedTuple):
-    """What a diagnosis should name: kind, topic, component, and the number if it has one."""
+    """States what a diagnosis should name: kind, topic, component, and the number if it has one."""
 
     kind: Kind
     topic: str
@@ -87,7 +87,7 @@ SPREADS: dict[str, tuple[float, float]] = {
     "compass + 4.5 deg": (0.00165, np.nan),
 }
 # Of the unit's faults: what is told, of which topic, and the number.
-UNIT_RIGHT: dict[str, tuple[Told, str, float] | None] = {
+UNIT_RIGHT: dict[str, tuple[Estimated, str, float] | None] = {
     "nothing": None,
     "accelerometer in g": ("gravity", UNIT, 1.0 / 9.80665),
     "gravity's sign": ("gravity", UNIT, -1.0),
@@ -111,7 +111,7 @@ PAIRS = (
 
 
 class Cell(NamedTuple):
-    """A fault, and what the log has beside wheels and fixes."""
+    """Describes a planted fault, and what the log has beside wheels and fixes."""
 
     fault: str
     has_compass: bool
@@ -119,13 +119,13 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The fault with what the log has."""
+        """Return the fault with what the log has."""
         more = [*["compass"] * self.has_compass, *["prior"] * self.has_prior]
         return ", ".join([self.fault, *more])
 
 
 def cells(*, has_prior: bool = False) -> Iterator[Cell]:
-    """All faults, with a compass and, those that are not of it, without."""
+    """Yield all faults, with a compass and, those that are not of it, without."""
     for has_compass in (True, False):
         for fault in FAULTS:
             if has_compass or not fault.startswith("compass"):
@@ -170,16 +170,16 @@ def tried(cell: Cell, seed: int, most: int = 1) -> dict[str, Any]:
 
 def unit_tried(fault: str, seed: int) -> dict[str, Any]:
     """Plant a fault into the unit's log, and see whether it is what is told without a filter."""
-    told = findings(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
+    found = findings(recorded_unit(UNIT_FAULTS[fault](ride(seed))).streams)
     right = UNIT_RIGHT[fault]
-    named = [(each.cause, each.topic) for each in told]
+    named = [(each.cause, each.topic) for each in found]
     return {
         "fault": fault,
         "seed": seed,
         "findings": len(named),
         "is_first": named[:1] == [right[:2]] if right else not named,
         "first": " ".join(named[0]) if named else "",
-        "value": abs(told[0].value) if told else np.nan,  # of half a turn the sign says nothing
+        "value": abs(found[0].value) if found else np.nan,  # of half a turn the sign says nothing
     }
 
 
@@ -201,9 +201,9 @@ def _named(cause: Cause) -> Iterator[Right]:
     """What a cause names, and what the log does not tell from it; factors of noise as logarithms."""
     for each in (cause, *cause.others):
         kind, topic = each.hypothesis.kind, each.hypothesis.topic
-        for told in each.numbers:
-            value = np.log(told.value) if kind.endswith(" noise") else told.value
-            yield Right(kind, topic, told.part, value)
+        for estimate in each.numbers:
+            value = np.log(estimate.value) if kind.endswith(" noise") else estimate.value
+            yield Right(kind, topic, estimate.part, value)
 
 
 def results(
@@ -268,7 +268,7 @@ def metrics_of(rows: pd.DataFrame) -> dict[str, float]:
 
 
 def unit_metrics(rows: pd.DataFrame) -> dict[str, float]:
-    """The runs of the unit whose fault is told first, and the spread of the number, by fault."""
+    """Return the runs of the unit whose fault is told first, and the spread of the number, by fault."""
     found = {"diagnosis.unit_runs": float(rows.groupby("fault")["seed"].size().max())}
     for fault, own in rows.groupby("fault", sort=False):
         found[f"diagnosis.unit_first.{_case(str(fault))}"] = float(own["is_first"].sum())

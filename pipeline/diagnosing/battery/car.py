@@ -1,4 +1,4 @@
-"""A car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; with and without prior.
+"""Simulates a car that drives after 10 s at rest: wheels, a gyroscope, fixes, a compass; prior or none.
 
 Its faults by name, the inertial unit that may ride with it, with its own, and logs of both. Faults are
 put into the columns themselves, not by what a diagnosis undoes them with.
@@ -23,7 +23,7 @@ START_SIGMAS = np.array([1.0, 1.0, 0.1])  # of a prior, in m and rad
 
 
 class Truth(NamedTuple):
-    """How the car drives: speeds and turn rates (n,) that hold a step each, poses (n + 1, 3) between."""
+    """Describes how the car drives: speeds, turn rates (n,) of each step, poses (n + 1, 3) between."""
 
     step_s: float
     speed_mps: Floats
@@ -40,7 +40,7 @@ class Truth(NamedTuple):
 
 
 class Car(NamedTuple):
-    """What a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
+    """Holds what a log of the car has: stamps in s, SI units; the heading anticlockwise from east."""
 
     seed: int
     truth: Truth
@@ -64,12 +64,12 @@ def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s:
 
 
 def philox(key: int) -> np.random.Generator:
-    """The sheet's P(key)."""
+    """Return the sheet's P(key)."""
     return np.random.Generator(np.random.Philox(key=key))
 
 
 def drive(seed: int, step_s: float = 0.1) -> Car:
-    """The car without a fault."""
+    """Return the car without a fault."""
     rng, n = philox(seed), round(DURATION_S / step_s)
     start_rad = 2.0 * np.pi * rng.uniform()
     odometry, fixes = rng.standard_normal((n, 2)), rng.standard_normal((201, 2))
@@ -156,7 +156,7 @@ FAULTS: dict[str, Callable[[Car], Car]] = {
 
 
 def faulty(seed: int, *names: str) -> Car:
-    """The car with one of the `FAULTS`, or with several, put one after the other."""
+    """Return the car with one of the `FAULTS`, or with several, put one after the other."""
     return reduce(lambda car, name: FAULTS[name](car), names, drive(seed))
 
 
@@ -166,7 +166,7 @@ def stamps_ns(times_s: Floats) -> NDArray[np.int64]:
 
 
 def recorded(car: Car, *, has_compass: bool = True, has_prior: bool = False) -> MemorySource:
-    """The car as a log, which `fl.write` writes; a prior is about the true start."""
+    """Return the car as a log, which `fl.write` writes; a prior is about the true start."""
     n, half = len(car.fix_s), 0.5 * car.compass_rad
     zero = np.zeros_like(half)
     wheels = make_stream(
@@ -211,7 +211,7 @@ def source(streams: list[Stream]) -> MemorySource:
 
 
 def car(seed: int, stated: float = 1.0) -> MemorySource:
-    """The log without a compass; its fixes state so many times their variance."""
+    """Return the log without a compass; its fixes state so many times their variance."""
     clean = drive(seed)
     return recorded(clean._replace(fix_variance_m2=stated * clean.fix_variance_m2), has_compass=False)
 
@@ -220,7 +220,7 @@ def car(seed: int, stated: float = 1.0) -> MemorySource:
 
 
 class Unit(NamedTuple):
-    """An inertial unit on the car, and velocities (m, 2) east and north of a receiver."""
+    """Describes an inertial unit on the car, and velocities (m, 2) east and north of a receiver."""
 
     sample_s: Floats
     force_mps2: Floats
@@ -230,7 +230,7 @@ class Unit(NamedTuple):
 
 
 def ride(seed: int) -> Unit:
-    """The unit without a fault."""
+    """Return the unit without a fault."""
     truth, rng = drive(seed, 0.02).truth, philox(seed + 500_000)
     n = len(truth.speed_mps)
     force, turn = rng.standard_normal((n, 3)), rng.standard_normal(n)
@@ -278,7 +278,7 @@ UNIT_FAULTS: dict[str, Callable[[Unit], Unit]] = {
 
 
 def recorded_unit(unit: Unit) -> MemorySource:
-    """The log of the unit and of the receiver's velocities."""
+    """Return the log of the unit and of the receiver's velocities."""
     zero = np.zeros_like(unit.turn_radps)
     samples = make_stream(
         "/car/inertial",

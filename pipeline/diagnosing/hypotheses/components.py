@@ -1,4 +1,4 @@
-"""Faults of the numbers that are read of a topic: factors, signs, biases, axes, conventions."""
+"""Tries faults of the numbers read of a topic: factors, signs, biases, axes, conventions."""
 
 from collections.abc import Iterator, Mapping
 from itertools import combinations
@@ -36,7 +36,7 @@ PROBED = 64  # messages, by which is found what is read
 
 
 class Entry(NamedTuple):
-    """One number of a topic's messages that is read.
+    """Describes one number of a topic's messages that is read.
 
     Attributes:
         field, place: where it stands; a heading is of the field `quaternion`.
@@ -55,12 +55,12 @@ class Entry(NamedTuple):
 
     @property
     def is_heading(self) -> bool:
-        """Whether it is the heading of orientations."""
+        """Tell whether it is the heading of orientations."""
         return self.field == "quaternion"
 
 
 def entries_of(stream: Stream, reading: Reading | None) -> list[Entry]:
-    """The numbers of a topic that are read: those whose change changes what is read.
+    """Return the numbers of a topic that are read: those whose change changes what is read.
 
     Where it is not known what is read, all numbers, and the entries of positions and velocities.
     """
@@ -115,7 +115,7 @@ def _changed(reading: Reading, before: Stream, after: Stream) -> list[int]:
 def of_components(
     stream: Stream, reading: Reading | None, parameters: Parameters | None, first_ns: int
 ) -> Iterator[Hypothesis]:
-    """All faults of the numbers of a topic; `first_ns` is where a bias begins to grow."""
+    """Yield all faults of the numbers of a topic; `first_ns` is where a bias begins to grow."""
     is_control = reading is not None and stream.topic in reading.controls
     entries = entries_of(stream, reading)
     if "latitude_deg" in stream.columns:
@@ -147,7 +147,7 @@ def of_components(
 
 
 class _Own(NamedTuple):
-    """The parameters that a number of a topic has: what is added to it, and what it is multiplied by.
+    """Names the parameters that a number of a topic has: its bias, and its factor.
 
     `bias_sign` is by what a bias of the number is multiplied for the parameter's, whose value is
     `bias_value`.
@@ -173,7 +173,7 @@ class _Own(NamedTuple):
 def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypothesis:
     units = UNITS.get(unit_of(entry.name), {})
     specials = {float(np.log(size)): f"{name} are" for name, size in units.items()}
-    specials |= {-at: f"{said} that are converted twice" for at, said in specials.items()}
+    specials |= {-at: f"{meaning} that are converted twice" for at, meaning in specials.items()}
 
     def words(at: float, low: float, high: float) -> str:
         more = f", as {specials[at]}" if at in specials else ""
@@ -197,7 +197,7 @@ def _factor(topic: str, entry: Entry, stretch: float, own: _Own | None) -> Hypot
         words,
         mend,
         specials,
-        told=lambda at: float(np.exp(at)),
+        reported=lambda at: float(np.exp(at)),
     )
 
 
@@ -213,17 +213,17 @@ def _sign(topic: str, entry: Entry) -> Hypothesis:
         lambda *_: f"{topic}: {entry.name} has the wrong sign",
         lambda _: Advice(f"{topic}.{bare(entry.name)}_scale", -1),
         IS_SO,
-        told=lambda _: -1.0,
+        reported=lambda _: -1.0,
     )
 
 
 def _bias(topic: str, entry: Entry, own: _Own | None) -> Hypothesis:
     def words(at: float, low: float, high: float) -> str:
         is_so, size, least, most = in_sense(at, low, high)
-        said = f"{topic}: {entry.name} is {is_so} by {number(size)} ({number(least)} to {number(most)})"
+        bias = f"{topic}: {entry.name} is {is_so} by {number(size)} ({number(least)} to {number(most)})"
         if not entry.is_angle:
-            return said
-        return f"{said}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
+            return bias
+        return f"{bias}, or the sensor's frame is turned by {np.degrees(-at):.2g} deg, which is the same"
 
     def mend(at: float) -> Advice:
         if own and own.bias:
@@ -336,7 +336,7 @@ def _of_heading(topic: str, first_ns: int, span_s: float) -> Iterator[Hypothesis
         lambda *_: f"{topic}: the heading has the wrong sign",
         lambda _: Advice(f"{topic}.heading_scale", -1),
         IS_SO,
-        told=lambda _: -1.0,
+        reported=lambda _: -1.0,
     )
     yield Hypothesis(
         "convention",

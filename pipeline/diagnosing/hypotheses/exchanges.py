@@ -1,4 +1,4 @@
-"""Faults of numbers: two of a map, or two topics, stand for each other."""
+"""Tries faults of numbers: two of a map, or two topics, stand for each other."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import combinations

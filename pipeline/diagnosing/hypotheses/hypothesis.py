@@ -44,7 +44,7 @@ BY_CHANCE = float(chi2.isf(0.001, PARTS - 1)) / (PARTS - 1)  # an inflation in 1
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One way in which a log or its settings may be wrong.
+    """Describes one way in which a log or its settings may be wrong.
 
     Attributes:
         kind: what those that cannot be told apart have in common.
@@ -59,7 +59,7 @@ class Hypothesis:
         specials: numbers that are tried as they are, with what they mean, such as a unit.
         size: of how many numbers it is.
         floor: of the magnitude: what is less is no fault.
-        told: the number as tables have it: a factor, where it is searched by its logarithm.
+        reported: the number as tables have it: a factor, where it is searched by its logarithm.
     """
 
     kind: Kind
@@ -73,16 +73,16 @@ class Hypothesis:
     specials: Mapping[float, str] = field(default_factory=dict)
     size: int = 1
     floor: float = 0.0
-    told: Callable[[float], float] = float
+    reported: Callable[[float], float] = float
 
     @property
     def has_end(self) -> bool:
-        """Whether what lies beyond the limit is not searched; an angle is, where it comes round."""
+        """Tell whether what lies beyond the limit is not searched; an angle is, where it comes round."""
         return bool(self.tried) and self.size == 1 and self.limit not in (np.pi, np.inf)
 
     @property
     def name(self) -> str:
-        """What it is of, in a few words."""
+        """Return what it is of, in a few words."""
         return " ".join(filter(None, (self.kind, self.topic, self.part)))
 
 
@@ -93,7 +93,7 @@ IS_SO: Mapping[float, str] = {1.0: ""}  # the numbers of what is so, or is not
 def in_topic(
     topic: str, alteration: alter.Alteration, stretched: float = 0.0
 ) -> Callable[[Trial, Any], Trial]:
-    """The trial with the opposite of an alteration of a topic.
+    """Return the trial with the opposite of an alteration of a topic.
 
     `stretched` is by how much the number stretches what is measured, see `Trial`.
     """
@@ -111,7 +111,7 @@ def in_topic(
 
 
 def has(parameters: Parameters | None, name: str) -> bool:
-    """Whether there is a parameter of this name."""
+    """Tell whether there is a parameter of this name."""
     return parameters is not None and name in type(parameters).model_fields
 
 
@@ -125,14 +125,14 @@ def times(at: float, low: float, high: float) -> str:
 
 
 def size_of(at: float) -> str:
-    """Whether it is too small or too large by so much."""
+    """Say whether it is too small or too large by so much."""
     return "small" if at > 0.0 else "large"
 
 
 def in_sense(
     at: float, low: float, high: float, words: tuple[str, str] = ("too large", "too small")
 ) -> tuple[str, float, float, float]:
-    """The word for a number's sign, the number's size, and its interval in that sense.
+    """Return the word for a number's sign, the number's size, and its interval in that sense.
 
     >>> in_sense(-0.3, -0.4, -0.2)
     ('too small', 0.3, 0.2, 0.4)
@@ -143,7 +143,7 @@ def in_sense(
 
 
 def gains_over(likelihood: Likelihood, now: Trial) -> GainsOf:
-    """What undoing faults of these numbers, each by itself, gains over a trial."""
+    """Return what undoing faults of these numbers, each by itself, gains over a trial."""
     [before] = likelihood([now])
     return lambda asked: [
         found - before for found in likelihood([each.without(now, at) for each, at in asked])

@@ -1,4 +1,4 @@
-"""All that may be wrong of a run and the estimator that is bound to it."""
+"""Lists all that may be wrong of a run and the estimator that is bound to it."""
 
 from collections.abc import Mapping, Sequence
 
@@ -27,7 +27,7 @@ def hypotheses(
     innovations: Mapping[str, Stream],
     readings: Mapping[str, Reading],
 ) -> list[Hypothesis]:
-    """All that may be wrong.
+    """Return all that may be wrong.
 
     Args:
         bound: what is estimated.

@@ -1,4 +1,4 @@
-"""Faults of the origin that positions are given from, or geodetic fixes are taken into a plane by."""
+"""Tries faults of the origin of positions, or of the plane that geodetic fixes are taken into."""
 
 from collections.abc import Callable, Iterator
 

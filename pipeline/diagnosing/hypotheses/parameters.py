@@ -1,4 +1,4 @@
-"""Faults of parameters: noise, what may be estimated beside the state, and the gate."""
+"""Tries faults of parameters: noise, what may be estimated beside the state, and the gate."""
 
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ STEPS = {"m": 0.3, "s": 0.05, "rad": 0.03, "rad/s": 0.01, "m/s": 0.1, "m/s^2": 0
 def of_noises(
     bound: Sequence[Bound], source: MemorySource, readings: Mapping[str, Reading]
 ) -> Iterator[Hypothesis]:
-    """The noise that the estimator's parameters state, channels for them, or that is assumed."""
+    """Yield the noise that the estimator's parameters state, channels for them, or that is assumed."""
     parameters = bound[0].parameters
     if parameters is None:
         return
@@ -72,7 +72,7 @@ def _noise(name: str, what: str, value: float, kind: Kind) -> Hypothesis:
     def mend(at: float) -> Advice:
         return Advice(name, rounded(value * np.exp(at)), free=name)
 
-    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor)
+    return Hypothesis(kind, name, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor)
 
 
 def _noise_of(
@@ -88,7 +88,7 @@ def _noise_of(
 
 
 def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
-    """The covariances that messages state, or their channel for them."""
+    """Yield the covariances that messages state, or their channel for them."""
     fields = [
         (field, alter.spread(field))
         for field in ("covariance_m2", "covariance_m2ps2", "covariance")
@@ -99,8 +99,8 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
     for field, spread in fields:
 
         def words(at: float, low: float, high: float, field: str = field) -> str:
-            said = f"of {field} the standard deviation is {times(at, low, high)}"
-            return f"{stream.topic}: {said}, so that R is too {size_of(at)}"
+            changes = f"of {field} the standard deviation is {times(at, low, high)}"
+            return f"{stream.topic}: {changes}, so that R is too {size_of(at)}"
 
         def mend(at: float) -> Advice:
             return Advice(f"{stream.topic}.covariance_scale", precise(np.exp(2.0 * at)))
@@ -109,7 +109,7 @@ def of_covariances(stream: Stream) -> Iterator[Hypothesis]:
         without = partial(_spread, stream.topic, spread)
         kind: Kind = "measurement noise"
         yield Hypothesis(
-            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, told=_factor
+            kind, stream.topic, "", SCALES, LARGEST_SCALE, without, words, mend, reported=_factor
         )
 
 
@@ -166,7 +166,7 @@ def _parameters(
         return trial._replace(settings=with_values(trial.settings, list(names), added))
 
     def words(at: Any, low: Any, high: Any) -> str:
-        said = [
+        changes = [
             f"{name} is {number(value + by)} ({number(value + least)} to {number(value + most)})"
             for name, value, by, least, most in zip(
                 names, values, numbers(at), numbers(low), numbers(high), strict=True
@@ -174,7 +174,7 @@ def _parameters(
         ]
         where = " and ".join(topic or "the motion" for topic in topics)
         given = ", ".join(number(value) for value in values)
-        return f"{where}: {', '.join(said)}, not {given}"
+        return f"{where}: {', '.join(changes)}, not {given}"
 
     def mend(at: Any) -> Advice:
         (name, value), *more = zip(

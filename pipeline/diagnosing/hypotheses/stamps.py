@@ -1,4 +1,4 @@
-"""Faults of stamps: messages are late, or a clock gains."""
+"""Tries faults of stamps: messages are late, or a clock gains."""
 
 from collections.abc import Iterator, Mapping
 
@@ -24,7 +24,7 @@ MOST_CELLS = 1_000_000  # of lags and speeds that are held at once
 def of_stamps(
     stream: Stream, reading: Reading | None, first_ns: int, hold_s: float, lags_s: tuple[float, ...]
 ) -> Iterator[Hypothesis]:
-    """A topic's delay and its clock.
+    """Yield a topic's delay and its clock.
 
     Args:
         stream: the topic's messages.

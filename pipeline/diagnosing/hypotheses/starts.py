@@ -1,4 +1,4 @@
-"""Faults of the state at the start, where a log states it."""
+"""Tries faults of the state at the start, where a log states it."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""The report: result folders as one HTML page that fetches nothing and runs only our scripts.
+"""Writes the report: results as one HTML page that fetches nothing and runs only our scripts.
 
 Begin here; `kinds` has what a section opens with, `story` the first sentences and the cards, `scene` the
 pictures of a run.
@@ -51,12 +51,14 @@ _MARKDOWN = MarkdownIt("commonmark", {"html": False}).disable("image")
 
 
 class _Timings(Parameters):
+    """Holds what timings.json says: by estimator, its seconds and messages."""
+
     of: dict[str, dict[str, float]]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A figure of the page, a chart or a picture, and what it says to who cannot see it."""
+    """Holds a figure of the page, a chart or a picture, and its words for those who cannot see it."""
 
     name: str
     caption: str
@@ -297,10 +299,10 @@ def _first_run(folder: Path, order: Sequence[str], found: Findings, *, viewer: b
 
 def _errors_by_case(found: Findings, label: str) -> dict[str, float]:
     """What an estimator errs in each case."""
-    told = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
+    by_case = {each.case: each.quantities.get(found.main, {}).get(label) for each in found.tables}
     return {
         case: float(each.value)
-        for case, each in told.items()
+        for case, each in by_case.items()
         if each and isinstance(each.value, int | float)
     }
 

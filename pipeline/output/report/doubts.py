@@ -27,7 +27,7 @@ _CHECKS: dict[str, Callable[[str], str]] = {
 
 
 def doubts_of(found: Findings, alarms: Sequence[Alarm], take: str, equal: Sequence[str]) -> list[str]:
-    """What is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
+    """Return what is doubtful of estimators: `take` is the one to take, `equal` are those as good."""
     compared = found.compared if len(found.labels) > 1 else []
     return [
         *_of_covariances(found, alarms),
@@ -50,16 +50,16 @@ def named(labels: Sequence[str], among: int = 0) -> str:
 
 def _of_covariances(found: Findings, alarms: Sequence[Alarm]) -> list[str]:
     """Whose covariances are not right, by what."""
-    told = {label: each.state for label, each in found.of.items()}
+    states = {label: each.state for label, each in found.of.items()}
     sentences = []
     for size, state in (("small", "too sure"), ("large", "too careful")):
-        whose = [label for label in found.labels if told[label] == state]
+        whose = [label for label in found.labels if states[label] == state]
         if whose:
             of = named(whose, len(found.labels))
             sentences.append(f"the covariances of {of}, which are too {size}")
     for kind, what in _OF_COVARIANCES.items():
         whose = [each.estimator for each in alarms if each.kind == kind]
-        little = [label for label in dict.fromkeys(whose) if told.get(label) == "honest"]
+        little = [label for label in dict.fromkeys(whose) if states.get(label) == "honest"]
         if little:
             sentences.append(
                 f"the {what} of {named(little)}, which are off by little, but beyond chance"
@@ -114,7 +114,7 @@ def _of_chance(found: Findings, compared: Sequence[str], take: str, equal: Seque
 
 def _of_what_is_not_known(found: Findings) -> list[str]:
     """Who was not judged, or not compared."""
-    told = []
+    unknown = []
     unjudged = [
         label
         for label, each in found.of.items()
@@ -122,11 +122,11 @@ def _of_what_is_not_known(found: Findings) -> list[str]:
     ]
     if unjudged and found.main:
         whose = named(unjudged, len(found.labels))
-        told.append(f"the covariances of {whose}, which nothing here judges")
+        unknown.append(f"the covariances of {whose}, which nothing here judges")
     lacking = [label for label in found.labels if label not in found.compared]
     if lacking and found.compared:
         main = quantity(found.main).name.removesuffix(", RMS")
         where = " in every case" if len(found.cases) > 1 else ""
         have = "has" if len(lacking) == 1 else "have"
-        told.append(f"a comparison with {named(lacking)}, which {have} no {main}{where}")
-    return told
+        unknown.append(f"a comparison with {named(lacking)}, which {have} no {main}{where}")
+    return unknown

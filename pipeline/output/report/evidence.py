@@ -38,21 +38,21 @@ State = Literal["too sure", "too careful", "honest", "unknown", "failed"]
 
 
 class Spread(NamedTuple):
-    """A value, and where it lies with 95 % over other runs; NaN where too few runs tell."""
+    """Holds a value, and where it lies with 95 % over other runs; NaN where too few runs tell."""
 
     value: float
     low: float = math.nan
     high: float = math.nan
 
     @property
-    def is_told(self) -> bool:
-        """Whether there is an interval."""
+    def is_known(self) -> bool:
+        """Tell whether there is an interval."""
         return math.isfinite(self.low) and math.isfinite(self.high)
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """A mean of normalised squares, NEES or NIS.
+    """Holds a mean of normalised squares, NEES or NIS.
 
     Attributes:
         name: which of the two.
@@ -68,7 +68,7 @@ class Consistency:
 
     @property
     def factor(self) -> float:
-        """How many times larger errors are than the estimator claims."""
+        """Return how many times larger errors are than the estimator claims."""
         return math.sqrt(max(self.found.value, 0.0) / self.aim)
 
     @property
@@ -80,7 +80,7 @@ class Consistency:
     def state(self) -> State:
         """What that says of the estimator: by chance over the stated covariances, and over the runs."""
         low, high = self.honest
-        is_excluded = self.found.is_told and not self.found.low <= self.aim <= self.found.high
+        is_excluded = self.found.is_known and not self.found.low <= self.aim <= self.found.high
         is_usual = low <= self.found.value <= high and not is_excluded
         if is_usual or abs(self.found.value / self.aim - 1.0) <= MATERIAL:
             return "honest"
@@ -113,7 +113,7 @@ class Evidence:
 
     @property
     def state(self) -> State:
-        """What can be said of it in a word; NIS counts where NEES finds nothing."""
+        """Return what can be said of it in a word; NIS counts where NEES finds nothing."""
         if self.failed and self.failed >= self.runs:
             return "failed"
         states = [each.state for each in (self.consistency, self.also) if each is not None]
@@ -128,7 +128,7 @@ class Evidence:
 
 
 class Pair(NamedTuple):
-    """How much more of a quantity an estimator has than another one; NaN where no interval is known."""
+    """States how much more of a quantity an estimator has than another; NaN where that is unknown."""
 
     first: str
     second: str
@@ -139,7 +139,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """What a result knows of all its estimators.
+    """Holds what a result knows of all its estimators.
 
     Attributes:
         tables: its metrics by case.
@@ -161,13 +161,13 @@ class Findings:
 
     @cached_property
     def main(self) -> str:
-        """The quantity by which estimators are compared; empty where there is none."""
+        """Return the quantity by which estimators are compared; empty where there is none."""
         there = [key for table in self.tables for key in table.quantities if is_error(key)]
         return next((key for key in (*PREFERRED, *there) if key in there), "")
 
     @cached_property
     def of(self) -> Mapping[str, Evidence]:
-        """The evidence by estimator."""
+        """Return the evidence by estimator."""
         return {label: self._evidence(label) for label in self.labels}
 
     @cached_property
@@ -177,7 +177,7 @@ class Findings:
 
     @property
     def compared(self) -> list[str]:
-        """The estimators that have an error in every case."""
+        """Return the estimators that have an error in every case."""
         return [label for label in self.labels if self.of[label].error is not None]
 
     def least_in(self) -> Counter[str]:
@@ -209,18 +209,18 @@ class Findings:
         return paired_difference(values[:, 0], values[:, 1], target or target_of(key) or "low", MARGIN)
 
     def stressed(self, *labels: str) -> float:
-        """How far changes that should not matter move the main error, of any of these at most."""
+        """Return how far changes that should not matter move the main error, of any of these at most."""
         own = [self.stress[label].moved.get(self.main, 0.0) for label in labels if label in self.stress]
         return max(own, default=0.0)
 
     def values(self, label: str, key: str) -> list[float]:
-        """An estimator's metric in every case that has it."""
+        """Return an estimator's metric in every case that has it."""
         found = [table.quantities.get(key, {}).get(label) for table in self.tables]
         numbers = [each.value for each in found if each is not None]
         return [float(each) for each in numbers if isinstance(each, int | float)]
 
     def has_any(self, label: str, *stems: str) -> bool:
-        """Whether an estimator has a quantity with one of these in its name."""
+        """Tell whether an estimator has a quantity with one of these in its name."""
         return any(
             stem in key and label in of
             for table in self.tables
@@ -319,7 +319,7 @@ def is_withheld(found: Findings, first: str, second: str, difference: float) -> 
 
 
 def findings(result: Result, tables: Mapping[str, pd.DataFrame]) -> Findings:
-    """What a result knows of its estimators; `tables` are those of its folder, by name."""
+    """Return what a result knows of its estimators; `tables` are those of its folder, by name."""
     rows = tables.get("runs", pd.DataFrame())
     if not {"estimator", "run"} <= {*rows}:
         rows = pd.DataFrame()
@@ -355,7 +355,7 @@ def _pairs(result: Result, metrics: Mapping[str, float]) -> list[Pair]:
 
 
 def runs_of(result: Result, tables: Mapping[str, pd.DataFrame]) -> int:
-    """How many runs a result is of: as many as its tables have, else as its settings say."""
+    """Count how many runs a result is of: as many as its tables have, else as its settings say."""
     if "differences" in tables and len(tables["differences"]):
         return int(tables["differences"]["runs"].max())
     logs = result.settings.get("logs")

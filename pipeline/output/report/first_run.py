@@ -27,7 +27,7 @@ GAP_LIMIT_S = 0.2
 
 @dataclass(frozen=True)
 class Followed:
-    """What an estimator said of a place over time, beside the truth.
+    """Holds what an estimator said of a place over time, beside the truth.
 
     Attributes:
         time_s: (n,) since the first.
@@ -57,7 +57,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class FirstRun:
-    """The first run of a result: its log, what was estimated, and of the first case how well."""
+    """Holds the first run of a result: its log, what was estimated, and of the first case how well."""
 
     source: Source
     output: Source
@@ -153,7 +153,7 @@ def innovations_of_runs(folder: Path) -> dict[tuple[str, str], list[tuple[Floats
 
 
 def picture_of_timeline(timeline: Path) -> bytes:
-    """The viewer's picture of a timeline, as WebP.
+    """Return the viewer's picture of a timeline, as WebP.
 
     Raises BadInput where there is no timeline, or no Vulkan driver to draw it with.
     """

@@ -1,4 +1,4 @@
-"""The gauge of a card: where NEES or NIS lies between too careful and too sure."""
+"""Computes the gauge of a card: where NEES or NIS lies between too careful and too sure."""
 
 import math
 from typing import NamedTuple
@@ -11,7 +11,7 @@ GAUGE_ENDS = (1 / 3, 10.0)
 
 
 class Gauge(NamedTuple):
-    """Where a mean of squares lies, in percent of a scale from too careful to too sure.
+    """Shows where a mean of squares lies, in percent of a scale from too careful to too sure.
 
     Attributes:
         honest: what counts as consistent: where 95 % of such estimators lie, and what is off by little.
@@ -30,16 +30,16 @@ class Gauge(NamedTuple):
 
 
 def numbers_of(by: Consistency) -> str:
-    """The mean of squares with its interval, and what is right."""
+    """Return the mean of squares with its interval, and what is right."""
     name = "NIS per component" if by.name == "NIS" else by.name
-    if not by.found.is_told:
+    if not by.found.is_known:
         return f"{name} {number(by.found.value)}; {number(by.aim)} is right"
     found, low, high = alike(by.found, Scale())
     return f"{name} {found}, 95 % {low} to {high}; {number(by.aim)} is right"
 
 
 def gauge(by: Consistency) -> Gauge:
-    """Where a mean of squares lies on its scale."""
+    """Return where a mean of squares lies on its scale."""
 
     def place(value: float) -> float:
         low, high = map(math.log, GAUGE_ENDS)
@@ -48,7 +48,7 @@ def gauge(by: Consistency) -> Gauge:
 
     low, high = by.honest
     found = by.found
-    spread = (found.low, found.high) if found.is_told else (found.value, found.value)
+    spread = (found.low, found.high) if found.is_known else (found.value, found.value)
     words = f"{numbers_of(by)}; a consistent estimator lies from {interval(low, high, Scale())}"
     is_beyond = not GAUGE_ENDS[0] < found.value / by.aim < GAUGE_ENDS[1]
     ends = (place(spread[0]), place(spread[1]))

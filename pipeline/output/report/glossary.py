@@ -1,10 +1,10 @@
-"""The words that a page explains at its end: two sentences each, and where to read on."""
+"""Explains words at a page's end: two sentences each, and where to read on."""
 
 from typing import NamedTuple
 
 
 class Term(NamedTuple):
-    """An entry: the word, what it means, and a page about it."""
+    """Explains a word: what it means, and a page about it."""
 
     name: str
     meaning: str
@@ -77,7 +77,7 @@ _TERMS = {
 
 
 def glossary(keys: set[str], *, draws: bool) -> list[Term]:
-    """The entries that a page with these quantities needs; with `draws` what a tie is."""
+    """Return the entries that a page with these quantities needs; with `draws` what a tie is."""
     needed = {
         "rmse": any("rmse" in key for key in keys),
         "nees": any("nees" in key for key in keys),

@@ -1,4 +1,4 @@
-"""What a page opens with, by the kind of result: experiment, comparison, sweep, tuning, diagnosis.
+"""Opens a page by the kind of its result: experiment, comparison, sweep, tuning, diagnosis.
 
 Begin with `opening`. Each kind has its own first sentences; cards and differences are `story`'s.
 """
@@ -99,15 +99,15 @@ def opening(result: Result, tables: Tables, timings: Timings | None = None) -> O
     return Opening(tried, base, found, notes)
 
 
-def said(result: Result, folder: Path) -> tuple[str, str]:
-    """What was tried, and what came of it, as a terminal has them; `folder` is the result's."""
+def run_sentences(result: Result, folder: Path) -> tuple[str, str]:
+    """Return what was tried, and what came of it, as a terminal has them; `folder` is the result's."""
     paths = [folder / "tables" / f"{name}.parquet" for name in TOLD_BY]
     begun = opening(result, {path.stem: read_table(path) for path in paths if path.is_file()})
     return begun.tried, " ".join(begun.story.verdict) or "No errors against a truth, and no claims."
 
 
 def what_was_tried(result: Result, found: Findings, tables: Tables) -> str:
-    """The estimators, the runs, how long each was, and where they come from."""
+    """Return the estimators, the runs, how long each was, and where they come from."""
     settings = result.settings
     estimators = list(settings.get("estimators") or [*found.labels, *found.bounds])
     named = listed(estimators)
@@ -163,7 +163,7 @@ def _with_claims(base: Story, result: Result) -> Story:
 
 
 def claims_sentences(result: Result) -> list[str]:
-    """How many claims hold, and how many do not."""
+    """Say how many claims hold, and how many do not."""
     counts = Counter(claim.verdict for claim in result.claims)
     of_all = count(len(result.claims), "claim")
     if counts["confirmed"] == len(result.claims):
@@ -191,14 +191,16 @@ def _of_tuning(base: Story, tables: Tables, meanings: Mapping[str, str]) -> Stor
     for row in tables.get("parameters", pd.DataFrame()).to_dict("records")[:3]:
         ends = row["low"], row["high"]
         known = all(math.isfinite(each) for each in ends)
-        told_by = f" (95 % {number(ends[0])} to {number(ends[1])})" if known else ", without an interval"
+        interval = (
+            f" (95 % {number(ends[0])} to {number(ends[1])})" if known else ", without an interval"
+        )
         begun = (
             "" if row["start"] == row["value"] else f", where the search began at {number(row['start'])}"
         )
         meaning = meanings.get(row["parameter"], "")
         what = f"The {meaning} ({row['parameter']})" if meaning else row["parameter"]
         unit = f" {sign}" if (sign := unit_of(row["parameter"])) else ""
-        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{told_by}{begun}.")
+        sentences.append(f"{what} is likeliest {number(row['value'])}{unit}{interval}{begun}.")
     return replace(base, verdict=[*sentences, *base.verdict])
 
 

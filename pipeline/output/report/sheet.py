@@ -1,4 +1,4 @@
-"""The table of metrics as a person reads it: estimators as columns, a dozen rows, the rest below."""
+"""Makes the table of metrics: estimators as columns, a dozen rows, the rest below."""
 
 import math
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ GROUPS = (ACCURACY, TRACKING, CONSISTENCY, COST, OTHER)
 
 
 class Cell(NamedTuple):
-    """A number of a table, what stands small beside it, and if it is the best or out of bounds."""
+    """Holds a number of a table, what stands small beside it, and if it is the best or out of bounds."""
 
     text: str
     small: str = ""
@@ -40,7 +40,7 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Row:
-    """A quantity of all estimators; `key` is what the result calls it."""
+    """Holds a quantity of all estimators; `key` is what the result calls it."""
 
     key: str
     name: str
@@ -52,7 +52,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table: its groups of rows, and those that stand folded below."""
+    """Holds a table: its groups of rows, and those that stand folded below."""
 
     title: str
     columns: list[str]
@@ -61,7 +61,7 @@ class Sheet:
 
 
 def sheets(found: Findings) -> tuple[Sheet | None, list[Sheet]]:
-    """The table of a result, and of several cases one each; None without numbers."""
+    """Return the table of a result, and of several cases one each; None without numbers."""
     columns = [*found.labels, *found.bounds]
     tables = [table for table in found.tables if any(table.quantities.values())]
     if not tables or not columns:
@@ -80,7 +80,7 @@ def table_of_pairs(found: Findings) -> pd.DataFrame:
     for each in found.pairs:
         words = quantity(each.quantity.removeprefix("change_in_"))
         own = scale(words.unit, each.more.value)
-        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_told else ""
+        ends = f" ({interval(each.more.low, each.more.high, own)})" if each.more.is_known else ""
         of = rows.setdefault((each.first, each.second, words.name), {})
         of[each.case or "all"] = f"{own.text(each.more.value)}{ends} {own.sign}".rstrip()
     about = ("estimator", "has more than", "of")

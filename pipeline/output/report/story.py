@@ -1,4 +1,4 @@
-"""The story of a result: what was tried, what to do, a card per estimator, what differs beyond chance.
+"""Tells the story of a result: what was tried, what to do, a card per estimator, what differs.
 
 It is data: sentences and numbers. The template only sets it.
 """
@@ -56,7 +56,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Story:
-    """What a page says of a result, first of all.
+    """Says what a page says of a result, first of all.
 
     Attributes:
         verdict: what to do, the most important sentence first.
@@ -80,7 +80,7 @@ def story(
     timings: Timings | None = None,
     alarms: Sequence[Alarm] = (),
 ) -> Story:
-    """The story of estimators that were judged.
+    """Return the story of estimators that were judged.
 
     Causes, what each cost, and alarms are told where they are known.
     """
@@ -260,7 +260,7 @@ def _card(
     card = Card(each.estimator, look, mark, chip, cause=cause, stress=stress, notes=notes)
     if each.error is not None:
         about, value = quantity(found.main).name, own.text(each.error.value)
-        if each.error.is_told:
+        if each.error.is_known:
             value, low, high = alike(each.error, own)
             about += f"; 95 % {low} to {high}"
         card = replace(card, value=value, unit=own.sign, about=about)

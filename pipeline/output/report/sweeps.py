@@ -1,4 +1,4 @@
-"""What the page of a sweep opens with: whom to take at which point, and what chance leaves open.
+"""Opens the page of a sweep: whom to take at which point, and what chance leaves open.
 
 Of each estimator the point at which it errs least is told as an experiment of its own: `story` tells
 whom of these to take. Points at which it is overconfident count only where it is so at all of them.
@@ -25,7 +25,7 @@ Tables = Mapping[str, pd.DataFrame]
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep's result, and what of it the sentences are made of.
+    """Holds a sweep's result, and what the sentences are made of.
 
     Attributes:
         result: what was swept.
@@ -41,16 +41,16 @@ class Sweep:
 
     @cached_property
     def points(self) -> list[dict[str, object]]:
-        """The values of the parameters at each point."""
+        """Return the values of the parameters at each point."""
         return list(self.result.settings["sweep"])
 
     @cached_property
     def main(self) -> str:
-        """The error by which points are compared; empty where there is none."""
+        """Return the error by which points are compared; empty where there is none."""
         return next((key for key in self.table["quantity"].unique() if is_error(key)), "")
 
     def errors(self, label: str) -> "pd.Series[float]":
-        """An estimator's error at each point, over all cases."""
+        """Return an estimator's error at each point, over all cases."""
         table = self.table
         is_own = (table["estimator"] == label) & (table["quantity"] == self.main)
         own = table[is_own].dropna(subset=["value"])
@@ -73,7 +73,7 @@ class Sweep:
         return Consistency("NEES", Spread(float(row["value"])), float(row["aim"]), ends)
 
     def is_too_sure(self, label: str, point: int) -> bool:
-        """Whether an estimator is overconfident at a point."""
+        """Tell whether an estimator is overconfident at a point."""
         by = self.consistency(label, point)
         return by is not None and by.state == "too sure"
 
@@ -115,7 +115,7 @@ class Sweep:
         return findings(here, {"runs": self.rows})
 
     def where(self, point: int, *, brief: bool = False) -> str:
-        """The values at a point in words: with what they are of, or `brief`."""
+        """Return the values at a point in words: with what they are of, or `brief`."""
         parts = []
         for key, value in self.points[point].items():
             text = f"{_value(value)} {unit_of(key) if _is_number(value) else ''}".rstrip()
@@ -123,14 +123,14 @@ class Sweep:
         return f"({', '.join(parts)})" if brief and len(parts) > 1 else ", ".join(parts)
 
     def name(self, key: str, *, with_key: bool = False) -> str:
-        """What a parameter is: what it means, where that is known."""
+        """Return what a parameter is: what it means, where that is known."""
         meaning = str(self.result.settings.get("meanings", {}).get(key, ""))
         name = meaning or quantity(key.rpartition(".")[2]).name
         return f"{name} ({key})" if with_key else name
 
 
 def story_of_sweep(result: Result, tables: Tables) -> tuple[str, Story, Findings]:
-    """What was tried, whom to take at which point, and the findings that this follows from.
+    """Return what was tried, whom to take at which point, and the findings that this follows from.
 
     Where the scenario is swept, nobody chooses the point: estimators are told over all of them.
     """

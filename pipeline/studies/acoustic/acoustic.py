@@ -1,4 +1,4 @@
-"""The study of shooter localization: figures 3-23 of Osborne et al. 2014 with numbers."""
+"""Studies shooter localization: figures 3-23 of Osborne et al. 2014 with numbers."""
 
 import hashlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""What the study of shooter localization runs: one scenario at one noise, all modes, bounds."""
+"""Runs the cases of shooter localization: one scenario at one noise, all modes, bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ Place = tuple[float, float]
 
 
 class Maps(Parameters):
-    """Figures 22 and 23.
+    """Describes figures 22 and 23.
 
     Attributes:
         scenario: scenario with the sensors.
@@ -50,7 +50,7 @@ class Maps(Parameters):
 
 
 class AcousticOptions(Parameters):
-    """The paper's scenarios, how noisy they are, and the maps.
+    """States the paper's scenarios, how noisy they are, and the maps.
 
     Attributes:
         scenarios: the paper's three scenarios, as files.
@@ -75,7 +75,7 @@ class AcousticOptions(Parameters):
 
 @dataclass(frozen=True)
 class Mode:
-    """What one estimator made of a case.
+    """Holds what one estimator made of a case.
 
     Attributes:
         components: names of the n parameters.
@@ -140,7 +140,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Case:
-    """One scenario at one multiple of the angular noise, and its modes by the estimators' labels."""
+    """Holds one scenario at one multiple of the angular noise, and its modes by estimators' labels."""
 
     number: int
     multiplier: float
@@ -180,7 +180,7 @@ def run_case(experiment: Experiment, setting: Setting, number: int, multiplier: 
 
 
 def bound_of(parameters: AcousticParameters, settings: Mapping[str, Any], label: str) -> Floats:
-    """The CRLB (n, n) of an estimator at the truth."""
+    """Return the CRLB (n, n) of an estimator at the truth."""
     estimator = configure(label, settings)[1]
     assert isinstance(estimator, ShooterParameters)
     chosen = acoustic.Setting(
@@ -214,7 +214,7 @@ def _heard(sources: list[MemorySource]) -> Detections:
 
 
 def hearing(case: Case) -> list[float]:
-    """The numbers of the sensors that hear the shockwave."""
+    """Return the numbers of the sensors that hear the shockwave."""
     true = acoustic.noise_free(case.parameters.medium, *truth_of(case.parameters))
     return [float(sensor + 1) for sensor in np.flatnonzero(np.isfinite(true.shockwave_rad[0]))]
 

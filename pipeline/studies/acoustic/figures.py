@@ -1,4 +1,4 @@
-"""The figures of Osborne et al. 2014 with our numbers: ellipses, range errors, sweeps, maps."""
+"""Draws the figures of Osborne et al. 2014 with our numbers: ellipses, range errors, sweeps, maps."""
 
 from collections.abc import Callable, Sequence
 
@@ -15,7 +15,7 @@ from replay.timeline.drawing.plane import ellipses
 
 
 def figures(cases: Sequence[Case], options: AcousticOptions, runs: int) -> dict[str, Chart | Figure]:
-    """All figures by name."""
+    """Draw all figures by name."""
     nominal = [case for case in cases if case.multiplier == 1.0]
     return {
         "ellipses": _ellipses(nominal, options.modes),

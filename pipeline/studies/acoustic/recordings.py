@@ -1,4 +1,4 @@
-"""The study of sounds in recordings: arrivals by cross-correlation, places by them, with covariances.
+"""Studies sounds in recordings: arrivals by cross-correlation, places by them, covariances.
 
 Where truth or published differences are known, they are held to them. What a stated covariance is worth
 is tried on simulated recordings, over noise: there each of many sounds is somewhere else.
@@ -25,7 +25,7 @@ from replay.judging.errors.evaluation import Errors
 
 
 class Published(Parameters):
-    """Differences that were published of a sound.
+    """States the differences that were published of a sound.
 
     Attributes:
         delay_s: how much later than the first microphone the others heard it, in their numbers' order.
@@ -35,7 +35,7 @@ class Published(Parameters):
 
 
 class Simulated(Parameters):
-    """Simulated recordings of the scenario `sound-source`.
+    """Describes simulated recordings of the scenario `sound-source`.
 
     Attributes:
         runs: number of runs at each noise.
@@ -51,7 +51,7 @@ class Simulated(Parameters):
 
 
 class Options(Parameters):
-    """What is known of sounds, and what is simulated.
+    """States what is known of sounds, and what is simulated.
 
     Attributes:
         published: differences that were published, by the name of a sound.
@@ -102,7 +102,7 @@ def _judge_simulated(simulated: pd.DataFrame, label: str, outcome: Outcome) -> N
 
 
 def differences_of(source: MemorySource) -> pd.DataFrame:
-    """The differences of all sounds: later than at the first of its microphones, and how sure."""
+    """Return the differences of all sounds: later than at the first of its microphones, and how sure."""
     tables = []
     points = source.streams["/microphones"]
     places = pd.DataFrame(points["position_m"], points["landmark_id"].astype(int), ["x_m", "y_m", "z_m"])
@@ -143,7 +143,7 @@ def known_place(errors: Errors) -> dict[str, MetricValue]:
 
 
 def delays_of(table: pd.DataFrame, options: Options) -> dict[str, MetricValue]:
-    """The differences of every sound, and how far they are from those that were published."""
+    """Return the differences of every sound, and how far they are from those that were published."""
     delays = {name: rows["delay_s"].to_numpy() for name, rows in table.groupby("sound", sort=False)}
     found: dict[str, MetricValue] = {
         f"sound.delay_s.{name!s}": of.tolist() for name, of in delays.items()

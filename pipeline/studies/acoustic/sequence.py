@@ -1,4 +1,4 @@
-"""The study of shots in sequence: what it is worth to take them as one problem, and robustly.
+"""Studies shots in sequence: what it is worth to take them as one problem, and robustly.
 
 Errors are those at the last report of each shot: of filters and smoothers where the shooter is by then,
 of single-shot solutions, which know of no motion, where the shot was fired. Estimators are compared by
@@ -26,7 +26,7 @@ SINGLE, PLAIN, ROBUST = "single-shot", "not-robust", "student"
 
 
 class Options(Parameters):
-    """The cases.
+    """States the cases.
 
     Attributes:
         cases: what differs in the scenario, by the name of a case; the first has no faults.
@@ -65,7 +65,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def shot_errors(replayed: Replayed, labels: list[str]) -> pd.DataFrame:
-    """How far off each estimator is at every shot of every run, NaN where it has no estimate.
+    """Return how far off each estimator is at every shot of every run, NaN where it has no estimate.
 
     `nees` is per component, of all that an estimator tells and the truth has.
     """
@@ -101,7 +101,7 @@ def shots_of(source: MemorySource) -> tuple[Floats, Any]:
 
 
 def positions(source: MemorySource, time_ns: Any) -> Floats:
-    """Where the shooter is (n, 2)."""
+    """Return where the shooter is (n, 2)."""
     truth = source.streams["/shooter/truth"]
     elapsed, known = time_ns - source.epoch_ns, truth.publish_time_ns - source.epoch_ns
     return np.stack([np.interp(elapsed, known, truth["state"][:, axis]) for axis in range(2)], axis=1)

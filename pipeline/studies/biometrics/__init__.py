@@ -1,1 +1,1 @@
-"""Studies of biometric scores: fusion, and verification in sequence; begin with `biometrics`."""
+"""Studies biometric scores: fusion, and verification in sequence; begin with `biometrics`."""

@@ -1,4 +1,4 @@
-"""The study of biometric score fusion: modality, method and process, and verification of all pairs.
+"""Studies biometric score fusion: modality, method and process, verification of all pairs.
 
 Zheng & Blasch, JAIF 2014, Tables 2a to 5. Fusions of the trimmed database are repeated with several
 seeds; those of all pairs get confidence intervals of drawing users again.
@@ -55,7 +55,7 @@ TICKS = (1e-4, 1e-3, 0.01, 0.05, 0.2)
 
 
 class BiometricsOptions(Parameters):
-    """How often what is random is repeated.
+    """States how often what is random is repeated.
 
     Attributes:
         seeds: how often the cross validations are repeated.
@@ -117,7 +117,7 @@ def _repeated(
 
 
 def printed_metrics() -> dict[str, float]:
-    """The paper's rates, beside ours."""
+    """Return the paper's rates, beside ours."""
     fused = {
         f"printed-{label}.rate_percent.{case}": rate
         for label, rates in PAPER_FUSED.items()

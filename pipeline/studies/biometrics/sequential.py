@@ -1,4 +1,4 @@
-"""The study of verification in sequence: Wald's test of probe after probe, and Page's of the matcher.
+"""Studies verification in sequence: Wald's test of each probe, and Page's of the matcher.
 
 Log-likelihood ratios are calibrated on other users than they judge. Those of a matcher are drawn again,
 users as clusters: a replicate draws users with replacement, and all intervals are quantiles over the
@@ -52,7 +52,7 @@ IMPOSTORS = 100_000  # so many that their tail is that of all
 
 
 class Options(Parameters):
-    """What is stated, and how it is tried.
+    """States the tests' rates of error, and how they are tried.
 
     Attributes:
         rates: pairs of stated rates of false accepts and false rejects.
@@ -80,7 +80,7 @@ class Options(Parameters):
 
 
 class Drawn(NamedTuple):
-    """A matcher's ratios (users, users) by probe and gallery entry, and a replicate's users (n,)."""
+    """Holds a matcher's ratios (users, users) by probe and gallery entry, a replicate's users (n,)."""
 
     ratios: Floats
     users: Integers
@@ -165,7 +165,7 @@ def wald_tests(
 def probes_of(
     way: str, drawn: Drawn, options: Options, rng: np.random.Generator
 ) -> tuple[RatioOf, RatioOf]:
-    """What gives the next probes' ratios of sequences: of persons, and of impostors."""
+    """Return what gives the next probes' ratios of sequences: of persons, and of impostors."""
     genuine = np.diag(drawn.ratios)[drawn.users]
     if way == "alike":
         some = drawn.ratios[drawn.impostors(IMPOSTORS, rng)]
@@ -226,7 +226,7 @@ def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> floa
 def watched(
     drawn: Mapping[str, Drawn], options: Options, rng: np.random.Generator
 ) -> Iterator[dict[str, Any]]:
-    """How many probes pass until the alarm, by fault and matcher; "none" is without a fault.
+    """Count how many probes pass until the alarm, by fault and matcher; "none" is without a fault.
 
     Half of the users are the reference, the others are watched.
     """
@@ -330,7 +330,7 @@ def _measure(row: Mapping[str, Any], key: str, scale: float, outcome: Outcome) -
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows of a table by the names of its columns."""
+    """Return the rows of a table by the names of its columns."""
     rows: list[Any] = table.to_dict("records")
     return rows
 

@@ -12,14 +12,14 @@ DRIFT_SIGMA = 1.0
 
 
 class Labelled(NamedTuple):
-    """Probes of a matcher: its ratio (n,), and whether the other matchers say that it is the person."""
+    """Holds probes of a matcher: its ratio (n,), and whether the other matchers say it is the person."""
 
     ratio: Floats
     is_genuine: Booleans
 
 
 def faulty(fault: str, seen: Labelled, steady: Sequence[Floats], rng: np.random.Generator) -> Floats:
-    """The ratios (n,) of probes by a matcher with a fault.
+    """Return the ratios (n,) of probes by a matcher with a fault.
 
     `steady` are the ratios of impostors and of persons before, in rising order.
     """

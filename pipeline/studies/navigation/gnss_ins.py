@@ -1,4 +1,4 @@
-"""The study of a receiver with an inertial unit: how well they bridge outages of a recording.
+"""Studies a receiver with an inertial unit: how well they bridge outages of a recording.
 
 The fixes of a recording with centimetres of error are withheld for a while, again and again; what a
 filter and a smoother make of the rest is compared with the withheld fixes, and with what takes no
@@ -48,7 +48,7 @@ RUNS_AT_ONCE = 2  # in memory, with their estimates
 
 
 class GnssInsOptions(Parameters):
-    """The protocol of the outages.
+    """States the protocol of the outages.
 
     Attributes:
         filter: label of the filter that is compared.
@@ -74,7 +74,7 @@ class GnssInsOptions(Parameters):
 
 
 class Innovations(NamedTuple):
-    """Of one kind of measurement, where the fix was good: mean NIS, the share above 95 %, by axis."""
+    """Holds NIS of one kind of measurement where the fix was good: mean, share above 95 %, by axis."""
 
     nis: float
     share_above: float
@@ -149,7 +149,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def recording_of(experiment: Experiment, setting: Setting) -> Path:
-    """The one folder at --data or below that has all files of the mapping."""
+    """Return the one folder at --data or below that has all files of the mapping."""
     assert setting.data is not None
     assert experiment.import_ is not None
     mapping = read_mapping(str(experiment.import_.parameters.get("mapping", "")))

@@ -1,4 +1,4 @@
-"""The study of inertial units: how far off a body is located, the longer its receiver is silent.
+"""Studies grades of inertial units: how far off a body is, the longer its receiver is silent.
 
 The same drives with units of several grades, and an outage in the middle. Of n runs the largest error is
 above that which a share q of all runs stays below, with the probability 1 - q^n: .95 for 59 runs and
@@ -23,7 +23,7 @@ from replay.judging.errors.evaluation import Errors
 
 
 class Options(Parameters):
-    """The grades.
+    """States the grades.
 
     Attributes:
         grades: parameters of the scenario's inertial unit, by grade.
@@ -33,7 +33,7 @@ class Options(Parameters):
 
 
 class Span(NamedTuple):
-    """An outage, in s since a run's epoch."""
+    """Holds an outage, in s since a run's epoch."""
 
     begin_s: float
     end_s: float
@@ -65,7 +65,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def outage_of(source: MemorySource) -> Span:
-    """The outage of a drive; BadInput where it has none, or more than one."""
+    """Return the outage of a drive; BadInput where it has none, or more than one."""
     given = NavigationParameters.model_validate(source.run.parameters).gnss.outages_s
     if len(given) != 1:
         raise BadInput(
@@ -75,7 +75,7 @@ def outage_of(source: MemorySource) -> Span:
 
 
 def horizontal(errors: Errors, span: Span) -> pd.DataFrame:
-    """How far off an estimator is (m) in every run, so many seconds after the outage began."""
+    """Return how far off an estimator is (m) in every run, so many seconds after the outage began."""
     inside = (errors.elapsed_s >= span.begin_s) & (errors.elapsed_s < span.end_s)
     plane = [errors.components.index(name) for name in ("x_m", "y_m")]
     error_m = np.linalg.norm(errors.error[inside][:, plane], axis=1)

@@ -1,4 +1,4 @@
-"""The study of orientation from inertial samples: total error over each trial's movement.
+"""Studies orientation from inertial samples: total error over each trial's movement.
 
 BROAD: Laidig, Caruso, Cereatti, Seel, Data 6(7), 2021. What counts are the samples that its authors
 marked as movement; an error is the whole angle from the true orientation to the estimated one.
@@ -58,7 +58,7 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
 
 
 def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """What the last message before each stamp says; the topic speaks at every change."""
+    """Return what the last message before each stamp says; the topic speaks at every change."""
     stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
     row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1
     return (row >= 0) & (stream["value"][row.clip(0), 0] != 0.0)

@@ -1,4 +1,4 @@
-"""The study of orientation by filters and by the common methods, trial by trial of the BROAD benchmark.
+"""Studies orientation by filters and the common methods, trial by trial of the BROAD benchmark.
 
 Laidig, Caruso, Cereatti, Seel, "BROAD", Data 6(7), 2021, section 4: what counts are the samples marked
 as movement; the error is the rotation from the true orientation to the estimated one in the axes of the
@@ -39,7 +39,7 @@ AS_RECORDED, WITH_MAGNET = "all", "magnet-added"
 
 
 class OrientationOptions(Parameters):
-    """The magnet that is added, and what counts as a disturbance.
+    """States the magnet that is added, and what counts as a disturbance.
 
     Attributes:
         magnet_ut: field of the magnet in the unit's axes (x, y, z).
@@ -55,7 +55,7 @@ class OrientationOptions(Parameters):
 
 
 class ErrorAngles(NamedTuple):
-    """Errors (n,) in rad."""
+    """Holds errors (n,) in rad."""
 
     total: Floats
     heading: Floats
@@ -108,7 +108,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def trials(experiment: Experiment, setting: Setting) -> Iterator[tuple[str, MemorySource]]:
-    """The trials of a folder or the one of a file, one after another, by name."""
+    """Yield the trials of a folder or the one of a file, one after another, by name."""
     assert experiment.import_ is not None
     assert setting.data is not None
     files = sorted(setting.data.glob("*.hdf5")) if setting.data.is_dir() else [setting.data]
@@ -120,7 +120,7 @@ def trials(experiment: Experiment, setting: Setting) -> Iterator[tuple[str, Memo
 
 
 def with_magnet(source: MemorySource, trial: str, options: OrientationOptions) -> MemorySource:
-    """The same trial with the field of a magnet that is near for some time."""
+    """Return the same trial with the field of a magnet that is near for some time."""
     topic = f"/{trial}/inertial"
     stream = source.streams[topic]
     elapsed_s = (stream.publish_time_ns - source.epoch_ns) * 1e-9
@@ -133,7 +133,7 @@ def with_magnet(source: MemorySource, trial: str, options: OrientationOptions) -
 
 
 def states_of(replayed: Replayed, trial: str) -> Iterator[tuple[str, Stream]]:
-    """Every estimator's label with its estimates of a trial."""
+    """Yield every estimator's label with its estimates of a trial."""
     for topic, rows in replayed.outputs.items():
         label, _, leaf = topic.removeprefix("/estimates/").partition("/")
         if leaf == f"{trial}/state":
@@ -163,7 +163,7 @@ def errors_of(replayed: Replayed, trial: str, case: str) -> Iterator[dict[str, A
 
 
 def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
-    """The rows (n,) of stamps that are wanted (n,), and which of these there are."""
+    """Return the rows (n,) of stamps that are wanted (n,), and which of these there are."""
     row = np.searchsorted(time_ns, wanted_ns).clip(0, max(len(time_ns) - 1, 0))
     known = time_ns[row] == wanted_ns if len(time_ns) else np.zeros(len(wanted_ns), bool)
     return row, known
@@ -182,7 +182,7 @@ def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
 def disturbed_spans(
     replayed: Replayed, trial: str, case: str, options: OrientationOptions
 ) -> Iterator[dict[str, Any]]:
-    """Where estimators that know the field of the place find it disturbed."""
+    """Yield where estimators that know the field of the place find it disturbed."""
     [source] = replayed.sources
     for label, states in states_of(replayed, trial):
         if not set(COMPONENTS) <= set(states.components):

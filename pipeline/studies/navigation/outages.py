@@ -1,4 +1,4 @@
-"""Outages of a receiver that are made: fixes of a recording withheld, and errors where they are known.
+"""Makes outages of a receiver: withholds fixes of a recording; errors where they are known.
 
 A window is a span whose fixes and velocities are withheld entirely, by the times of the receiver's rows.
 Windows that lie far enough apart share a run. Errors are horizontal, at the withheld rows.
@@ -27,7 +27,7 @@ _GAP_S = 1.0
 
 
 class Rows(NamedTuple):
-    """What the receiver wrote, a row for every fix; the plane is that of east and north.
+    """Holds what the receiver wrote, a row for every fix; the plane is that of east and north.
 
     Attributes:
         time_ns: (n,), as it is written.
@@ -46,7 +46,7 @@ class Rows(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A span (s since the first row) whose rows, by their numbers, are withheld."""
+    """Holds a span (s since the first row) whose rows, by their numbers, are withheld."""
 
     length_s: float
     start_s: float
@@ -54,7 +54,7 @@ class Window(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the window is called among the cases."""
+        """Return what the window is called among the cases."""
         return f"{self.length_s:g}s-at-{self.start_s:g}s"
 
 
@@ -104,7 +104,7 @@ def in_runs(windows: Sequence[Window], every_s: float, apart: int) -> list[list[
 
 
 def withheld(source: MemorySource, rows: Rows, windows: Sequence[Window]) -> MemorySource:
-    """The recording without the rows of windows, of which it tells as outages."""
+    """Return the recording without the rows of windows, of which it tells as outages."""
     gone_ns = np.concatenate([rows.time_ns[:0], *(rows.time_ns[each.rows] for each in windows)])
     streams = dict(source.streams)
     for topic in (FIX, VELOCITY):

@@ -1,4 +1,4 @@
-"""The study of several inertial units on one body, whose clocks are off: what more units give.
+"""Studies several inertial units on one body, whose clocks are off: what more units give.
 
 Each recording is replayed with one unit, with the mean of all, and with a filter for each whose
 estimates covariance intersection fuses, since all filters have the same fixes. Stamps of the units are
@@ -51,7 +51,7 @@ PRIOR_SIGMA = np.concatenate(
 
 
 class QuadInertialOptions(Parameters):
-    """What is known of the recordings.
+    """States what is known of the recordings.
 
     Attributes:
         filter: label of the filter.
@@ -74,7 +74,7 @@ class QuadInertialOptions(Parameters):
 
 
 class Flight(NamedTuple):
-    """A recording: its name, its truth, its fixes, and each unit's samples.
+    """Holds a recording: its name, its truth, its fixes, and each unit's samples.
 
     Attributes:
         time_ns: (n,) of the truth.

@@ -1,1 +1,1 @@
-"""Studies of sensor networks and robots that share estimates; begin with `networks`."""
+"""Studies sensor networks and robots that share estimates; begin with `networks`."""

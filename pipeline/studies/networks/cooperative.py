@@ -1,4 +1,4 @@
-"""The study of cooperative localization: accuracy and consistency of robots that share estimates.
+"""Studies cooperative localization: accuracy and consistency of robots that share estimates.
 
 Its paper, Jin, Lee, Hashimoto, DIND networks, has no numbers of real robots.
 """
@@ -19,7 +19,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def by_robot(metrics: Mapping[str, MetricValue], estimator: str, quantity: str) -> dict[str, float]:
-    """One estimator's values of a metric by case; those that are numbers."""
+    """Return one estimator's values of a metric by case; those that are numbers."""
     start = f"{estimator}.{quantity}."
     found = {key.removeprefix(start): value for key, value in metrics.items() if key.startswith(start)}
     return {key: float(value) for key, value in found.items() if isinstance(value, int | float)}

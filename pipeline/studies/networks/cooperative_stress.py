@@ -1,4 +1,4 @@
-"""The study of robots that share estimates under stress, on recorded logs.
+"""Studies robots that share estimates under stress, on recorded logs.
 
 When a robot sees another, both get a message. Here some of these sightings are taken out of the log: all
 but one in an interval, a random half, those of a robot that leaves; or a robot is sure of a wrong start.
@@ -34,7 +34,7 @@ SEED = 1
 
 
 class CooperativeStressOptions(Parameters):
-    """What the robots are put under.
+    """States what the robots are put under.
 
     Attributes:
         intervals_s: least times between two meetings of two robots at which they share, in s.

@@ -1,4 +1,4 @@
-"""The study of sensor networks: what each fusion rule costs in accuracy, consistency and bytes.
+"""Studies sensor networks: what each fusion rule costs in accuracy, consistency and bytes.
 
 Claims: Jin, Lee, Hashimoto, DIND networks. RMSE, over all runs and steps, and NEES are those after
 `settle_s`, when every node has measured; ratios are the nodes' mean RMSE over that of one filter with
@@ -33,7 +33,7 @@ CI = "ci-trace"
 
 
 class NetworkOptions(Parameters):
-    """What the study looks at besides the experiment's own runs.
+    """States what the study looks at besides the experiment's own runs.
 
     Attributes:
         settle_s: errors count from so long after the beginning on.

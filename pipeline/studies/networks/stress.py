@@ -1,4 +1,4 @@
-"""The study of networks under stress: what lateness, absence, lies and silence cost CI.
+"""Studies networks under stress: what lateness, absence, lies and silence cost CI.
 
 Each run gives one mean NEES and one mean squared error over its nodes after `settle_s`; intervals are
 over the runs. The claims are ours, and were set before their numbers were seen: a filter of n states
@@ -30,7 +30,7 @@ INTERVAL, NEWS = "at most once in an interval", "when it has news"
 
 
 class StressOptions(Parameters):
-    """What the network is put under.
+    """States what the network is put under.
 
     Attributes:
         settle_s: errors count from so long after the beginning on.

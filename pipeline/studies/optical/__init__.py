@@ -1,1 +1,1 @@
-"""Studies of lines of sight: Belfadel et al. 2014, and moving sensors; begin with `los`."""
+"""Studies lines of sight: Belfadel et al. 2014, and moving sensors; begin with `los`."""

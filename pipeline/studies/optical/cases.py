@@ -1,4 +1,4 @@
-"""What the study of lines of sight runs: one scenario under one condition, all schemes, bounds."""
+"""Runs the cases of lines of sight: one scenario under one condition, all schemes, bounds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ ALONE, BLIND, JOINT = "scheme-1", "scheme-2", "scheme-3"
 
 
 class Condition(Parameters):
-    """Biases and noise.
+    """Describes biases and noise.
 
     Attributes:
         bias_deg: multiple of the biases of the scenario files, which have 1 deg.
@@ -41,7 +41,7 @@ class Condition(Parameters):
 
 
 class Printed(Parameters):
-    """What the paper prints; rows are scenarios, columns targets or biases.
+    """Holds what the paper prints; rows are scenarios, columns targets or biases.
 
     Attributes:
         table_of_sensors: number of the table of the sensors' positions.
@@ -71,7 +71,7 @@ class Printed(Parameters):
 
 
 class LosOptions(Parameters):
-    """Scenarios and conditions.
+    """States scenarios and conditions.
 
     Attributes:
         scenarios: scenario files, in the paper's order.
@@ -94,7 +94,7 @@ class LosOptions(Parameters):
 
 @dataclass(frozen=True)
 class Case:
-    """One scenario under one condition.
+    """Holds one scenario under one condition.
 
     Attributes:
         number: of the scenario, from 1.
@@ -119,12 +119,12 @@ class Case:
 
     @property
     def targets(self) -> int:
-        """How many there are."""
+        """Count how many there are."""
         return len(self.parameters.target_position_m)
 
     @property
     def sigma_mrad(self) -> Floats:
-        """The CRLB's deviations of the biases."""
+        """Return the CRLB's deviations of the biases."""
         return 1e3 * np.sqrt(np.diagonal(self.bound))[3 * self.targets :]
 
     @property
@@ -134,7 +134,7 @@ class Case:
 
     @property
     def component_nees(self) -> Floats:
-        """The mean normalized squared error of each bias, (biases,)."""
+        """Return the mean normalized squared error of each bias, (biases,)."""
         squared = component_error_squared(self.error[JOINT], self.bound)
         return np.nanmean(squared, axis=(0, 1))[3 * self.targets :]
 
@@ -229,7 +229,7 @@ def _judged(
 
 
 def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
-    """What an estimator of biases knows of a scenario before the measurements."""
+    """Return what an estimator of biases knows of a scenario before the measurements."""
     sensors = np.array(parameters.sensor_position_m)
     sigma = np.full((len(sensors), 2), parameters.sigma_rad)
     known = known_biases(range(1, len(sensors) + 1), estimator)
@@ -237,13 +237,13 @@ def scene_of(parameters: OpticalParameters, estimator: Parameters) -> Scene:
 
 
 def bias_names(case: Case) -> list[str]:
-    """The wanted biases as tables name them."""
+    """Return the wanted biases as tables name them."""
     names = [f"{angle}{s + 1}" for s in range(len(case.scene.position_m)) for angle in ANGLES]
     return [name for name, wanted in zip(names, case.scene.wanted, strict=True) if wanted]
 
 
 def observabilities(case: Case) -> dict[str, Observability]:
-    """What can be told in variations of a case, by what varies."""
+    """Return what can be told in variations of a case, by what varies."""
     wanted = case.scene._replace(known_bias_rad=np.full_like(case.scene.known_bias_rad, np.nan))
     first, last = case.scene.position_m[[0, -1]]
     share = np.linspace(0.0, 1.0, len(case.scene.position_m))[:, None]

@@ -1,4 +1,4 @@
-"""The figures of Belfadel et al. 2014 with our numbers: scenes, NEES, NEES of single biases, GDOP."""
+"""Draws the figures of Belfadel et al. 2014 with our numbers: scenes, NEES, biases' NEES, GDOP."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from replay.judging.errors.evaluation import chi_square_interval
 
 
 def figures(cases: Sequence[Case], runs: int) -> dict[str, Chart]:
-    """All figures by name."""
+    """Draw all figures by name."""
     conditions = list(dict.fromkeys(case.condition for case in cases))
     by_condition = {name: [case for case in cases if case.condition == name] for name in conditions}
     first = by_condition[conditions[0]]

@@ -1,4 +1,4 @@
-"""The study of bias estimation from lines of sight: tables I-VIII and figures of Belfadel et al. 2014.
+"""Studies bias estimation from lines of sight: tables I-VIII, figures of Belfadel et al. 2014.
 
 Every scenario is recorded with and without biases under several conditions. The paper does not state
 those that its tables follow from, so each condition is judged on its own.

@@ -1,4 +1,4 @@
-"""The study of moving lines of sight: which biases can be told, what would tell them, and how well.
+"""Studies moving lines of sight: which biases can be told, what would tell them, and how well.
 
 Sensors that fly straight on, side by side, leave one direction of the state open: all that they see may
 turn about the line between them if they roll with it, and targets that keep their velocities then keep
@@ -32,7 +32,7 @@ ALIGNED_S, LAST_S = 10.0, 10.0
 
 
 class Options(Parameters):
-    """Cases, and how observability is told.
+    """States the cases, and how observability is told.
 
     Attributes:
         cases: what differs in the scenario, by the name of a case.
@@ -79,7 +79,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def unknowns(parameters: MovingOpticalParameters) -> dict[str, Any]:
-    """What is estimated beside the targets: all biases, and the clocks but for the first."""
+    """Return what is estimated beside the targets: all biases, and the clocks but for the first."""
     numbers = range(1, len(parameters.sensor_position_m) + 1)
     biases = [name for number in numbers for name in bias_components(number)]
     clocks = [clock_component(number) for number in numbers[1:]]
@@ -101,7 +101,7 @@ def weakest_directions(sources: list[MemorySource], shared: Mapping[str, Any]) -
 
 
 def prior_sigmas(parameters: MovingOpticalParameters) -> dict[str, float]:
-    """What is known beforehand of every component, as a standard deviation."""
+    """Return what is known beforehand of every component, as a standard deviation."""
     targets = {
         name: parameters.prior_sigma_m if name.endswith("_m") else parameters.prior_sigma_mps
         for target in range(1, TARGETS + 1)

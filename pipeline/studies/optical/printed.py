@@ -20,7 +20,7 @@ RULE = 0.15
 
 
 def metrics_of_print(paper: Printed) -> dict[str, Any]:
-    """How many of the printed pairs keep the paper's rules."""
+    """Return how many of the printed pairs keep the paper's rules."""
     sigma, rmse = np.array(paper.bias_sigma_mrad), np.array(paper.bias_rmse_mrad)
     small = np.abs(np.array(paper.bias_mean_mrad)) < 2.0 * sigma / np.sqrt(paper.runs)
     return {
@@ -59,7 +59,7 @@ def metrics_beside_print(case: Case, paper: Printed) -> dict[str, Any]:
 
 
 def metrics_of_geometry(case: Case, paper: Printed) -> dict[str, Any]:
-    """What can be told in variations of a scenario, and where its sensors stand."""
+    """Return what can be told in variations of a scenario, and where its sensors stand."""
     number = case.number
     values: dict[str, Any] = {}
     for what, found in observabilities(case).items():
@@ -80,7 +80,7 @@ def metrics_of_geometry(case: Case, paper: Printed) -> dict[str, Any]:
 
 
 def steepest_deg(case: Case) -> float:
-    """The elevation of the steepest line of sight; near 90 deg azimuth is nearly singular."""
+    """Return the elevation of the steepest line of sight; near 90 deg azimuth is nearly singular."""
     elevation = np.degrees(optical.predict(case.scene, case.truth[None])[0, :, :, 1])
     return float(elevation.ravel()[np.abs(elevation).argmax()])
 

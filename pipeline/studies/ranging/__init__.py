@@ -1,1 +1,1 @@
-"""Studies of ultra-wideband ranges; begin with `ranging`."""
+"""Studies ultra-wideband ranges; begin with `ranging`."""

@@ -1,4 +1,4 @@
-"""What the studies of ranges share: recordings in a folder, their replay, errors by the truth."""
+"""Shares what studies of ranges need: recordings in a folder, their replay, errors by the truth."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -22,7 +22,7 @@ from replay.engine.streams.sources import MemorySource, memory_source
 
 
 class RangingOptions(Parameters):
-    """Delays that the data do not state.
+    """States delays that the data do not.
 
     Attributes:
         range_delay_s: ranges are taken to be older than stamped by so much, beside an estimator's own
@@ -33,7 +33,7 @@ class RangingOptions(Parameters):
 
 
 class Recording(NamedTuple):
-    """One recording: its name, where it lies, and the files beside that which belong to it."""
+    """Names one recording, its place, and the files beside it that belong to it."""
 
     name: str
     path: Path
@@ -41,7 +41,7 @@ class Recording(NamedTuple):
 
 
 class Replayed(NamedTuple):
-    """A recording with the outputs of every estimator, by the last parts of their topics."""
+    """Holds a recording with the outputs of every estimator, by the last parts of their topics."""
 
     recording: Recording
     source: MemorySource
@@ -61,7 +61,7 @@ def recordings(setting: Setting, pattern: str) -> list[Path]:
 
 
 def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -> Iterator[Replayed]:
-    """The recordings one by one; logs are kept of all, the timeline of the first."""
+    """Yield the recordings one by one; logs are kept of all, the timeline of the first."""
     assert experiment.import_ is not None
     delay_s, runner = setting.options.range_delay_s, Runner(experiment, setting)
     estimators = dict(experiment.estimators)
@@ -83,7 +83,7 @@ def replayed(experiment: Experiment, setting: Setting, found: list[Recording]) -
 
 
 class Reference(NamedTuple):
-    """The truth: stamps in order (n,), and its components (n, d); those of angles do not wrap."""
+    """Holds the truth: stamps in order (n,), and components (n, d); those of angles do not wrap."""
 
     time_ns: Integers
     state: Floats
@@ -96,7 +96,7 @@ class Reference(NamedTuple):
 
 
 def mean_nis(innovations: Stream, begin_ns: int, end_ns: int) -> float:
-    """The mean NIS of single ranges within a span."""
+    """Return the mean NIS of single ranges within a span."""
     stamps = innovations.publish_time_ns
     inside = (stamps >= begin_ns) & (stamps <= end_ns)
     return float(np.mean(innovations["normalised_innovation_squared"][inside]))

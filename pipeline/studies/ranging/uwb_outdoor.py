@@ -1,4 +1,4 @@
-"""The study of positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
+"""Studies positions from ranges outdoors: uwb_outdoor, with published tracks beside ours.
 
 Published errors are those of a part of each path, which begins and ends where it enters a place. The
 truth is linear between its rows, but for those at another height than the others by half a metre.
@@ -34,7 +34,7 @@ PUBLISHED = ("LS", "ESKF")
 
 
 class Place(Parameters):
-    """Where a window begins or ends: a part of the plane.
+    """Bounds a part of the plane, where a window begins or ends.
 
     Attributes:
         x_above_m: least x; None for any.
@@ -49,7 +49,7 @@ class Place(Parameters):
     y_below_m: float | None = None
 
     def holds(self, position: Floats) -> Booleans:
-        """Which positions (n, 2) lie there."""
+        """Return which positions (n, 2) lie there."""
         above = np.array([self.x_above_m, self.y_above_m], float)
         below = np.array([self.x_below_m, self.y_below_m], float)
         outside = (position <= above) | (position > below)  # nothing is outside a limit that is none
@@ -57,7 +57,7 @@ class Place(Parameters):
 
 
 class Window(Parameters):
-    """The part of a path that is scored.
+    """Describes the part of a path that is scored.
 
     Attributes:
         begin: where it begins: the first time that the path is there.
@@ -69,7 +69,7 @@ class Window(Parameters):
 
 
 class UwbOutdoorOptions(RangingOptions):
-    """Windows, and what errors are held to.
+    """States the windows, and what errors are held to.
 
     Attributes:
         windows: the part of a path that is scored, by the name of a folder that a recording lies in;
@@ -153,7 +153,7 @@ def scored_truth(of: Replayed, window: Window | None, level_m: float) -> tuple[R
 def published_rmse(
     of: Replayed, track: str, truth: Reference, begin_ns: int, end_ns: int
 ) -> tuple[float, float]:
-    """The error in the plane, and in space, of a published track within the window."""
+    """Return the error in the plane, and in space, of a published track within the window."""
     stream = of.source.streams[f"/published/{track}"]
     inside = (stream.publish_time_ns >= begin_ns) & (stream.publish_time_ns <= end_ns)
     error = stream["state"][inside] - truth.at(stream.publish_time_ns[inside])
@@ -161,7 +161,7 @@ def published_rmse(
 
 
 def printed(folder: Path) -> dict[str, float]:
-    """The errors that a recording comes with, by their names; none without such a file."""
+    """Return the errors that a recording comes with, by their names; none without such a file."""
     path = folder / "RMSD_results.txt"
     if not path.exists():
         return {}

@@ -1,4 +1,4 @@
-"""The study of poses from ranges between anchors and tags: lias, ultra-wideband with motion capture.
+"""Studies poses from ranges between anchors and tags: lias, ultra-wideband with motion capture.
 
 Estimates are scored from `skip_s` on at their stamps; the truth is linear between its own. The body of
 the motion capture is not quite that of the tags, so that errors have a mean that no filter can know:
@@ -31,7 +31,7 @@ from replay.engine.arrays import Floats, Integers
 
 
 class UwbPoseOptions(RangingOptions):
-    """When scoring begins, and how truth is mounted.
+    """States when scoring begins, and how truth is mounted.
 
     Attributes:
         skip_s: scoring begins so long after the first estimate.

@@ -1,4 +1,4 @@
-"""Studies of densities and samples: Bingham, torus, LCD sampling, the S2KF's systems.
+"""Studies densities and samples: Bingham, torus, LCD sampling, the S2KF's systems.
 
 Begin with `bingham`.
 """

@@ -1,4 +1,4 @@
-"""The evaluation of the Bingham filter beside modified Kalman filters: figures 4 and 5.
+"""Evaluates the Bingham filter beside modified Kalman filters: figures 4 and 5.
 
 Kurz, Gilitschenski, Julier, Hanebeck, "Recursive Bingham Filter for Directional Estimation Involving 180
 Degree Symmetry", JAIF 9(2), 2014, section 7. Every ensemble is recorded twice, with Bingham noise and
@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 
 
 class BinghamOptions(Parameters):
-    """Which estimator is judged beside the others.
+    """Names the estimator that is judged beside the others.
 
     Attributes:
         estimator: label of the estimator that is judged.
@@ -135,7 +135,7 @@ def _grid_errors_deg(replayed: Replayed, stated: AxisParameters, cells: int) -> 
 
 
 def error_figure(errors_deg: dict[str, dict[str, Floats]]) -> Figure:
-    """The runs' errors of every estimator, as figures 4 and 5 have them."""
+    """Draw the runs' errors of every estimator, as figures 4 and 5 have them."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     for axes, (case, found) in zip(
         figure.subplots(1, len(errors_deg), sharey=True), errors_deg.items(), strict=True

@@ -1,4 +1,4 @@
-"""The extended target of the S2KF's paper: a measurement update with multiplicative noise.
+"""Studies the S2KF paper's extended target: an update with multiplicative noise.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.B, Figs. 9 and 10. Beside the paper's filters run the S2KF's with their sample sets turned at
@@ -52,7 +52,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict[str, Any]]:
-    """The S2KF of 25 and 50 samples with their sets turned, under labels of their own."""
+    """Return the S2KF of 25 and 50 samples with their sets turned, under labels of their own."""
     return {
         f"{label}{TURNED}{turn}": values | {"kind": f"{values['kind']}:rotation={turn}"}
         for label, values in experiment.estimators.items()
@@ -62,7 +62,7 @@ def rotated_estimators(experiment: Experiment, rotations: int) -> dict[str, dict
 
 
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
-    """One row per estimator and step.
+    """Return one row per estimator and step.
 
     RMSE of area and position against the exact moments' filter (the paper's) and against truth; the
     median area. A half side of -l is the rectangle of l, but flips the area's sign: such runs are
@@ -97,7 +97,7 @@ def _area(target: Floats) -> Floats:
 
 
 def by_key_step(steps: pd.DataFrame) -> pd.DataFrame:
-    """The columns at the paper's steps, averaged over the seeds; counts are summed."""
+    """Return the columns at the paper's steps, averaged over the seeds; counts are summed."""
     rows = steps[steps["step"].isin(KEY_STEPS)]
     counts = dict.fromkeys(("flipped_runs", "failed_runs"), "sum")
     means = dict.fromkeys((name for name in rows.columns if name.endswith(("_m", "_m2"))), "mean")
@@ -105,7 +105,7 @@ def by_key_step(steps: pd.DataFrame) -> pd.DataFrame:
 
 
 def metrics(at_keys: pd.DataFrame) -> dict[str, MetricValue]:
-    """Every column at every key step; of turned sets a list, one entry per rotation."""
+    """Return every column at every key step; of turned sets a list, one entry per rotation."""
     found: dict[str, MetricValue] = {}
     columns = [name for name in at_keys.columns if name not in ("estimator", "step")]
     own = at_keys[~at_keys["estimator"].str.contains(TURNED)]
@@ -122,7 +122,7 @@ def metrics(at_keys: pd.DataFrame) -> dict[str, MetricValue]:
 
 
 def turned_areas(at_keys: pd.DataFrame, label: str, step: int) -> list[float]:
-    """The area RMSE of every rotation of a filter's set at one step."""
+    """Return the area RMSE of every rotation of a filter's set at one step."""
     turned = at_keys["estimator"].str.startswith(label + TURNED) & (at_keys["step"] == step)
     return [float(value) for value in at_keys.loc[turned, "area_rmse_m2"]]
 

@@ -1,4 +1,4 @@
-"""Samplings of N(0, I): how near they are to it, what LCD sets cost, and what they look like.
+"""Studies samplings of N(0, I): how near they are to it, what LCD sets cost, how they look.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section V, Figs. 1 and 5. No filter runs here: the logs hold the sample sets.
@@ -30,7 +30,7 @@ Size = Annotated[tuple[PositiveInt, ...], Field(min_length=2, max_length=2)]
 
 
 class LcdOptions(Parameters):
-    """The sets to optimise, and samplings to draw.
+    """States the sets to optimise, and samplings to draw.
 
     Attributes:
         sizes: dimension and count of each set to optimise.
@@ -88,12 +88,12 @@ def optimised(dimension: int, count: int, starts: int, seed: int) -> dict[str, f
 
 
 def draw(name: str, seed: int) -> Samples:
-    """One set in the plane."""
+    """Return one set in the plane."""
     return parse_sampling(name).at(2).draw(np.random.default_rng(seed), ())
 
 
 def unlikeness_to_ukf(dimension: int, starts: int, seed: int) -> tuple[float, float]:
-    """How far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
+    """Return how far 2N+1 LCD samples are from the equally weighted UKF's, raw and moment-corrected.
 
     The largest difference between their sorted distances from one another and from the origin, which
     no rotation changes.

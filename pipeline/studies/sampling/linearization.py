@@ -1,4 +1,4 @@
-"""What the studies of the S2KF's paper share: filters against the one with the exact moments.
+"""Shares what studies of the S2KF's paper need: filters against the one with exact moments.
 
 An experiment's runs are replayed for several seeds, because errors differ more between seeds than
 between sample sets of one kind; each seed is an ensemble of its own.
@@ -26,7 +26,7 @@ REFERENCE = "analytic"
 
 
 class Options(Parameters):
-    """What is averaged over.
+    """States what is averaged over.
 
     Attributes:
         data_seeds: number of seeds of the data to average over.
@@ -38,7 +38,7 @@ class Options(Parameters):
 
 
 class Track(NamedTuple):
-    """One filter's estimates of an ensemble; NaN from where a run failed."""
+    """Holds one filter's estimates of an ensemble; NaN from where a run failed."""
 
     mean: Floats
     """(runs, steps, n)"""
@@ -47,12 +47,12 @@ class Track(NamedTuple):
 
     @property
     def failed(self) -> int:
-        """How many runs did not reach the last step."""
+        """Count how many runs did not reach the last step."""
         return int(np.isnan(self.mean[:, -1, 0]).sum())
 
 
 class Ensemble(NamedTuple):
-    """The runs of one seed: their truth (runs, steps, n) after the start, and every filter's track."""
+    """Holds the runs of one seed: truth (runs, steps, n) after the start, and each filter's track."""
 
     sources: list[MemorySource]
     truth: Floats
@@ -110,7 +110,7 @@ def rmse(difference: Floats) -> Floats:
 
 
 def error_panel(steps: pd.DataFrame, quantity: str, label: str) -> Panel:
-    """One line per estimator over the steps, averaged over the seeds."""
+    """Draw one line per estimator over the steps, averaged over the seeds."""
     mean = steps.groupby(["estimator", "step"], sort=False)[quantity].mean()
     lines = {str(name): mean[name] for name in mean.index.get_level_values("estimator").unique()}
     return Panel(

@@ -1,4 +1,4 @@
-"""How many samples pay in a linear regression Kalman filter: from 2 to 20 dimensions, and on drives.
+"""Studies how many samples pay in a linear regression Kalman filter: 2 to 20 dimensions, drives.
 
 Moments come first, apart from any filter: waves y = sin(k'x + phase) of x ~ N(0, I) have exact ones, by
     E exp(i k'x) = exp(-|k|^2 / 2).
@@ -36,7 +36,7 @@ X_LIMITS, X_TICKS = (4.0, 600.0), (5.0, 20.0, 100.0, 500.0)
 
 
 class Drive(Parameters):
-    """What is recorded; estimates are judged by their positions.
+    """States what is recorded; estimates are judged by their positions.
 
     Attributes:
         scenario: name of the scenario.
@@ -48,7 +48,7 @@ class Drive(Parameters):
 
 
 class Options(Parameters):
-    """Functions of several dimensions, and drives.
+    """States functions of several dimensions, and drives.
 
     Attributes:
         dimensions: dimensions of the state.
@@ -66,14 +66,14 @@ class Options(Parameters):
 
 
 class Waves(NamedTuple):
-    """sin(K x + phases): vectors K (m, n), phases (m,)."""
+    """Describes the function sin(K x + phases): vectors K (m, n), phases (m,)."""
 
     vectors: Floats
     phases: Floats
 
 
 class Moments(NamedTuple):
-    """Of what a function gives: mean (m,), covariance (m, m), covariance of x with it (n, m)."""
+    """Holds of what a function gives the mean (m,), covariance (m, m), and that of x with it (n, m)."""
 
     mean: Floats
     covariance: Floats
@@ -102,7 +102,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
-    """The samplings of the estimators by their labels; BadInput where there is none."""
+    """Return the samplings of the estimators by their labels; BadInput where there is none."""
     kinds = {label: str(values.get("kind", label)) for label, values in experiment.estimators.items()}
     found: dict[str, Callable[[int], Sampler]] = {
         label: parse_sampling(kind.removeprefix("lrkf:")).at
@@ -115,7 +115,7 @@ def samplings_of(experiment: Experiment) -> dict[str, Callable[[int], Sampler]]:
 
 
 def exact(waves: Waves) -> Moments:
-    """The moments of waves of x ~ N(0, I)."""
+    """Return the moments of waves of x ~ N(0, I)."""
     vectors, phases = waves
     squared = np.sum(vectors**2, axis=1)
     fading = np.exp(-0.5 * squared)
@@ -131,7 +131,7 @@ def exact(waves: Waves) -> Moments:
 
 
 def sampled(waves: Waves, samples: Samples) -> Moments:
-    """What a sample set (L, n) makes of them."""
+    """Return what a sample set (L, n) makes of them."""
     points, weights = samples
     values = np.sin(points @ waves.vectors.T + waves.phases)
     mean = weights @ values
@@ -142,7 +142,7 @@ def sampled(waves: Waves, samples: Samples) -> Moments:
 def moment_errors(
     samplings: Mapping[str, Callable[[int], Sampler]], options: Options, seed: int
 ) -> pd.DataFrame:
-    """One row per sampling, dimension, direction and function: relative errors of its moments.
+    """Return one row per sampling, dimension, direction and function: relative errors of its moments.
 
     That of the mean is the root mean square in standard deviations of what the function gives, those of
     the covariances are by the Frobenius norm.
@@ -181,7 +181,7 @@ def _relative(found: Floats, wanted: Floats) -> float:
 def driven(
     experiment: Experiment, setting: Setting, name: str, drive: Drive
 ) -> tuple[list[MemorySource], pd.DataFrame]:
-    """The runs of a scenario, kept in a folder of its name; one row per estimator and run.
+    """Return the runs of a scenario, kept in a folder of its name; one row per estimator and run.
 
     A row has the state's dimension, the RMSE of the position, the mean NEES for each component, and how
     long a second of a run took all cores together, in ms: the mean of all runs at once.

@@ -1,4 +1,4 @@
-"""The batch reactor of the S2KF's paper: nonlinear prediction against the exact moments.
+"""Studies the S2KF paper's batch reactor: nonlinear prediction against the exact moments.
 
 Source: Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014,
 section VI.A, Fig. 7. Its statements are judged for the prior mean as printed, (0.5, 3.5), and for the
@@ -60,7 +60,7 @@ def _in_case(experiment: Experiment, case: str) -> Experiment:
 
 
 def step_errors(ensemble: Ensemble) -> pd.DataFrame:
-    """One row per estimator and step.
+    """Return one row per estimator and step.
 
     RMSE of mean and covariance against the exact moments' filter (the paper's), of the mean against
     truth, and how large the filter's own variance is beside the exact one.

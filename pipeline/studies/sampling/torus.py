@@ -1,4 +1,4 @@
-"""Estimation on the torus: what a coupling makes of the samples (figure 3), and the recursive filter.
+"""Studies estimation on the torus: what a coupling makes of the samples (figure 3), and a filter.
 
 Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate Circular Estimation", 2016. The
 propagation is numerics without a log; its truth is the population value, from Gauss-Hermite nodes in
@@ -36,7 +36,7 @@ Floats = NDArray[np.float64]
 
 
 class PropagationOptions(Parameters):
-    """Figure 3's sweep.
+    """States figure 3's sweep.
 
     Attributes:
         sigma_rad: standard deviations of the two angles, in rad.
@@ -54,7 +54,7 @@ class PropagationOptions(Parameters):
 
 
 class MomentErrors(NamedTuple):
-    """Errors of mean and covariance, entrywise means, (correlations,); random: (runs, correlations)."""
+    """Holds errors of mean and covariance, means over entries, ([runs,] correlations)."""
 
     mean: Floats
     covariance: Floats
@@ -184,7 +184,7 @@ def propagation_chart(table: pd.DataFrame, options: PropagationOptions) -> Chart
 
 
 class FilterOptions(Parameters):
-    """Cases, and the filter on a grid.
+    """States the cases, and the filter on a grid.
 
     Attributes:
         cases: what differs in the scenario's parameters, by the name of a case.
@@ -242,7 +242,7 @@ def _grid_errors_rad(replayed: Replayed, cells: int) -> Floats:
 
 
 def filter_figure(errors_rad: dict[str, dict[str, Floats]]) -> Figure:
-    """The runs' errors of every filter, case by case."""
+    """Draw the runs' errors of every filter, case by case."""
     figure = Figure(figsize=(2.8 * len(errors_rad) + 1, 4), layout="constrained")
     plots = np.atleast_1d(figure.subplots(1, len(errors_rad), sharey=True))
     for axes, (case, found) in zip(plots, errors_rad.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Real angles on the torus: densities fitted to dihedrals of a protein, filters that predict the wind.
+"""Studies real angles on the torus: densities of a protein's dihedrals, predictions of the wind.
 
 What is fitted is judged on angles that the fit has not seen: dihedrals stretch by stretch of the chain,
 winds of the second half with noise and coupling that are most likely in the first. Neighbours resemble
@@ -64,7 +64,7 @@ SIMPLER = {
 
 
 class Options(Parameters):
-    """How dihedrals and wind are judged.
+    """States how dihedrals and wind are judged.
 
     Attributes:
         folds: number of parts in which dihedrals are held out.
@@ -82,7 +82,7 @@ class Options(Parameters):
 
 
 class Prediction(NamedTuple):
-    """What was said of every hour but the first: log density of what came, and its circular distance."""
+    """Holds for every hour but the first the log density of what came, and its circular distance."""
 
     log_density: Floats
     error_rad: Floats
@@ -105,7 +105,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
     _judge_predictions(wind, half, found, options, outcome)
     time_ns = source.in_order("/wind", "publish_time").publish_time_ns
     predicted = (
-        _told(name, time_ns, predicted_by(wind, run, found[name])) for name, run in FILTERS.items()
+        _estimates(name, time_ns, predicted_by(wind, run, found[name])) for name, run in FILTERS.items()
     )
     runner.keep([source], {each.stream.topic: each for each in predicted})
     return outcome
@@ -248,7 +248,7 @@ def predicted_by(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> 
 
 
 def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Prediction:
-    """What a filter says of every hour."""
+    """Return what a filter says of every hour."""
     next_ = predicted_by(wind, run, parameters)
     variance = next_.covariance[:, 0, 0] + parameters["measurement_sigma_rad"] ** 2
     return _of_normal(wind[1:] - next_.mean[:, 0], variance)
@@ -262,7 +262,7 @@ def _of_normal(deviation: Floats, variance: Floats | float) -> Prediction:
 
 
 def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -> Prediction:
-    """The same by Bayes' rule on a grid."""
+    """Return the same by Bayes' rule on a grid."""
     measured = _measured(wind)
     prior = wrapped_normal.density(WrappedNormal(np.array([wind[0], 0.0]), _PRIOR), torus_grid(cells))
     begin = (prior / prior.sum())[None]
@@ -305,7 +305,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
     return Chart(panels=[panel])
 
 
-def _told(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
+def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
     """A filter's predictions of every hour but the first, as estimates."""
     angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
     stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)

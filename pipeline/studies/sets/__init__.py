@@ -1,1 +1,1 @@
-"""Studies of guaranteed sets; begin with `set_membership`."""
+"""Studies guaranteed sets; begin with `set_membership`."""

@@ -1,4 +1,4 @@
-"""Bounds of a robot's errors, taken from the other robots of its log: their truth says what theirs were.
+"""Takes bounds of a robot's errors from the other robots of its log: their truth says theirs.
 
 So nothing is chosen by the truth of the robot that is judged. Channels state what is found.
 """
@@ -30,7 +30,7 @@ SPAN_STEP_S = 0.5
 
 
 class BoundOptions(Parameters):
-    """How bounds follow from errors.
+    """States how bounds follow from errors.
 
     Attributes:
         margin: odometry's bound is its largest error times this.
@@ -44,7 +44,7 @@ class BoundOptions(Parameters):
 
 @dataclass(frozen=True)
 class RobotErrors:
-    """Errors of one robot: bearings and their differences (n,); odometry, largest by span (spans, 2)."""
+    """Holds one robot's errors: bearings and differences (n,); odometry, largest by span (spans, 2)."""
 
     bearing_rad: Floats
     relative_rad: Floats
@@ -107,7 +107,7 @@ def _bounds(
 
 
 def robot_errors(source: MemorySource, prefix: str, gap_limit_s: float) -> RobotErrors:
-    """How far one robot's bearings and odometry were off, where its truth is known."""
+    """Return how far one robot's bearings and odometry were off, where its truth is known."""
     seen, truth = source.streams[f"{prefix}/range_bearing"], source.streams[f"{prefix}/truth"]
     landmarks, driven = source.streams["/landmarks"], source.streams[f"{prefix}/odometry"]
     error, look = _bearing_errors(seen, landmarks, truth, gap_limit_s)

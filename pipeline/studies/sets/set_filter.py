@@ -1,4 +1,4 @@
-"""The study of guaranteed sets over time: area, containment, how much the past helps, what was isolated.
+"""Studies guaranteed sets over time: area, containment, what the past helps, what was isolated.
 
 What is compared are the frames for which all estimators have a set or an ellipse; intervals are over the
 robots.
@@ -101,7 +101,7 @@ def _ellipse_rows(errors: Errors, sets: Sequence[JudgedSets]) -> pd.DataFrame:
 
 
 def compared(table: pd.DataFrame) -> pd.DataFrame:
-    """The rows of frames for which every estimator has one."""
+    """Return the rows of frames for which every estimator has one."""
     count = table.groupby(KEYS)["estimator"].transform("nunique")
     return table[count == table["estimator"].nunique()].reset_index(drop=True)
 
@@ -152,7 +152,7 @@ def _compare(summary: pd.DataFrame, outcome: Outcome) -> None:
 
 
 def isolation_metrics(filters: Sequence[JudgedFilter]) -> dict[str, MetricValue]:
-    """How often the wrong one of a frame and the past is isolated, by the truth; by filter."""
+    """Return how often the wrong one of a frame and the past is isolated, by the truth; by filter."""
     counts: dict[str, Counter[str]] = {}
     for each in filters:
         count = counts.setdefault(each.sets.estimator, Counter())

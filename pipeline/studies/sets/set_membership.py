@@ -1,4 +1,4 @@
-"""The study of set-valued fixes: areas, containment of the truth, faults.
+"""Studies set-valued fixes: areas, containment of the truth, faults.
 
 Its paper, Briechle, Hanebeck (2004), has figures without numbers; section V is recorded besides the
 experiment's own runs wherever these are simulated.
@@ -46,7 +46,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def frame_table(found: Sequence[JudgedSets]) -> pd.DataFrame:
-    """One row per estimator, case, run and frame."""
+    """Return one row per estimator, case, run and frame."""
     parts = [
         pd.DataFrame(
             {

@@ -1,4 +1,4 @@
-"""The study of consistency: whether errors are what covariances say, once an estimator is aligned.
+"""Studies consistency: whether errors are what covariances say, once an estimator is aligned.
 
 That of `localization`, and of all stamps from `aligned_s` on the share at which the mean NEES of the
 runs lies in its 95 % interval, and the mean of these. Bar-Shalom, Li, Kirubarajan, Estimation with
@@ -14,7 +14,7 @@ from recorders.parameters import Parameters
 
 
 class ConsistencyOptions(Parameters):
-    """When estimators count.
+    """States when estimators count.
 
     Attributes:
         aligned_s: estimators count from then on, since a run's epoch.

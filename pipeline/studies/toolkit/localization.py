@@ -1,4 +1,4 @@
-"""The study of estimators that follow a moving thing: errors, consistency, innovations.
+"""Studies estimators that follow a moving thing: errors, consistency, innovations.
 
 It is what most experiments need: record or import, replay, judge, draw. Families with claims of a paper
 add their own tables, figures and claims.

@@ -1,4 +1,4 @@
-"""A paper's Monte Carlo experiment, repeated: step k over all runs of an ensemble is one repetition.
+"""Repeats a paper's Monte Carlo experiment: step k over all runs of an ensemble is one repetition.
 
 A log that holds the same experiment several times over, with fresh noise, gives one estimate each. So an
 ensemble of 100 runs with 10 steps repeats a paper's 100 runs ten times, and a rule that a paper states
@@ -31,7 +31,7 @@ def require_spread(solutions: int) -> None:
 
 
 def errors_named(replayed: Replayed, estimator: str) -> Errors:
-    """The errors of an estimator that has one estimate stream."""
+    """Return the errors of an estimator that has one estimate stream."""
     [errors] = [each for each in replayed.errors if each.estimator == estimator]
     return errors
 
@@ -44,7 +44,7 @@ def by_repetition(errors: Errors, values: Floats, runs: int) -> Floats:
 
 
 class Interval(NamedTuple):
-    """The mean of independent values, and where it lies with 95 %."""
+    """Holds the mean of independent values, and where it lies with 95 %."""
 
     mean: float
     low: float
@@ -69,12 +69,12 @@ def root_mean_square(values: Floats, axis: int | tuple[int, ...]) -> Floats:
 
 
 def rms_length(errors: Floats) -> float:
-    """The root mean square of the lengths of errors (n, d); NaN of none."""
+    """Return the root mean square of the lengths of errors (n, d); NaN of none."""
     return float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))) if len(errors) else np.nan
 
 
 def rmse_of_runs(errors: Errors, runs: int) -> Floats:
-    """The root mean square length of every run's errors (runs,); NaN for a run without any."""
+    """Return the root mean square length of every run's errors (runs,); NaN for a run without any."""
     squared = np.sum(errors.error**2, axis=1)
     count = np.bincount(errors.run, minlength=runs)
     with np.errstate(invalid="ignore"):

@@ -1,1 +1,1 @@
-"""Studies of trackers: vessels, ferries, targets that cross; begin with `tracking`."""
+"""Studies trackers: vessels, ferries, targets that cross; begin with `tracking`."""

@@ -1,4 +1,4 @@
-"""The study of tracks of reports without identities: which vessels kept one track of their own.
+"""Studies tracks of reports without identities: which vessels kept one track of their own.
 
 The identities that the log has are used to judge alone. A vessel's own track is the one that it is
 assigned when tracks and vessels are paired one to one: see `replay.judging.tracks.tracks`.
@@ -28,7 +28,7 @@ from replay.judging.tracks.tracks import (
 
 
 class AisOptions(Parameters):
-    """How tracks are counted.
+    """States how tracks are counted.
 
     Attributes:
         live_s: a track is called live for so long after a report.
@@ -53,7 +53,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def vessel_table(replayed: Replayed) -> pd.DataFrame:
-    """The tables of `replay.judging.tracks.tracks.track_table` of all estimators."""
+    """Return the tables of `replay.judging.tracks.tracks.track_table` of all estimators."""
     tables = [
         table.assign(estimator=each.estimator)
         for each in replayed.judged

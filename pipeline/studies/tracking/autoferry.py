@@ -1,4 +1,4 @@
-"""The study of Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
+"""Studies Autoferry scenarios: what each sensor adds to tracks of vessels, and each association.
 
 Quays, marks and other craft have no reference: GOSPA leaves out what is farther than 50 m from both
 vessels. Trackers are replayed in the order of the stamps, and some of them again in the order of
@@ -33,7 +33,7 @@ from replay.judging.tracks.errors import Judged, instants_of, tracks_at
 
 
 class AutoferryOptions(Parameters):
-    """What is compared, and late scans.
+    """States what is compared, and which ways to treat late scans are tried.
 
     Attributes:
         compared: pairs of estimators whose figures are compared, the first with the second.

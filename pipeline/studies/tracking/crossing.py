@@ -1,4 +1,4 @@
-"""The study of simulated targets that cross: what associations are worth in clutter.
+"""Studies simulated targets that cross: what associations are worth in clutter.
 
 Every case has a rate of clutter and a probability of detection; the targets of a run and their true ways
 are the same in all cases.
@@ -21,7 +21,7 @@ from replay.judging.tracks.errors import instants_of
 
 
 class CrossingOptions(Parameters):
-    """The cases, and what is compared.
+    """States the cases, and what is compared.
 
     Attributes:
         clutter_per_scan: mean numbers of false detections in a scan.

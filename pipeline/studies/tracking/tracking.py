@@ -1,4 +1,4 @@
-"""What studies of trackers have in common: their tracks judged by run, and differences of trackers.
+"""Shares what studies of trackers need: tracks judged by run, and differences of trackers.
 
 Tracks are judged as `replay.judging.tracks.errors` says, at instants that are the same for all trackers.
 """
@@ -38,7 +38,7 @@ SWITCH_PENALTY_M = 10.0
 
 
 def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream, Stream]:
-    """How many tracks an estimator tells of in every scan of a run, and these tracks.
+    """Return how many tracks an estimator tells of in every scan of a run, and these tracks.
 
     Raises BadInput where it is no tracker.
     """
@@ -52,7 +52,7 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
 
 
 def figures_of(tracked: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
-    """What the tracks of a run are worth, tracked at the instants of the truths (targets, k, 2).
+    """Return what the tracks of a run are worth, tracked at the instants of the truths (targets, k, 2).
 
     Figures of whole tracks leave out those that are never within the cutoff of a target: a track's
     length is the time from its first to its last instant, and trajectory GOSPA is divided by the root
@@ -88,7 +88,7 @@ def table_of(
 
 
 def means_of(table: pd.DataFrame) -> dict[str, dict[str, float]]:
-    """The means over the runs, by estimator."""
+    """Return the means over the runs, by estimator."""
     means: Any = table.drop(columns="run").groupby("estimator", sort=False).mean()
     return {str(label): row.to_dict() for label, row in means.iterrows()}
 

@@ -1,1 +1,1 @@
-"""Studies of cooperative vehicles: Zhang et al. 2016; begin with `vehicles`."""
+"""Studies cooperative vehicles: Zhang et al. 2016; begin with `vehicles`."""

@@ -1,4 +1,4 @@
-"""Cooperative vehicles in several cases: what each estimator comes to, run by run and step by step."""
+"""Runs cooperative vehicles in several cases: each estimator's errors, by run and by step."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ TRACK_BYTES = NUMBER_BYTES * (4 + 10)
 
 
 class VehiclesOptions(Parameters):
-    """The cases, and what they are compared with.
+    """States the cases, and what they are compared with.
 
     Attributes:
         cases: what differs in the scenario's parameters, by the name of a case.
@@ -43,7 +43,7 @@ class VehiclesOptions(Parameters):
 
 
 class Scores(NamedTuple):
-    """Total errors (20) of every run, with fixed labels and with the best ones, (runs,).
+    """Holds total errors (20) of every run, with fixed labels and with the best ones, (runs,).
 
     By step the squared errors, and GOSPA in m (cutoff 10 m), (runs, steps); `failed` counts runs that
     did not reach the end. Sets have no labels: NaN.
@@ -57,13 +57,13 @@ class Scores(NamedTuple):
     failed: int
 
     def of_first(self, runs: int) -> "Scores":
-        """The scores of the first runs."""
+        """Return the scores of the first runs."""
         by_step = (self.fixed_by_step, self.assigned_by_step, self.gospa_by_step)
         return _scores(*(part[:runs] for part in by_step))
 
 
 class Case(NamedTuple):
-    """One case: its runs, every estimator's scores by label, and what each sends per step in bytes."""
+    """Holds one case: its runs, each estimator's scores by label, and bytes that each sends per step."""
 
     name: str
     sources: Sequence[MemorySource]
@@ -72,14 +72,14 @@ class Case(NamedTuple):
 
     @property
     def parameters(self) -> VehiclesParameters:
-        """What was recorded."""
+        """Return what was recorded."""
         stated = self.sources[0].run
         assert stated is not None
         return VehiclesParameters.model_validate(stated.parameters)
 
     @property
     def has_losses(self) -> bool:
-        """Whether detections are missed or false."""
+        """Tell whether detections are missed or false."""
         network = self.parameters.network
         return network.detection_probability < 1.0 or network.clutter_per_scan > 0.0
 
@@ -145,7 +145,7 @@ def scores_of(
     labels: Iterable[str],
     sets: Sequence[SetErrors] = (),
 ) -> dict[str, Scores]:
-    """The scores of all estimators of the runs; those of sets by the network's fixes."""
+    """Return the scores of all estimators of the runs; those of sets by the network's fixes."""
     times_ns, truths = truths_of(sources)
     of_sets = {each.estimator: each for each in sets if each.case == "network"}
     return {
@@ -159,7 +159,7 @@ def scores_of(
 def bytes_per_step(
     sources: Sequence[Source], estimators: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, float]:
-    """What the members of the network send per scan of the network, on average, by estimator.
+    """Return what the members of the network send per scan of the network, on average, by estimator.
 
     Fixes with identity where the association must be known, without else; of the infrastructure
     sensor nothing, its one number, or its detections.
@@ -167,14 +167,14 @@ def bytes_per_step(
     fixes = [f"/vehicle{number}/fix" for number in vehicle_numbers(sources[0].topics)]
     names = ["/network/scan", "/network/detection", "/infrastructure/scan", "/infrastructure/detection"]
     counts = {name: sum(source.topics[name].messages for source in sources) for name in [*names, *fixes]}
-    steps, told, looks, seen = (counts[name] for name in names)
+    steps, detected, looks, seen = (counts[name] for name in names)
     own = sum(counts[name] for name in fixes)
     found = {}
     for label, settings in estimators.items():
         kind, _, method = str(settings.get("kind", label)).partition(":")
         association, sensor = split_method(method)
         is_known = kind == "vehicle-kalman" or association == "known"
-        sent = own * (POSITION_BYTES + IDENTITY_BYTES) if is_known else told * POSITION_BYTES
+        sent = own * (POSITION_BYTES + IDENTITY_BYTES) if is_known else detected * POSITION_BYTES
         sent += {"topology": NUMBER_BYTES * looks, "": 0}.get(sensor, POSITION_BYTES * seen)
         found[label] = sent / max(steps, 1)
     return found

@@ -1,4 +1,4 @@
-"""How time and error of cooperative vehicles' filters grow with the number of vehicles.
+"""Studies how time and error of vehicles' filters grow with the number of vehicles.
 
 Vehicles start anywhere in a square: one that grows with their number, so that they stay as far apart, or
 one so small that any fix may be of any vehicle. Where a method's time grows faster than any power, it is
@@ -28,7 +28,7 @@ TICKS = (2, 5, 10, 20, 50, 100)
 
 
 class Swept(Parameters):
-    """Up to how many vehicles a method goes, and how its work should grow.
+    """States up to how many vehicles a method goes, and how its work should grow.
 
     Attributes:
         most: largest number of vehicles.
@@ -42,7 +42,7 @@ class Swept(Parameters):
 
 
 class ScalingOptions(Parameters):
-    """The numbers of vehicles, and where they are.
+    """States the numbers of vehicles, and where they are.
 
     Attributes:
         vehicles: numbers of vehicles.
@@ -58,7 +58,7 @@ class ScalingOptions(Parameters):
 
 
 class Growth(NamedTuple):
-    """How time grows over the greater half of the numbers: the power of N, or the factor per vehicle."""
+    """States how time grows over the greater half of the numbers: power of N, and factor per vehicle."""
 
     power: float
     factor: float

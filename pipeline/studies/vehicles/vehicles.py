@@ -1,4 +1,4 @@
-"""The study of cooperative vehicles: total errors by method, bounds and bandwidth.
+"""Studies cooperative vehicles: total errors by method, bounds and bandwidth.
 
 Source: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016.

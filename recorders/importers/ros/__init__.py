@@ -1,4 +1,4 @@
-"""Logs of ROS 1 and ROS 2: .bag, .db3 and MCAP files, and folders of them, without ROS.
+"""Imports logs of ROS 1 and ROS 2: .bag, .db3 and MCAP files, and folders of them, without ROS.
 
 Begin with `importer`.
 """

@@ -74,7 +74,7 @@ def choose(bag: Bag, parameters: RosParameters) -> Choice:
 def stream_names(
     readers: Mapping[Connection, Reader], parameters: RosParameters
 ) -> dict[tuple[str, str], str]:
-    """The name of a stream by topic and kind."""
+    """Return the name of a stream by topic and kind."""
 
     def below(topic: str, taken: Taken) -> str:
         own = topic if taken.is_doubtful else topic.rpartition("/")[0]

@@ -1,4 +1,4 @@
-"""The clocks of a bag: the stamps of headers beside those of the bag, by topic."""
+"""Compares the clocks of a bag: the stamps of headers with those of the bag, by topic."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -48,7 +48,7 @@ class Clocks:
             )
 
     def notes(self) -> dict[str, str]:
-        """Both clocks and their offset, in words."""
+        """Return both clocks and their offset, in words."""
         found = {}
         for name, spans in (("header", self.header), ("bag", self.bag)):
             if spans:

@@ -1,4 +1,4 @@
-"""The importer of ROS logs: topics become streams, and what is not taken is told."""
+"""Imports ROS logs: topics become streams, and what is not taken is told."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ _BLOCK_BYTES = 1 << 24
 
 @dataclass
 class _Pending:
-    """Messages of one size that wait to be read together: their bytes (n, size), rows and stamps."""
+    """Holds messages of one size that wait to be read together: bytes (n, size), rows and stamps."""
 
     raw: list[NDArray[np.uint8]] = field(default_factory=list)
     rows: list[NDArray[np.int64]] = field(default_factory=list)
@@ -37,7 +37,7 @@ class _Pending:
 
 
 class _Import:
-    """The import of one bag: what is chosen of it, what waits to be read, and what is to be told."""
+    """Imports one bag: keeps what is chosen of it, what waits to be read, and what is to be told."""
 
     def __init__(self, bag: Bag, parameters: RosParameters) -> None:
         self.path, self._bag, self._parameters = bag.path, bag, parameters
@@ -54,12 +54,12 @@ class _Import:
     # What is read.
 
     def is_wanted(self, connection: Connection) -> bool:
-        """Whether the messages of a connection are read."""
+        """Tell whether the messages of a connection are read."""
         return connection in self._readers
 
     @property
     def is_full(self) -> bool:
-        """Whether what waits is enough for a block."""
+        """Tell whether what waits is enough for a block."""
         return self._waiting_messages >= _BLOCK_MESSAGES or self._waiting_bytes >= _BLOCK_BYTES
 
     def add(self, batch: Batch) -> None:
@@ -75,7 +75,7 @@ class _Import:
         self._waiting_messages += len(batch.begins)
 
     def block(self, *, is_last: bool = False) -> list[Stream]:
-        """The streams of all that waits."""
+        """Return the streams of all that waits."""
         for (connection, _), pending in self._pending.items():
             rows, log_time_ns = np.concatenate(pending.rows), np.concatenate(pending.log_time_ns)
             for found in self._readers[connection].type.read(np.concatenate(pending.raw), rows):
@@ -176,7 +176,7 @@ class _Import:
 
     @property
     def first_ns(self) -> int:
-        """The first publish time; zero where there is none."""
+        """Return the first publish time; zero where there is none."""
         return self._streams.first_ns or 0
 
     def check(self) -> None:
@@ -188,7 +188,7 @@ class _Import:
             raise BadInput(f"{self.path}: none of its topics could be imported: {facts}")
 
     def notes(self) -> dict[str, str]:
-        """What the bag had, by subject."""
+        """Return what the bag had, by subject."""
         notes = self._clocks.notes()
         counts: Counter[str] = Counter()
         types = {}
@@ -208,7 +208,7 @@ class _Import:
                     f"{chain.left_out} stamps left out at which a transform of the chain is not known"
                 )
         notes |= self._streams.noise
-        for (subject, fact), count in self._streams.told.items():
+        for (subject, fact), count in self._streams.counts.items():
             notes[f"{subject}: {fact}"] = str(count)
         for topic, why in sorted(self._not_taken.items()):
             notes[f"not taken, {topic}"] = f"{counts[topic]} {why}"
@@ -255,7 +255,7 @@ def read(path: Path, parameters: RosParameters) -> Blocks:
     return found
 
 
-def _blocks(path: Path, parameters: RosParameters, told: Blocks) -> Iterator[list[Stream]]:
+def _blocks(path: Path, parameters: RosParameters, result: Blocks) -> Iterator[list[Stream]]:
     with open_bag(path) as bag:
         work = _Import(bag, parameters)
         for batch in bag.batches(work.is_wanted):
@@ -264,8 +264,8 @@ def _blocks(path: Path, parameters: RosParameters, told: Blocks) -> Iterator[lis
                 yield work.block()
         yield work.block(is_last=True)
         work.check()
-        told.notes.update(work.notes())
-        told.epoch_ns = work.first_ns
+        result.notes.update(work.notes())
+        result.epoch_ns = work.first_ns
 
 
 ROS = Importer(

@@ -32,7 +32,7 @@ _IDL_BORDER = "=" * 80 + "\n"
 
 
 class Undecodable(ValueError):
-    """A message, or a definition, that is not as it should be; says why."""
+    """Says why a message, or a definition, cannot be decoded."""
 
 
 def definitions_of(name: str, stated: MessageDefinition, distribution: str) -> Definitions:
@@ -61,7 +61,7 @@ _BASE = get_typestore(Stores.EMPTY).fielddefs
 
 
 class _Number(NamedTuple):
-    """Where a number stands, or so many of them."""
+    """States where a number stands, or so many of them."""
 
     offset: int
     dtype: np.dtype
@@ -69,7 +69,7 @@ class _Number(NamedTuple):
 
 
 class _Text(NamedTuple):
-    """Where a text stands, without the zero at its end."""
+    """States where a text stands, without the zero at its end."""
 
     offset: int
     length: int
@@ -95,7 +95,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Messages:
-    """Messages (n,) of one layout: the bytes (n, size) of each, and their rows among all of a topic."""
+    """Holds messages (n,) of one layout: the bytes (n, size) of each, and their rows in a topic."""
 
     layout: Layout
     raw: NDArray[np.uint8]
@@ -114,7 +114,7 @@ class Messages:
         return column[:, 0] if count is None else column
 
     def text(self, path: str) -> NDArray[np.bytes_]:
-        """A text (n,), as bytes; raises KeyError where there is none."""
+        """Return a text (n,), as bytes; raises KeyError where there is none."""
         offset, length = self.layout.texts[path]
         if not length:
             return np.zeros(len(self), "S1")
@@ -186,7 +186,7 @@ class MessageType:
 
 
 class _Walk:
-    """A walk along one message, field by field."""
+    """Walks along one message, field by field."""
 
     def __init__(self, definitions: Definitions, raw: bytes, encoding: Encoding) -> None:
         self._definitions, self._raw = definitions, raw
@@ -199,7 +199,7 @@ class _Walk:
         self._fix(0, 2 if self._is_cdr else 0)
 
     def layout(self, name: str) -> Layout:
-        """The layout; raises Undecodable where the message does not fit its definition."""
+        """Return the layout; raises Undecodable where the message does not fit its definition."""
         self._walk("", (Nodetype.NAME, name))
         behind = len(self._raw) - self._position
         if not 0 <= behind < (4 if self._is_cdr else 1):

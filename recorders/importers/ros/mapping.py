@@ -1,4 +1,4 @@
-"""Messages of one's own: a TOML file says which of their fields become which stream.
+"""Maps messages of one's own: a TOML file says which of their fields become which stream.
 
 [messages."my_robot_msgs/msg/Wheels"]
 becomes = "VectorMeasurement"                 # one of fuselog's messages
@@ -41,7 +41,7 @@ class MessageMapping(StreamMapping):
 
 
 class Mapping(Parameters):
-    """The mappings of a file.
+    """Holds the mappings of a file.
 
     Attributes:
         messages: what becomes of messages, by the name of their type, such as
@@ -52,7 +52,7 @@ class Mapping(Parameters):
 
 
 def read_mapping(path: Path) -> dict[str, MessageMapping]:
-    """A file of mappings; raises BadInput where it is none, or names what fuselog has not."""
+    """Return a file of mappings; raises BadInput where it is none, or names what fuselog has not."""
     found = build(Mapping, read_toml(path), str(path)).messages
     for name, mapping in found.items():
         schema_of(mapping, f"{path}: the mapping of {name}")

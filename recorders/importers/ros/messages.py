@@ -84,17 +84,17 @@ def stamps_ns(messages: Messages, path: str = STAMP) -> NDArray[np.int64] | None
 
 
 def vector(messages: Messages, path: str, names: str = "xyz") -> Floats:
-    """The numbers (n, d) that a field such as a Vector3 has under `names`."""
+    """Return the numbers (n, d) that a field such as a Vector3 has under `names`."""
     return np.stack([messages.numbers(f"{path}.{name}") for name in names], axis=1).astype(float)
 
 
 def quaternion(messages: Messages, path: str) -> Floats:
-    """A quaternion (n, 4): w, x, y, z."""
+    """Return a quaternion (n, 4): w, x, y, z."""
     return vector(messages, path, "wxyz")
 
 
 def covariance(messages: Messages, path: str) -> Floats:
-    """A covariance (n, d * d), row-major; NaN where it is unknown."""
+    """Return a covariance (n, d * d), row-major; NaN where it is unknown."""
     found = messages.numbers(path).astype(float, copy=False)
     unknown = found[:, 0] == -1.0
     may_be_zeros = np.flatnonzero(found[:, 0] == 0.0)

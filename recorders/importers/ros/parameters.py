@@ -1,4 +1,4 @@
-"""The parameters of an import of ROS."""
+"""Defines the parameters of an import of ROS."""
 
 from typing import Annotated, Literal
 
@@ -22,7 +22,7 @@ Names = Annotated[list[str], BeforeValidator(_as_list)]
 
 
 class RosParameters(Parameters):
-    """Which topics are imported, and by which clock.
+    """States which topics are imported, and by which clock.
 
     Attributes:
         clock: what gives the publish time: the message's header, or the bag.

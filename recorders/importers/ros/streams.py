@@ -1,4 +1,4 @@
-"""The streams that are made of a bag: what waits for the end of a block, and what is counted of it."""
+"""Makes the streams of a bag: keeps what waits for the end of a block, and counts."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ Frames = Sequence[tuple[Mapping[str, str], NDArray[np.bool_]]]
 
 
 class Sent(NamedTuple):
-    """Messages (n,) of a topic: their places in it, and their stamps; None where there is no header."""
+    """Holds messages (n,) of a topic: their places in it, and their stamps; None without a header."""
 
     topic: str
     rows: NDArray[np.int64]
@@ -29,7 +29,7 @@ class Sent(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Some messages of a stream, which are one of its parts of a block."""
+    """Holds some messages of a stream, which are one of its parts of a block."""
 
     rows: NDArray[np.int64]
     publish_time_ns: NDArray[np.int64]
@@ -40,7 +40,7 @@ class _Piece(NamedTuple):
 
 @dataclass
 class _Written:
-    """What a stream keeps from its first block to its last."""
+    """Holds what a stream keeps from its first block to its last."""
 
     schema: Schema
     metadata: dict[str, str]
@@ -56,7 +56,7 @@ class StreamMaker:
     """Makes streams block by block, and counts what is dropped or doubtful.
 
     Attributes:
-        told: how many, by subject and fact.
+        counts: how many, by subject and fact.
         came_of: what has come of a topic, in the order in which it came.
         first_ns: the first publish time of all.
         noise: what is stated of the noise of a topic, or why nothing is.
@@ -69,7 +69,7 @@ class StreamMaker:
         names: Mapping[tuple[str, str], str],
         origin: Origin | None = None,
     ) -> None:
-        self.told: Counter[tuple[str, str]] = Counter()
+        self.counts: Counter[tuple[str, str]] = Counter()
         self.came_of: dict[str, dict[str, None]] = defaultdict(dict)
         self.first_ns: int | None = None
         self.noise: dict[str, str] = {}
@@ -86,7 +86,7 @@ class StreamMaker:
     def tell(self, subject: str, fact: str, count: int) -> None:
         """Count a fact."""
         if count:
-            self.told[subject, fact] += count
+            self.counts[subject, fact] += count
 
     def add(self, sent: Sent, part: Part, frames: Frames, name: str = "") -> None:
         """Take up a part of messages (n,), for the stream `name` or that of their topic and frames."""
@@ -97,7 +97,7 @@ class StreamMaker:
                 self._put(name or self._name(sent.topic, part.kind, frame), sent, part, rows, frame)
 
     def block(self) -> list[Stream]:
-        """The streams of all that waits."""
+        """Return the streams of all that waits."""
         return [
             self._stream(topic, written) for topic, written in self._written.items() if written.pieces
         ]
@@ -183,10 +183,10 @@ class StreamMaker:
             of = f"a standard deviation of {sigma:.3g} {unit}"
             if least <= sigma <= most:
                 written.metadata[name] = f"{sigma * step_s**0.5:.6g}"
-                said = f"{written.metadata[name]}, of {of} every {step_s:.3g} s"
+                statement = f"{written.metadata[name]}, of {of} every {step_s:.3g} s"
             else:
-                said = f"not stated, since {of} is no sensor's"
-            self.noise[f"{topic}: {name}"] = said
+                statement = f"not stated, since {of} is no sensor's"
+            self.noise[f"{topic}: {name}"] = statement
 
     def _stream(self, topic: str, written: _Written) -> Stream:
         """What waits for a stream, in the order in which the bag has it."""

@@ -1,4 +1,4 @@
-"""Transforms between frames (TF): those that are sent, as poses, and named pairs composed of them.
+"""Reads transforms between frames (TF): those sent, as poses, and named pairs composed of them.
 
 A transform is the pose of a child frame in its parent frame. A named pair is composed at the stamps of
 that part of its chain which is sent most often; the others are interpolated between the two nearest,
@@ -23,7 +23,7 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class Transforms:
-    """Poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
+    """Holds poses (n,) of a child frame in its parent frame, with the stamps of sensor and recorder.
 
     `rows` says of which message of its topic each is.
     """
@@ -38,7 +38,7 @@ class Transforms:
         return len(self.stamp_ns)
 
     def take(self, rows: NDArray | slice) -> "Transforms":
-        """Some of them."""
+        """Return some of them."""
         return Transforms(
             self.stamp_ns[rows],
             self.log_time_ns[rows],
@@ -51,7 +51,7 @@ class Transforms:
 def transforms_of(
     messages: Messages, log_time_ns: NDArray[np.int64]
 ) -> Iterator[tuple[Pair, Transforms]]:
-    """The transforms in messages (n,), by parent and child.
+    """Yield the transforms in messages (n,), by parent and child.
 
     Raises BadInput where a quaternion is not of unit length.
     """
@@ -91,7 +91,7 @@ def join(parts: Sequence[Transforms]) -> Transforms:
 
 
 class Chain:
-    """A pair of frames, and the transforms that lead from one to the other.
+    """Holds a pair of frames, and the transforms that lead from one to the other.
 
     Args:
         pair: parent and child.
@@ -119,7 +119,7 @@ class Chain:
             self.left_out += int((found.stamp_ns <= self._done_ns).sum()) if pair == self._leader else 0
 
     def composed(self, *, is_last: bool = False) -> Transforms | None:
-        """The pair's poses since the last call, up to where every part of the chain is known."""
+        """Return the pair's poses since the last call, up to where every part of the chain is known."""
         if self._leader is None or not all(self._held.values()):
             return None
         held = {link: join(parts) for link, parts in self._held.items()}
@@ -146,7 +146,7 @@ class Chain:
 
     @property
     def static(self) -> Transforms | None:
-        """The pair's pose, where it never changes."""
+        """Return the pair's pose, where it never changes."""
         if self._held:
             return None
         zero = np.zeros(1, np.int64)

@@ -1,4 +1,4 @@
-"""Tables of others, such as CSV files, as logs: what their columns are is said by a mapping.
+"""Imports tables of others, such as CSV files: a mapping says what their columns are.
 
 Begin with `importer`.
 """

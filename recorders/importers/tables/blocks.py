@@ -1,4 +1,4 @@
-"""Texts in blocks of whole lines, none of which is too long: memory holds one block at a time."""
+"""Reads texts in blocks of whole lines, none of which is too long: memory holds one block."""
 
 import io
 from collections.abc import Iterator
@@ -28,7 +28,7 @@ def blocks_of(file: BinaryIO) -> Iterator[bytes]:
 
 
 def lines_of(file: BinaryIO) -> Iterator[bytes]:
-    """The lines one by one; raises ValueError where one is longer than a block."""
+    """Yield the lines one by one; raises ValueError where one is longer than a block."""
     while line := file.readline(BLOCK_BYTES + 1):
         if len(line) > BLOCK_BYTES:
             raise ValueError(f"it has a line of more than {BLOCK_BYTES >> 20} MB")
@@ -36,7 +36,7 @@ def lines_of(file: BinaryIO) -> Iterator[bytes]:
 
 
 class Utf8(io.RawIOBase):
-    """A text's blocks for Arrow, whose handler of rows takes no other bytes than UTF-8."""
+    """Gives a text's blocks to Arrow, whose handler of rows takes no other bytes than UTF-8."""
 
     def __init__(self, blocks: Iterator[bytes]) -> None:
         self._blocks, self._rest = blocks, b""

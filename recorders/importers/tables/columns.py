@@ -13,7 +13,7 @@ from recorders.importers.units import unit
 
 
 class GuessedColumn(NamedTuple):
-    """A column: its name, that without its unit in lower case, the unit, and its numbers (rows,)."""
+    """Holds a column: its name, that without its unit in lower case, the unit, its numbers (rows,)."""
 
     name: str
     plain: str
@@ -22,7 +22,7 @@ class GuessedColumn(NamedTuple):
 
 
 class GuessedTable(NamedTuple):
-    """The columns that no stream has yet, how topics begin, and whether the file's name says truth.
+    """Holds the columns without a stream yet, how topics begin, whether the file's name says truth.
 
     `places` are all columns, by which courses are told, and `made` lines of the table itself.
     """
@@ -47,7 +47,7 @@ def take(columns: list[GuessedColumn], *patterns: str) -> list[GuessedColumn]:
 
 
 def take_axes(columns: list[GuessedColumn], *stems: str, axes: str = "xyz") -> list[GuessedColumn]:
-    """The columns of the axes of a vector whose name is one of some."""
+    """Return the columns of the axes of a vector whose name is one of some."""
     for stem in stems:
         before = f"(.*_)?{stem}_?" if stem else ""
         if found := take(columns, *(before + axis for axis in axes)):
@@ -56,14 +56,14 @@ def take_axes(columns: list[GuessedColumn], *stems: str, axes: str = "xyz") -> l
 
 
 def stated_unit(column: GuessedColumn, usual: str) -> str:
-    """The unit that a column's name states, if it is one of the usual one's kind."""
+    """Return the unit that a column's name states, if it is one of the usual one's kind."""
     return column.unit if column.unit and unit(column.unit).powers == unit(usual).powers else ""
 
 
 def unit_by_size(
     columns: Sequence[GuessedColumn], sizes: Mapping[str, tuple[float, float]]
 ) -> tuple[str, str]:
-    """The unit in which a vector's length is as it must be, else the first; and the reason."""
+    """Return the unit in which a vector's length is as it must be, else the first; and the reason."""
     usual = next(iter(sizes))
     if stated := stated_unit(columns[0], usual):
         return stated, "as its name says"
@@ -80,7 +80,7 @@ def length_of(columns: Sequence[GuessedColumn]) -> float:
 
 
 def unit_by_largest(column: GuessedColumn, usual: str, other: str, limit: float) -> tuple[str, str]:
-    """The unit of a column: the other one if its numbers go beyond a limit; and the reason."""
+    """Return the unit of a column: the other one if its numbers go beyond a limit; and the reason."""
     if stated := stated_unit(column, usual):
         return stated, "as its name says"
     largest = largest_of([column])
@@ -139,13 +139,13 @@ def _is_unit(text: str) -> bool:
 
 
 def underlined(name: str) -> str:
-    """A name in lower case, its English words with underlines between them."""
+    """Return a name in lower case, its English words with underlines between them."""
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower().translate(_UMLAUTS)).strip("_")
     return "_".join(_WORDS.get(word, word) for word in plain.split("_"))
 
 
 class Direction(NamedTuple):
-    """What a heading is in, whether it is clockwise from north, and why."""
+    """States what a heading is in, whether it is clockwise from north, and why."""
 
     unit: str
     is_compass: bool

@@ -1,4 +1,4 @@
-"""Files that hold tables, opened one like another: the names of their columns, and batches of rows.
+"""Opens files that hold tables, one like another: the names of columns, and batches of rows.
 
 CSV and its like, Parquet, JSON lines, NumPy's .npz, solutions of RTKLIB (.pos), and the trajectories of
 benchmarks. A batch has an Arrow array for each column that is asked for; memory holds one at a time.
@@ -48,7 +48,7 @@ DAMAGED = (OSError, EOFError, ValueError, zlib.error, lzma.LZMAError, pa.ArrowEx
 
 @dataclass
 class Table:
-    """A file's table: its columns, what gives its rows, what was left out of them, and was mended."""
+    """Reads a file's table: holds its columns, what was left out of its rows, and what was mended."""
 
     path: Path
     columns: list[str]
@@ -68,7 +68,7 @@ class Table:
         raise BadInput(f"{self.path}: has no column '{name}'; {choices(name, self.columns)}")
 
     def batches(self, numbers: Collection[str], texts: Collection[str] = ()) -> Iterator[Batch]:
-        """The rows with these columns, block by block.
+        """Yield the rows with these columns, block by block.
 
         Empty cells are null. Raises BadInput where the file is damaged, or a cell of `numbers` is none.
         """
@@ -77,7 +77,7 @@ class Table:
         except BadInput:
             raise
         except DAMAGED as error:
-            raise BadInput(f"{self.path}: {_said(error, self)}") from None
+            raise BadInput(f"{self.path}: {_reason(error, self)}") from None
 
 
 def open_table(
@@ -121,7 +121,7 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
-def _said(error: Exception, table: Table) -> str:
+def _reason(error: Exception, table: Table) -> str:
     """What Arrow says of a cell, with the column's name and the mend."""
     found = re.search(r"In CSV column #(\d+):.*invalid value '(.*)'", str(error))
     if not found:

@@ -1,4 +1,4 @@
-"""A mapping to start from: which messages the columns of tables are, by their names and numbers.
+"""Guesses a mapping to start from: which messages columns are, by their names and numbers.
 
 Every guess stands in the mapping with its reason as a comment beside it; columns that fit no message
 become a vector of plain numbers. A person reads and mends it: the text is the product, not the import.
@@ -48,7 +48,7 @@ _REFERENCE = r"(?i)(^|[^a-z])(ref|reference|gt|(ground)?_?-?truth|mocap|vicon|op
 
 
 def guess(paths: Sequence[Path]) -> str:
-    """A mapping of tables, in TOML; raises BadInput where a file is no table."""
+    """Return a mapping of tables, in TOML; raises BadInput where a file is no table."""
     files = []
     for path in paths:
         if not path.exists():
@@ -107,7 +107,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
             texts.append(column)
         else:
             columns.append(GuessedColumn(column, *parted(column), values))
-    time, used, told = _time(path, batch, columns, texts)
+    time, used, comments = _time(path, batch, columns, texts)
     if not columns or (not used and len(columns[0].values) < _FEWEST):
         raise BadInput(
             f"{path}: has no column of times, and no column of {_FEWEST} numbers or more; write a "
@@ -115,7 +115,7 @@ def _table(path: Path, name: str, *, is_alone: bool) -> str:
         )
     lines = ["[[tables]]", f"files = {json.dumps(name)}"]
     lines += [f'decimal = "{decimal}"'] * (decimal != ".")
-    lines += [*told, f"time = {time}"]
+    lines += [*comments, f"time = {time}"]
     if all(column.isdecimal() for column in table.columns):
         blanks = ", ".join(f'"{column}"' for column in table.columns)
         lines.append(f"# The file does not name its columns; to name them: columns = [{blanks}]")
@@ -205,16 +205,16 @@ def _time(
         epoch = next((name for name, least in _EPOCHS if middle >= least), None)
         relative = "ns" if step > 1e5 else "us" if step > 1e3 else "ms" if step >= 1 else "s"
         in_unit = column.unit if column.unit in dict(_EPOCHS) else epoch or relative
-        told = []
+        comments = []
         if epoch is None:
-            told = [
+            comments = [
                 f"# Stamps begin at {known[0]:g}: give the date that they count from; check the unit."
             ]
         zero = f', zero = "{_UNKNOWN_ZERO}"' if epoch is None else ""
         given = {"column": column.name, "unit": in_unit, "zero": _UNKNOWN_ZERO}
         mapping = TimeMapping.model_validate(given)
         text = f'{{ column = {json.dumps(column.name)}, unit = "{in_unit}"{zero} }}'
-        return text, {column.name}, [*told, *_seen(mapping, batch)]
+        return text, {column.name}, [*comments, *_seen(mapping, batch)]
     return (
         '{ rate_hz = 1, zero = "2026-01-01" }',
         set(),
@@ -232,12 +232,12 @@ def _dated(batch: Batch, names: Sequence[str]) -> tuple[str, set[str], list[str]
     cell = " ".join(_first_cell(batch[name]) for name in names)
     is_of_day = re.match(r"\d{1,2}:\d{2}", cell) is not None
     given: dict[str, Any] = {"column": list(names), "unit": "date"}
-    told = ['# If its clock is not UTC: zone = "Europe/Berlin", or utc_offset_h = 8.']
+    comments = ['# If its clock is not UTC: zone = "Europe/Berlin", or utc_offset_h = 8.']
     if zone := _zone(names):
-        given["zone"], told = zone, []
+        given["zone"], comments = zone, []
     if is_of_day:
         given["zero"] = _UNKNOWN_ZERO
-        told.append("# These times have no date: give the day in zero.")
+        comments.append("# These times have no date: give the day in zero.")
     fitting = {}
     for pattern in formats_of(cell):
         mapping = TimeMapping.model_validate({**given, "format": pattern})
@@ -247,12 +247,12 @@ def _dated(batch: Batch, names: Sequence[str]) -> tuple[str, set[str], list[str]
         return None
     (pattern, seen), *others = fitting.items()
     if others:
-        told.append(f"# Day and month may be exchanged: {others[0][0]} fits as well.")
+        comments.append(f"# Day and month may be exchanged: {others[0][0]} fits as well.")
     if pattern != ISO:
         given["format"] = pattern
     given["column"] = names[0] if len(names) == 1 else list(names)
     parts = [f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in given.items()]
-    return f"{{ {', '.join(parts)} }}", set(names), [*seen, *told]
+    return f"{{ {', '.join(parts)} }}", set(names), [*seen, *comments]
 
 
 def _zone(names: Sequence[str]) -> str:
@@ -279,17 +279,17 @@ def _seen(mapping: TimeMapping, batch: Batch) -> list[str]:
     usual_s = float(np.median(forward))
     gaps = forward[forward > 5 * usual_s]
     rate = f"{1 / usual_s:.4g}"
-    told = f"# {rate} {'row' if rate == '1' else 'rows'} a second"
+    comment = f"# {rate} {'row' if rate == '1' else 'rows'} a second"
     if len(gaps):
         what = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
-        told += f"; {what} over {5 * usual_s:.3g} s, the longest {gaps.max():.3g} s"
+        comment += f"; {what} over {5 * usual_s:.3g} s, the longest {gaps.max():.3g} s"
     for one, many, which in (
         ("repeats", "repeat", steps_s == 0),
         ("goes back", "go back", steps_s < 0),
     ):
         if which.any():
-            told += f"; 1 stamp {one}" if which.sum() == 1 else f"; {which.sum()} stamps {many}"
-    return [f"{told}."]
+            comment += f"; 1 stamp {one}" if which.sum() == 1 else f"; {which.sum()} stamps {many}"
+    return [f"{comment}."]
 
 
 # What columns are together.

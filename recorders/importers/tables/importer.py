@@ -1,4 +1,4 @@
-"""The importer of tables: rows become messages by a mapping, and what is left out is told."""
+"""Imports tables: rows become messages by a mapping, and what is left out is told."""
 
 import heapq
 from collections import Counter
@@ -29,7 +29,7 @@ from recorders.recording import Blocks, Importer
 
 
 class TableParameters(Parameters):
-    """The mapping, and what differs between recordings.
+    """States the mapping, and what differs between recordings.
 
     Attributes:
         mapping: the mapping, by its name (walk) or file (own.toml).
@@ -75,7 +75,7 @@ def read(path: Path, parameters: TableParameters) -> Blocks:
 
 
 def _blocks(
-    paths: list[Path], mapping: LogMapping, generator: np.random.Generator, told: Blocks
+    paths: list[Path], mapping: LogMapping, generator: np.random.Generator, result: Blocks
 ) -> Iterator[list[Stream]]:
     files, others = find_files(mapping, paths)
     counts: ReadCounts = Counter()
@@ -90,12 +90,12 @@ def _blocks(
             f"{paths[0]}: no row has a time that can be read, so that nothing can be imported; check "
             "`time` in the mapping"
         )
-    told.epoch_ns = min(firsts.values())
+    result.epoch_ns = min(firsts.values())
     _check_clocks({sources[number].path: first for number, first in firsts.items()}, mapping)
     origin = mapping.origin or next(filter(None, (source.first_fix() for source in sources)), None)
     is_stated = mapping.origin is not None
     plane = None if origin is None else Plane(origin, mapping.projection, is_stated)
-    yield [_constant(each, told.epoch_ns) for each in mapping.constants]
+    yield [_constant(each, result.epoch_ns) for each in mapping.constants]
     # the file that is furthest behind comes next, so that the log is nearly in the order of time
     queue = [(first, number) for number, first in firsts.items()]
     heapq.heapify(queue)
@@ -107,11 +107,11 @@ def _blocks(
     if not any(source.messages.total() for source in sources):
         facts = "; ".join(f"{topic}: {fact}" for topic, fact in counts) or "it has no rows"
         raise BadInput(f"{paths[0]}: none of its rows could be imported: {facts}")
-    told.notes.update(_notes(sources, plane, mapping))
-    told.notes.update({f"{subject}: {fact}": str(count) for (subject, fact), count in counts.items()})
+    result.notes.update(_notes(sources, plane, mapping))
+    result.notes.update({f"{subject}: {fact}": str(count) for (subject, fact), count in counts.items()})
     not_taken = {other.name for other in others} - {source.tag_name for source in sources}
     if not_taken:
-        told.notes["files not taken"] = some_of(sorted(not_taken))
+        result.notes["files not taken"] = some_of(sorted(not_taken))
 
 
 def _check_clocks(firsts: Mapping[Path, int], mapping: LogMapping) -> None:

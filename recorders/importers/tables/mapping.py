@@ -1,4 +1,4 @@
-"""Mappings of tables: a TOML file says which files, which columns, and what becomes of them.
+"""Defines mappings of tables: a TOML file says which files and columns, and what becomes of them.
 
 [[tables]]
 files = "imu_{unit}.csv"                          # {unit} stands for anything, and is {unit} below
@@ -40,7 +40,7 @@ _SHIPPED = resources.files("fuselog_data") / "mappings"
 
 
 class Origin(Parameters):
-    """Where the local plane of east, north and up touches.
+    """States where the local plane of east, north and up touches.
 
     Attributes:
         latitude_deg: latitude of the origin.
@@ -54,7 +54,7 @@ class Origin(Parameters):
 
 
 class Geodetic(Parameters):
-    """Columns with a place; with them there are columns east_m, north_m and up_m.
+    """Names columns with a place; with them there are columns east_m, north_m and up_m.
 
     Attributes:
         latitude: column of the latitude.
@@ -70,7 +70,7 @@ class Geodetic(Parameters):
 
 
 class Attitude(Parameters):
-    """Columns with angles of a body of forward, left, up; with them there are quaternion_w to _z.
+    """Names columns with angles of a body of forward, left, up; they give quaternion_w to _z.
 
     They turn to a frame of east, north, up.
 
@@ -92,7 +92,7 @@ class Attitude(Parameters):
 
 
 class TableStream(StreamMapping):
-    """A stream of a table's rows.
+    """Describes a stream of a table's rows.
 
     Attributes:
         topic: name of the topic.
@@ -124,7 +124,7 @@ def _once(pattern: str) -> str:
 
 
 class TableMapping(Parameters):
-    """The files of one kind, and the streams of their rows.
+    """Describes the files of one kind, and the streams of their rows.
 
     Attributes:
         files: a pattern of names, from the given folder on, or of the name of a given file; * and {name}
@@ -157,7 +157,7 @@ class TableMapping(Parameters):
 
 
 class ConstantStream(Parameters):
-    """Messages that stand in the mapping itself, such as anchors; their stamps are the log's first.
+    """Holds messages that stand in the mapping, such as anchors; their stamps are the log's first.
 
     Attributes:
         topic: name of the topic.
@@ -175,7 +175,7 @@ class ConstantStream(Parameters):
 
     @property
     def mapping(self) -> StreamMapping:
-        """The same in the language of streams: one row, and messages for each of these."""
+        """Return the same in the language of streams: one row, and messages for each of these."""
         rows = [dict(row) for row in self.rows]
         return StreamMapping(
             becomes=self.becomes, each=rows, components=self.components, kinds=self.kinds
@@ -183,7 +183,7 @@ class ConstantStream(Parameters):
 
 
 class LogMapping(Parameters):
-    """A mapping: how the tables of a recording become a log.
+    """Maps the tables of a recording to a log.
 
     Attributes:
         summary: what it is for.
@@ -204,7 +204,7 @@ class LogMapping(Parameters):
 
 
 def shipped() -> list[str]:
-    """The names of the mappings that ship."""
+    """Return the names of the mappings that ship."""
     return sorted(
         each.name.removesuffix(".toml") for each in _SHIPPED.iterdir() if each.name.endswith(".toml")
     )
@@ -236,7 +236,7 @@ def adapted(
     mounting_deg: tuple[float, float, float] | None = None,
     delays_s: Mapping[str, float] | None = None,
 ) -> LogMapping:
-    """The mapping with another mounting, of all streams that it turns, and other delays by topic.
+    """Return the mapping with another mounting, of all streams that it turns, and other delays by topic.
 
     Raises BadInput where it turns none, or has no such topic.
     """
@@ -282,7 +282,7 @@ def recordings_in(mapping: LogMapping, place: Path) -> list[Path]:
 
 
 class FileMatch(NamedTuple):
-    """A file, its mapping, and what the names in braces stand for."""
+    """Holds a file, its mapping, and what the names in braces stand for."""
 
     path: Path
     table: TableMapping

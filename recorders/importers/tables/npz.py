@@ -1,4 +1,4 @@
-"""NumPy's archives of arrays (.npz) as columns, block by block: memory holds no array as a whole."""
+"""Reads NumPy's archives of arrays (.npz) as columns, block by block: memory holds no whole array."""
 
 import zipfile
 from collections.abc import Callable, Collection, Iterator
@@ -16,7 +16,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 class _Array(NamedTuple):
-    """An array of an archive.
+    """Describes an array of an archive.
 
     Attributes:
         member: its name in the archive.
@@ -33,26 +33,26 @@ class _Array(NamedTuple):
 
     @property
     def width(self) -> int:
-        """How many columns it is."""
+        """Count how many columns it is."""
         return self.shape[1] if len(self.shape) == 2 else 1
 
 
 class _Column(NamedTuple):
-    """A column: of which array, and which one of it."""
+    """Describes a column: of which array, and which one of it."""
 
     array: _Array
     number: int
 
 
 class Columns(NamedTuple):
-    """The columns of an archive, and what reads some of them by their names, block by block."""
+    """Reads columns of an archive by their names, block by block."""
 
     names: list[str]
     read: Callable[[Collection[str]], Iterator[dict[str, NDArray]]]
 
 
 def columns_of(path: Path, most_columns: int, block_bytes: int) -> Columns:
-    """The arrays as columns; those with a second axis are NAME.0, NAME.1, ...
+    """Return the arrays as columns; those with a second axis are NAME.0, NAME.1, ...
 
     Raises BadInput where they are not of one length, and ValueError where the archive is damaged, or has
     more columns or larger values than can be read.

@@ -1,4 +1,4 @@
-"""Patterns of files' names: * and ? as in a shell, and {name} for what is then known by that name.
+"""Matches patterns of files' names: * and ? as in a shell, and {name} for what is known by it.
 
 A match takes time that grows with both lengths, whatever the pattern is: an expression of `re` tries all
 ways in which many stars may share a name.
@@ -10,7 +10,7 @@ _WILD = re.compile(r"(\{\w+\}|\*|\?)")
 
 
 def names_in(pattern: str) -> list[str]:
-    """The names in braces."""
+    """Return the names in braces."""
     return [part[1:-1] for part in _WILD.split(pattern)[1::2] if part not in "*?"]
 
 

@@ -1,4 +1,4 @@
-"""The plane that a log's positions are in, made of places on the earth."""
+"""Makes the plane that a log's positions are in of places on the earth."""
 
 from functools import cache
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class Plane(NamedTuple):
-    """East, north and up from an origin: tangent to the ellipsoid, or on the map of a projection.
+    """Gives east, north and up from an origin: tangent to the ellipsoid, or on a projection's map.
 
     Where the mapping states the origin, all positions of the log are in this plane.
     """

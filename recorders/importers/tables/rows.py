@@ -1,4 +1,4 @@
-"""The rows of one file, batch by batch, as streams."""
+"""Reads the rows of one file, batch by batch, as streams."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ ReadCounts = Counter[tuple[str, str]]
 
 
 class Rows:
-    """A file that is being imported: its next batch lies ready, and what is left out is counted.
+    """Imports a file: its next batch lies ready, and what is left out is counted.
 
     `generator` makes the noise that the mapping asks for. Raises BadInput where the file cannot be read,
     or lacks a column that its mapping names.
@@ -141,7 +141,7 @@ class Rows:
     # What the first rows say.
 
     def first_ns(self) -> int | None:
-        """The earliest stamp of the first rows."""
+        """Return the earliest stamp of the first rows."""
         if self._next is None:
             return None
         stamps = self._stamps(self._next, self._time)
@@ -149,7 +149,7 @@ class Rows:
         return int(known.min()) if len(known) else None
 
     def first_fix(self) -> Origin | None:
-        """The first place of the file."""
+        """Return the first place of the file."""
         fixes = next((each for each in self.mapping.streams if each.becomes == "GeodeticFix"), None)
         if self.mapping.geodetic is None and fixes is None:
             return None
@@ -171,7 +171,7 @@ class Rows:
     # What becomes of them.
 
     def block(self, plane: Plane | None) -> list[Stream]:
-        """The streams of the next batch."""
+        """Return the streams of the next batch."""
         assert self._next is not None
         batch, self._next = self._next, next(self._batches, None)
         stamps = self._stamps(batch, self._time)

@@ -1,4 +1,4 @@
-"""Stamps of tables: numbers since some zero, dates, GPS weeks, or none but a rate; exact to the ns."""
+"""Reads stamps of tables: numbers since some zero, dates, GPS weeks, or a rate; exact to the ns."""
 
 import re
 import struct
@@ -40,7 +40,7 @@ NOT_A_TIME = np.iinfo(np.int64).min
 
 
 class TimeMapping(Parameters):
-    """Where a row's time stands.
+    """States where a row's time stands.
 
     Attributes:
         column: one column, or several whose texts belong together, such as date and time.
@@ -89,7 +89,7 @@ class TimeMapping(Parameters):
 
     @property
     def columns(self) -> list[str]:
-        """All columns that are read, in order."""
+        """Return all columns that are read, in order."""
         texts = [self.column] if isinstance(self.column, str) else self.column
         return [*texts, *([self.week] if self.week else [])]
 
@@ -101,7 +101,7 @@ class TimeMapping(Parameters):
 
 
 def offset_of(zone: str) -> float | ZoneInfo:
-    """How many hours a zone is ahead of UTC, or its rules where these are not always the same.
+    """Return how many hours a zone is ahead of UTC, or its rules where these are not always the same.
 
     Raises ValueError where there is no such zone.
     """
@@ -116,7 +116,7 @@ def offset_of(zone: str) -> float | ZoneInfo:
 
 
 def formats_of(cell: str) -> Iterator[str]:
-    """The formats that a date or time of day as text may have, the likeliest first.
+    """Yield the formats that a date or time of day as text may have, the likeliest first.
 
     >>> list(formats_of("05.10.2026 14:03:07,25"))
     ['%d.%m.%Y %H:%M:%S,%f']
@@ -154,7 +154,7 @@ def _date_ns(text: str) -> int:
 def stamps_ns(
     mapping: TimeMapping, columns: Mapping[str, pa.Array], first_row: int, size: int, where: str
 ) -> Stamps:
-    """The stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
+    """Return the stamps (n,) of rows in ns, `NOT_A_TIME` where there is none.
 
     `first_row` is the number of rows before these. Raises BadInput, which begins with `where`, where a
     cell holds no time, or one beyond what a log can hold.
@@ -198,9 +198,9 @@ def _counted_ns(cells: pa.Array, digits: int, label: str) -> Stamps:
             try:
                 cells = texts.cast(pa.float64())
             except pa.ArrowInvalid as error:
-                said = str(error).splitlines()[0]
+                why = str(error).splitlines()[0]
                 raise BadInput(
-                    f'{label} has cells that are not numbers ({said}); dates need unit = "date"'
+                    f'{label} has cells that are not numbers ({why}); dates need unit = "date"'
                 ) from None
         else:
             # a decimal of `digits` digits is kept as so many units of the last one: nanoseconds
@@ -238,9 +238,9 @@ def _dates_ns(mapping: TimeMapping, cells: list[pa.Array], label: str) -> Stamps
             rows = (zones == zone) & (since_ns != NOT_A_TIME)
             since_ns[rows] = _from_zone(since_ns[rows], offset_of(zone))
     except ValueError as error:
-        said = str(error).splitlines()[0]
+        why = str(error).splitlines()[0]
         raise BadInput(
-            f"{label} has cells that are not dates ({said}); give their `format`, or the unit of numbers"
+            f"{label} has cells that are not dates ({why}); give their `format`, or the unit of numbers"
         ) from None
     return since_ns
 
@@ -260,7 +260,7 @@ def _from_zone(local_ns: Stamps, zone: float | ZoneInfo) -> Stamps:
 
 
 class Counter(NamedTuple):
-    """A file's own counter, in ns: where it begins, when that was, and what one ns of its own takes.
+    """Describes a file's own counter, in ns: where it begins, when that was, what one ns of it takes.
 
     `cut_ns` is the last reading where its line was cut off within it, else NOT_A_TIME.
     """
@@ -271,14 +271,14 @@ class Counter(NamedTuple):
     cut_ns: int
 
     def stamps_ns(self, ticks_ns: Stamps) -> Stamps:
-        """The stamps (n,) of readings; one of a line that was cut off has none."""
+        """Return the stamps (n,) of readings; one of a line that was cut off has none."""
         since = np.rint((ticks_ns - self.first_ns) * self.rate).astype(np.int64)
         none = (ticks_ns < self.first_ns) | (ticks_ns == self.cut_ns)
         return np.where(none, NOT_A_TIME, self.start_ns + since)
 
 
 def read_counter(path: Path, suffix: str, ticks_ns: Iterator[Stamps]) -> Counter:
-    """The counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
+    """Return the counter of a file by its time tag, RTKLIB's, of the file's name and `suffix`.
 
     A tag has from byte 64 on a time_t and a fraction of a second, when the file was begun, and from byte
     76 on pairs of 4 bytes: ms since then, and how long the file was. `ticks_ns` are all readings.

@@ -1,4 +1,4 @@
-"""What becomes of the autopilot's own filter, EKF2: its states and innovations, and a simulator's truth.
+"""Imports the autopilot's own filter, EKF2: its states and innovations, and a simulator's truth.
 
 PX4's innovations are what was predicted minus what was measured; ours have the other sign. It fuses one
 component after the other, and logs the variance of each alone: the covariances here are diagonal.
@@ -34,7 +34,7 @@ TOPICS = (*_INNOVATIONS, _LOCAL, _ATTITUDE, "estimator_states", "estimator_statu
 
 
 class _Sensor(NamedTuple):
-    """The innovations of a sensor: their fields, and what we call them; with the sign that is ours.
+    """Names the innovations of a sensor: their fields, what we call them, and the sign that is ours.
 
     `bits` are by component those of the filter's status that say that it is in use: one of them is set;
     none where no bit says it.
@@ -110,7 +110,7 @@ _FIELDS = tuple(dict.fromkeys(name for sensor in _SENSORS.values() for name in s
 
 
 class _Table(NamedTuple):
-    """Rows (n,) of numbers (n, k) by their key in us, with their stamps."""
+    """Holds rows (n,) of numbers (n, k) by their key in us, with their stamps."""
 
     key_us: NDArray[np.int64]
     time_us: NDArray[np.int64]
@@ -130,7 +130,7 @@ class _Table(NamedTuple):
 
 
 def label_of(instance: int) -> str:
-    """What an instance of the filter is called as an estimator."""
+    """Return what an instance of the filter is called as an estimator."""
     return f"ekf2_{instance}" if instance else "ekf2"
 
 
@@ -151,7 +151,7 @@ class Autopilot:
         self._status: dict[int, _Table] = {}
 
     def parts(self, rows: list[Rows]) -> Iterator[Part]:
-        """The parts of a block's rows; what lacks its counterpart waits for the next block."""
+        """Yield the parts of a block's rows; what lacks its counterpart waits for the next block."""
         for each in rows:
             fields = Fields(each)
             if fields.has("control_mode_flags"):

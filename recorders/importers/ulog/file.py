@@ -29,7 +29,7 @@ _LEVELS = ("emergency", "alert", "critical", "error", "warning", "notice", "info
 
 
 class Rows(NamedTuple):
-    """Some rows (n,) of a topic's instance, in the order of the file.
+    """Holds some rows (n,) of a topic's instance, in the order of the file.
 
     `time_us` are their stamps, for rows without one those between which they lie in the file, of which
     `untimed` counts how many.
@@ -43,7 +43,7 @@ class Rows(NamedTuple):
 
 
 class Text(NamedTuple):
-    """What the autopilot said: when, how grave it is, and what."""
+    """Holds what the autopilot said: when, how grave it is, and what."""
 
     time_us: int
     level: str
@@ -51,7 +51,7 @@ class Text(NamedTuple):
 
 
 class _Subscription(NamedTuple):
-    """What the rows of a number are."""
+    """Says what the rows of a number are."""
 
     topic: str
     instance: int
@@ -59,7 +59,7 @@ class _Subscription(NamedTuple):
 
 
 class UlogFile:
-    """A ULog, read once from its beginning to its end.
+    """Reads a ULog once, from its beginning to its end.
 
     Attributes:
         path: the file.
@@ -96,7 +96,7 @@ class UlogFile:
             raise BadInput(f"{path}: cannot be read ({error.strerror}); give a .ulg file") from error
 
     def blocks(self, is_wanted: Callable[[str], bool]) -> Iterator[list[Rows]]:
-        """The rows of the topics that are wanted, a block for some megabytes of the file."""
+        """Yield the rows of the topics that are wanted, a block for some megabytes of the file."""
         ends = sorted({each for each in self._appended if self._begins <= each < self._size})
         if len(ends) < len(self._appended):
             self.losses["appended section that lies outside of the file"] += 1

@@ -1,4 +1,4 @@
-"""The layouts of ULog's messages: format definitions, flattened to NumPy's types."""
+"""Lays out ULog's messages: format definitions, flattened to NumPy's types."""
 
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
@@ -15,11 +15,11 @@ _MOST_BYTES = 0xFFFF - 2
 
 
 class Damaged(Exception):
-    """A definition that cannot be used, and why."""
+    """Says why a definition cannot be used."""
 
 
 class FormatField(NamedTuple):
-    """One field of a format: its type, how many of it (0: no array), and its name."""
+    """Describes one field of a format: its type, how many of it (0: no array), and its name."""
 
     type: str
     length: int
@@ -27,7 +27,7 @@ class FormatField(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """How the messages of a topic lie in a file.
+    """Describes how the messages of a topic lie in a file.
 
     `dtype` has a field for every number, as `q[0]` or `esc[1].rpm`; padding at its end, which a message
     may lack, is not in it: a message has between `dtype.itemsize` and `most_bytes` bytes. `stamp` is
@@ -40,7 +40,7 @@ class Layout(NamedTuple):
 
 
 def parsed(text: str) -> tuple[str, list[FormatField]]:
-    """The name and the fields of a format; raises Damaged."""
+    """Return the name and the fields of a format; raises Damaged."""
     name, colon, rest = text.partition(":")
     if not colon or not name:
         raise Damaged("a format has no name")

@@ -1,4 +1,4 @@
-"""From PX4's frames into ours: NED into ENU, and of the body FRD into FLU (forward, left, up)."""
+"""Converts PX4's frames into ours: NED into ENU, and of the body FRD into FLU (forward, left, up)."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""The importer of ULog: topics become streams, and what is not taken is told."""
+"""Imports ULog: topics become streams, and what is not taken is told."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ class UlogParameters(Parameters):
 
 
 class _Surroundings(NamedTuple):
-    """The origin of the filter's plane on the earth; None where the log states none."""
+    """Holds the origin of the filter's plane on the earth; None where the log states none."""
 
     origin: Origin | None
 
@@ -53,38 +53,38 @@ def _surroundings(path: Path) -> _Surroundings:
 
 
 class _Import:
-    """The import of one file: its streams, block after block, and what is to be told."""
+    """Imports one file: makes its streams, block after block, and keeps what is to be told."""
 
     def __init__(self, file: UlogFile, origin: Origin | None) -> None:
         self._file, self._origin = file, origin
         self._autopilot = Autopilot(file.parameters)
         self._noise = stated_noise(file.parameters)
-        self._told: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._first_ns: int | None = None
 
     def block(self, rows: list) -> list[Stream]:
-        """The streams of a block's rows."""
+        """Return the streams of a block's rows."""
         parts: list[Part] = []
         for each in rows:
             if each.untimed:
-                said = f"{each.topic}: rows without a stamp, timed by their neighbours in the file"
-                self._told[said] += each.untimed
+                fact = f"{each.topic}: rows without a stamp, timed by their neighbours in the file"
+                self._counts[fact] += each.untimed
             if each.topic not in SENSORS:
                 continue
             try:
                 parts += SENSORS[each.topic](Fields(each))
             except (KeyError, ValueError) as error:
-                self._told[f"{each.topic}: rows whose fields are others ({error})"] += len(each.data)
+                self._counts[f"{each.topic}: rows whose fields are others ({error})"] += len(each.data)
         parts += self._autopilot.parts([each for each in rows if each.topic in TOPICS])
         return [stream for part in parts if (stream := self._stream(part)) is not None]
 
     def _stream(self, part: Part) -> Stream | None:
         for reason, count in part.left_out.items():
-            self._told[f"{part.topic}: left out {reason}"] += count
+            self._counts[f"{part.topic}: left out {reason}"] += count
         if not len(part.time_us):
             return None
         bad = not_finite(part.schema, dict(part.columns)) | (part.time_us < 0)
-        self._told[f"{part.topic}: left out, NaN or infinite"] += int(bad.sum())
+        self._counts[f"{part.topic}: left out, NaN or infinite"] += int(bad.sum())
         kept = part.take(np.flatnonzero(~bad)[np.argsort(part.time_us[~bad], kind="stable")])
         if not len(kept.time_us):
             return None
@@ -102,7 +102,7 @@ class _Import:
         return in_plane(stream, self._origin)
 
     def last(self) -> list[Stream]:
-        """The streams that are whole only at the end: parameters, and what the logger lost."""
+        """Return the streams that are whole only at the end: parameters, and what the logger lost."""
         file = self._file
         streams = []
         if file.parameters:
@@ -139,7 +139,7 @@ class _Import:
 
     @property
     def epoch_ns(self) -> int:
-        """The first stamp."""
+        """Return the first stamp."""
         return self._first_ns or 0
 
     def check(self) -> None:
@@ -152,7 +152,7 @@ class _Import:
             )
 
     def notes(self) -> dict[str, str]:
-        """What the file had, by subject."""
+        """Return what the file had, by subject."""
         file = self._file
         notes = {
             "frames": "north, east, down became east, north, up; forward, right, down became forward, "
@@ -163,7 +163,7 @@ class _Import:
         notes |= carried(file.parameters)
         for number, text in enumerate(file.texts, start=1):
             notes[f"text {number}, {text.time_us * 1e-6:.3f} s, {text.level}"] = text.text
-        for what, count in (self._told + self._autopilot.left_out).items():
+        for what, count in (self._counts + self._autopilot.left_out).items():
             notes[what] = str(count)
         for what, count in (+file.losses).items():
             notes[f"lost, {what}"] = str(count)
@@ -191,7 +191,7 @@ def read(path: Path, parameters: UlogParameters) -> Blocks:  # noqa: ARG001
     return found
 
 
-def _blocks(path: Path, told: Blocks) -> Iterator[list[Stream]]:
+def _blocks(path: Path, result: Blocks) -> Iterator[list[Stream]]:
     origin = _surroundings(path).origin
     file = UlogFile(path)
     work = _Import(file, origin)
@@ -199,8 +199,8 @@ def _blocks(path: Path, told: Blocks) -> Iterator[list[Stream]]:
         yield work.block(rows)
     work.check()
     yield work.last()
-    told.notes.update(work.notes())
-    told.epoch_ns = work.epoch_ns
+    result.notes.update(work.notes())
+    result.epoch_ns = work.epoch_ns
 
 
 ULOG = Importer("ULog, the logs of PX4 autopilots: a .ulg file", UlogParameters, read)

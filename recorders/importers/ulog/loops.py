@@ -1,4 +1,4 @@
-"""The loops over a ULog's data: where messages begin, and which are whose; see `recorders.log.loops`."""
+"""Loops over a ULog's data: where messages begin, and which are whose; see `recorders.log.loops`."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ NUMBERS = 1 << 16
 
 
 class Walk(NamedTuple):
-    """Where the messages of a piece of a file begin, in bytes.
+    """States where the messages of a piece of a file begin, in bytes.
 
     `data` are those with a topic's numbers, `others` all others. `end` is where the walk stopped, at a
     message that is not whole, or that can be none if `is_broken`.
@@ -29,7 +29,7 @@ class Walk(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What is known of the topic of every number (NUMBERS,); of a number without one `since` is never.
+    """Holds what is known of each number's topic (NUMBERS,); `since` of a number without one is never.
 
     A row has `least` to `most` bytes, begins from the byte `since` on and before the byte `until` of the
     file, and has its stamp at the byte `stamp`.
@@ -43,7 +43,7 @@ class Known(NamedTuple):
 
 
 class Sorted(NamedTuple):
-    """Rows (n,) of a piece, by their number.
+    """Holds rows (n,) of a piece, by their number.
 
     `order` has the rows number by number, each in the file's order, and `counts` (NUMBERS + 1,) how many
     each has; those that are no topic's come last. `stamps` are in us, 0 of what is no topic's;

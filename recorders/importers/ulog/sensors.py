@@ -21,7 +21,7 @@ _INVALID_US = 2**31 - 1
 
 @dataclass(frozen=True)
 class Part:
-    """Messages (n,) of a stream: when they were measured and logged, in us, and their columns.
+    """Holds messages (n,) of a stream: when they were measured and logged, in us, and their columns.
 
     Rows where a required number is not finite are left out by whoever makes the stream; `left_out`
     counts others by reason.
@@ -36,7 +36,7 @@ class Part:
     left_out: Mapping[str, int] = field(default_factory=dict)
 
     def take(self, which: NDArray) -> "Part":
-        """The messages of some rows."""
+        """Return the messages of some rows."""
         columns = {name: column[which] for name, column in self.columns.items()}
         return Part(
             self.topic, self.schema, self.time_us[which], self.logged_us[which], columns, self.metadata,
@@ -45,16 +45,16 @@ class Part:
 
 
 class Fields(NamedTuple):
-    """The fields of a topic's rows, as numbers."""
+    """Holds the fields of a topic's rows, as numbers."""
 
     rows: Rows
 
     def has(self, name: str) -> bool:
-        """Whether there is such a field."""
+        """Tell whether there is such a field."""
         return name in (self.rows.data.dtype.names or ())
 
     def of(self, name: str) -> Floats:
-        """A field (n,); NaN where there is none of the name."""
+        """Return a field (n,); NaN where there is none of the name."""
         if not self.has(name):
             return np.full(len(self.rows.data), np.nan)
         return self.rows.data[name].astype(float)
@@ -76,7 +76,7 @@ class Fields(NamedTuple):
     def part(
         self, topic: str, schema: Schema, metadata: Mapping[str, str] | None = None, **columns: Floats
     ) -> Part:
-        """All rows as messages of a stream."""
+        """Return all rows as messages of a stream."""
         return Part(
             f"{BODY}/{topic}", schema, self.measured_us, self.rows.time_us, columns, metadata or {}
         )
@@ -90,7 +90,7 @@ class Fields(NamedTuple):
 
 
 def combined(fields: Fields) -> Iterator[Part]:
-    """The inertial unit that the filter uses; of old firmware also magnetometer and barometer."""
+    """Yield the inertial unit that the filter uses; of old firmware also magnetometer and barometer."""
     force = to_flu(fields.vector("accelerometer_m_s2", width=3))
     rate = to_flu(fields.vector("gyro_rad", width=3))
     yield _inertial(fields, "inertial", force, rate)
@@ -131,7 +131,7 @@ def _at_own_time(fields: Fields, sensor: str, part: Part) -> Part:
 
 
 def unit(fields: Fields) -> Iterator[Part]:
-    """One of several inertial units: what it turned and gained, over how long that took."""
+    """Yield one of several inertial units: what it turned and gained, over how long that took."""
     spans = {}
     for of in ("angle", "velocity"):
         span = fields.of(f"delta_{of}_dt")
@@ -144,18 +144,18 @@ def unit(fields: Fields) -> Iterator[Part]:
 
 
 def accelerometer(fields: Fields) -> Iterator[Part]:
-    """One accelerometer as it is, in its own axes."""
+    """Yield one accelerometer as it is, in its own axes."""
     names = {f"force_{axis}_mps2": axis for axis in "xyz"}
     yield fields.values(f"accelerometer_{fields.rows.instance}", names)
 
 
 def gyro(fields: Fields) -> Iterator[Part]:
-    """One gyro as it is, in its own axes."""
+    """Yield one gyro as it is, in its own axes."""
     yield fields.values(f"gyro_{fields.rows.instance}", {f"rate_{axis}_radps": axis for axis in "xyz"})
 
 
 def magnetometer(fields: Fields) -> Iterator[Part]:
-    """The magnetometer that the filter uses, under a name by which no model takes it unasked.
+    """Yield the magnetometer that the filter uses, under a name by which no model takes it unasked.
 
     A model needs to be told the field of the place: `--set topics.magnetic_field=/vehicle/magnetometer`.
     """
@@ -165,13 +165,13 @@ def magnetometer(fields: Fields) -> Iterator[Part]:
 
 
 def raw_magnetometer(fields: Fields) -> Iterator[Part]:
-    """One magnetometer."""
+    """Yield one magnetometer."""
     field_ut = _GAUSS_UT * to_flu(fields.vector("x", "y", "z"))
     yield _magnetic(fields, f"magnetometer_{fields.rows.instance}", field_ut)
 
 
 def gnss(fields: Fields) -> Iterator[Part]:
-    """A receiver's position and velocity; eph, epv and s_variance_m_s are standard deviations."""
+    """Yield a receiver's position and velocity; eph, epv and s_variance_m_s are standard deviations."""
     if fields.has("latitude_deg"):
         place = fields.vector("latitude_deg", "longitude_deg", "altitude_ellipsoid_m")
     else:
@@ -202,7 +202,7 @@ def gnss(fields: Fields) -> Iterator[Part]:
 
 
 def air(fields: Fields) -> Iterator[Part]:
-    """The barometer that the filter uses: its height in the standard atmosphere."""
+    """Yield the barometer that the filter uses: its height in the standard atmosphere."""
     yield fields.values(
         "barometer",
         {"altitude_m": "baro_alt_meter", "pressure_pa": "baro_pressure_pa",
@@ -211,13 +211,13 @@ def air(fields: Fields) -> Iterator[Part]:
 
 
 def barometer(fields: Fields) -> Iterator[Part]:
-    """One barometer; its pressure is in Pa, of old firmware in hPa."""
+    """Yield one barometer; its pressure is in Pa, of old firmware in hPa."""
     names = {"pressure": "pressure", "temperature_degc": "temperature"}
     yield fields.values(f"barometer_{fields.rows.instance}", names)
 
 
 def airspeed(fields: Fields) -> Iterator[Part]:
-    """The speed through the air."""
+    """Yield the speed through the air."""
     names = {"indicated_mps": "indicated_airspeed_m_s", "true_mps": "true_airspeed_m_s"}
     yield fields.values(f"airspeed_{fields.rows.instance}", names)
 
@@ -234,7 +234,7 @@ def flow(fields: Fields) -> Iterator[Part]:
 
 
 def distance(fields: Fields) -> Iterator[Part]:
-    """The range of a distance sensor."""
+    """Yield the range of a distance sensor."""
     names = {"distance_m": "current_distance", "variance_m2": "variance"}
     yield fields.values(f"distance_{fields.rows.instance}", names)
 

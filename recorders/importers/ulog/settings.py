@@ -1,4 +1,4 @@
-"""What parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing there."""
+"""Says what parameters of PX4's EKF2 mean for the model `inertial`, and why others mean nothing."""
 
 from collections.abc import Mapping
 from fnmatch import fnmatchcase
@@ -32,7 +32,7 @@ _REASONS = {
 
 
 def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
-    """What channels state of their noise, by the last part of their topics."""
+    """Return what channels state of their noise, by the last part of their topics."""
     root_s = (1e-6 * parameters.get(_STEP_US, _DEFAULT_STEP_US)) ** 0.5
     stated = {
         ours: f"{parameters[name] * root_s:.6g}"
@@ -43,7 +43,7 @@ def stated_noise(parameters: Mapping[str, float]) -> dict[str, dict[str, str]]:
 
 
 def carried(parameters: Mapping[str, float]) -> dict[str, str]:
-    """What becomes of parameters, by subject: numbers of channels, settings, or why nothing."""
+    """Return what becomes of parameters, by subject: numbers of channels, settings, or why nothing."""
     notes = {}
     stated = [name for name in _DENSITIES if name in parameters]
     if stated:

@@ -1,4 +1,4 @@
-"""The MCAP container: chunks, indexes, and a file that appears whole or not at all.
+"""Reads and writes MCAP: chunks, indexes, and a file that appears whole or not at all.
 
 Begin with `reading`.
 """

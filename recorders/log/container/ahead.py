@@ -1,4 +1,4 @@
-"""A few threads that work ahead.
+"""Runs a few threads that work ahead.
 
 Packing and opening chunks is compiled code that lets other threads run, so they share the cores, and the
 file is read or written meanwhile.

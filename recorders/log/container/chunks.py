@@ -1,4 +1,4 @@
-"""Regions of an MCAP file as bytes: packing a chunk, opening one, and the small records around them.
+"""Handles regions of an MCAP file as bytes: packs a chunk, opens one, and the small records about.
 
 A region is a chunk, or a run of records outside chunks, which is laid out like an uncompressed chunk.
 Source: the MCAP specification (mcap.dev/spec).
@@ -60,11 +60,11 @@ _RECORDS: dict[int, Any] = {
 
 
 class Damaged(ValueError):
-    """A part of a file that cannot be read; says which and why."""
+    """Says which part of a file cannot be read, and why."""
 
 
 class Span(NamedTuple):
-    """Spans from the first to the last time, both included."""
+    """Holds spans from the first to the last time, both included."""
 
     first_ns: int
     last_ns: int
@@ -79,7 +79,7 @@ class Span(NamedTuple):
 
 
 class Contents(NamedTuple):
-    """An opened region: its bytes, where in them the messages of each channel start, what it declares.
+    """Holds an opened region: its bytes, where each channel's messages start, what it declares.
 
     `spans` is empty where there are no messages.
     """
@@ -166,7 +166,7 @@ def _stated_size(region: bytes) -> int:
 
 
 def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
-    """The small records in `data`, those of other kinds left out.
+    """Yield the small records in `data`, those of other kinds left out.
 
     Raises Damaged where one is not whole or cannot be understood.
     """
@@ -183,7 +183,7 @@ def read_records(data: bytes | memoryview, start: int = 0) -> Iterator[Any]:
 
 
 class _Whole(io.BytesIO):
-    """Bytes that never read short, as mcap's records would let pass."""
+    """Reads bytes, and raises where mcap's records would let a short read pass."""
 
     def read(self, size: int | None = -1) -> bytes:
         found = super().read(size)

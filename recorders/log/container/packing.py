@@ -13,7 +13,7 @@ INDEX_ENTRY = np.dtype([("log_time_ns", "<u8"), ("offset", "<u8")])
 
 
 class Chunk(NamedTuple):
-    """The records of one chunk, its spans of time, and the entries of its message indexes by channel."""
+    """Holds the records of one chunk, its spans of time, and its message indexes by channel."""
 
     data: memoryview
     log_time: Span

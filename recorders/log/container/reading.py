@@ -1,4 +1,4 @@
-"""The MCAP container: which regions of a file hold messages, and what else stands in it.
+"""Reads the MCAP container: which regions of a file hold messages, and what else stands in it.
 
 The data section is walked record by record. A chunk that the summary tells of is stepped over; any other
 is opened on the way, so that a file without an index, or with one that leaves chunks out, is read all
@@ -78,7 +78,7 @@ class Container:
 
 
 class _Place(NamedTuple):
-    """One record, bytes that are lost, or a run of loose records.
+    """Holds one record, bytes that are lost, or a run of loose records.
 
     A run is as if it were one message, or one schema where it has declarations alone.
     """
@@ -89,25 +89,25 @@ class _Place(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Where the next one starts."""
+        """Return where the next one starts."""
         return self.offset + self.length
 
 
 class _Summary(NamedTuple):
-    """The records of the summary, and where it begins; None where that is not known."""
+    """Holds the records of the summary, and where it begins; None where that is not known."""
 
     records: Sequence[Any] = ()
     start: int | None = None
 
 
 class _Index(NamedTuple):
-    """What a summary says of the chunks, by their place in the file, and of the messages, by channel."""
+    """Holds what a summary says of the chunks, by their place, and of the messages, by channel."""
 
     chunks: dict[int, records.ChunkIndex]
     message_counts: Counter[int]
 
     def chunk(self, place: _Place) -> records.ChunkIndex | None:
-        """The entry of the chunk that stands there, where an index has it right and not empty."""
+        """Return the entry of the chunk that stands there, where an index has it right and not empty."""
         entry = self.chunks.get(place.offset)
         if entry is None or (place.opcode, place.length) != (Opcode.CHUNK, entry.chunk_length):
             return None
@@ -116,7 +116,7 @@ class _Index(NamedTuple):
 
 
 class NotMcap(BadInput):
-    """A file of some other kind, which some commands take in another way."""
+    """Says that a file is of some other kind, which some commands take in another way."""
 
 
 def open_container(path: Path, *, use_index: bool = True) -> Container:
@@ -134,7 +134,7 @@ def open_container(path: Path, *, use_index: bool = True) -> Container:
 
 
 def read_bytes(file: BinaryIO, offset: int, length: int) -> bytes:
-    """The `length` bytes of `file` from `offset` on, which were there when it was opened."""
+    """Return the `length` bytes of `file` from `offset` on, which were there when it was opened."""
     file.seek(offset)
     found = file.read(length)
     if len(found) < length:

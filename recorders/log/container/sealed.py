@@ -1,4 +1,4 @@
-"""Our own metadata records, sealed with a checksum, since MCAP gives a metadata record none."""
+"""Seals our own metadata records with a checksum, since MCAP gives a metadata record none."""
 
 import json
 import zlib
@@ -13,12 +13,12 @@ _SEAL = "crc32"
 
 
 def seal(pairs: Mapping[str, str]) -> dict[str, str]:
-    """The pairs of a record of ours with their checksum beside them."""
+    """Return the pairs of a record of ours with their checksum beside them."""
     return {**pairs, _SEAL: _checksum(pairs)}
 
 
 def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
-    """The pairs without their checksum, which is compared; a foreign record as it is.
+    """Return the pairs without their checksum, which is compared; a foreign record as it is.
 
     Raises Damaged where the checksum is wrong.
     """
@@ -31,7 +31,7 @@ def unseal(name: str, pairs: Mapping[str, str]) -> dict[str, str]:
 
 
 def note_span(offset: int, length: int, span: Span) -> tuple[str, str]:
-    """The pair of `PUBLISH_SPANS` that tells of the chunk at these bytes of the file."""
+    """Return the pair of `PUBLISH_SPANS` that tells of the chunk at these bytes of the file."""
     return f"{offset}+{length}", f"{span.first_ns} {span.last_ns}"
 
 

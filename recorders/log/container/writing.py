@@ -1,4 +1,4 @@
-"""Writing an MCAP file that appears whole or not at all: its records, indexes and summary.
+"""Writes an MCAP file that appears whole or not at all: its records, indexes and summary.
 
 It is renamed when it is whole. The small records are mcap's own; chunks and their indexes come from
 `packing`. Source: the MCAP specification (mcap.dev/spec).
@@ -82,7 +82,7 @@ class ContainerWriter:
             self._file.close()
 
     def add_schema(self, name: str, description: bytes) -> int:
-        """The number of a protobuf schema; it is written where it is new."""
+        """Return the number of a protobuf schema; it is written where it is new."""
         if description not in self._schemas:
             number = len(self._schemas) + 1
             schema = records.Schema(id=number, data=description, encoding="protobuf", name=name)
@@ -91,7 +91,7 @@ class ContainerWriter:
         return self._schemas[description].id
 
     def add_channel(self, topic: str, schema_id: int, metadata: Mapping[str, str]) -> int:
-        """The number of a new channel."""
+        """Return the number of a new channel."""
         channel = records.Channel(
             id=len(self._channels) + 1,
             topic=topic,

@@ -93,6 +93,9 @@ def recursive(
         allocates: whether `follow` makes arrays, see
             `replay.engine.compiling.compile.compile_over_runs`.
 
+    Returns:
+        The estimator, which `replay` takes.
+
     The shortest range so far, of everything that was seen:
 
     >>> class Shortest(NamedTuple):
@@ -107,7 +110,6 @@ def recursive(
     >>> nearest = recursive(
     ...     "shortest range so far",
     ...     streams={"/range": schemas.RANGE},
-    ...     static={},
     ...     components={"range_m": "linear"},
     ...     start=start,
     ...     follow=follow,
@@ -166,7 +168,7 @@ def recursive(
         def run(carried: _Carried | None, block: Block) -> tuple[_Carried, list[Ragged]]:
             # without static topics, the first block is what tells how many runs there are
             carried = carried or started({}, len(block.events.offsets) - 1)
-            settings, before, told, generators = carried
+            settings, before, reported, generators = carried
             if advance is not None:
                 state, outcome = advance(settings, before, block)
                 return carried._replace(state=state), outcome
@@ -176,11 +178,11 @@ def recursive(
             results = made.blank(len(messages.time_ns))
             generators = _drawn_on(generators, messages, values) if draws else generators
             advance_all((settings, messages, state, results), generators)
-            is_lost = ~np.isfinite(np.reshape(state[0], (len(told), -1)).sum(axis=1))
-            failing: NDArray[np.bool_] = is_lost & ~told & (np.diff(messages.offsets) > 0)
-            told = told | failing
+            is_lost = ~np.isfinite(np.reshape(state[0], (len(reported), -1)).sum(axis=1))
+            failing: NDArray[np.bool_] = is_lost & ~reported & (np.diff(messages.offsets) > 0)
+            reported = reported | failing
             outcome = made.of_block(messages, results, np.flatnonzero(failing))
-            return _Carried(settings, state, told, generators), [*outcome, *made.of_skipped(skipped)]
+            return _Carried(settings, state, reported, generators), [*outcome, *made.of_skipped(skipped)]
 
         return Recursive(name, *_topics(bound), begin, run, _priors(bound))
 
@@ -232,12 +234,26 @@ def batch(
 ) -> Estimator[ParametersType]:
     """Make an estimator that solves whole streams.
 
-    Args as for `recursive`, and:
+    Args:
+        summary: what it is, in one line.
+        parameters: their type; without one there are none.
+        streams: the topics of measurements, within the span that is replayed, with their schemas.
+        static: the topics that are read whole, such as a map or a prior.
+        find: as for `recursive`.
+        requirements: as for `recursive`.
+        variant: as for `recursive`.
+        components: the estimate's components by name, with their kinds.
+        truth: the topic with the truth of what is estimated.
+        measured: the components of the innovations, where `solve` gives them.
+        optional: which of `streams` and `static` a log may lack.
         outputs: further outputs by name, with their schemas; see `Estimates.further`.
         solve: solve(given) gets the streams and static topics of all runs, by the names asked for;
             `each_run` makes it of a function of one run. Where the outputs are other than Gaussian
             estimates there are no `components`, and it returns the output streams, whose topics are
             /estimates/ + `Given.name` and more.
+
+    Returns:
+        The estimator, which `replay` takes.
 
     The mean of all ranges:
 
@@ -248,7 +264,6 @@ def batch(
     >>> average = batch(
     ...     "mean range",
     ...     streams={"/range": schemas.RANGE},
-    ...     static={},
     ...     components={"range_m": "linear"},
     ...     solve=each_run(mean_range),
     ... )
@@ -290,13 +305,16 @@ def batch(
 def each_run(
     solve: Callable[[OneRun, ParametersType], Estimates],
 ) -> Callable[[Given[ParametersType]], Solved]:
-    """Solve run by run, for `batch`: solve(streams, parameters) gets a run's streams by name.
+    """Make a function that solves run by run, for `batch`, of one that solves a run.
 
-    They know more of the run: `OneRun.prior`, `stated` and a `generator`. Where `solve` raises, that
-    run has failed; where all do, it is the input that is bad.
+    Where `solve` raises, that run has failed; where all do, it is the input that is bad.
 
     Args:
-        solve: (streams, parameters) -> the estimates of a run.
+        solve: (streams, parameters) -> the estimates of a run. The streams go by name, and know more
+            of the run: `OneRun.prior`, `stated` and a `generator`.
+
+    Returns:
+        The function, for the argument `solve` of `batch`.
     """
 
     def solve_all(given: Given[ParametersType]) -> Solved:
@@ -371,12 +389,12 @@ def _estimator(
 
 
 class _Carried(NamedTuple):
-    """Holds what a recursion carries from block to block; `told` (runs,): whose failure was reported.
+    """Holds what a recursion carries from block to block; `reported` (runs,): whose failure was.
 
     A run's generator is None until there is a message, or where none is wanted.
     """
 
     settings: Any
     state: Any
-    told: NDArray[np.bool_]
+    reported: NDArray[np.bool_]
     generators: Generators

@@ -63,14 +63,14 @@ class Given(Mapping[str, Ragged], Generic[ParametersType]):
     setup: Any = None
 
     def stated(self, topic: str, name: str) -> float:
-        """Return the parameter `name`, or where it is None the number that the topic's channel states.
+        """Return the parameter `name`, or where it is None the number that `topic`'s channel states.
 
         Raises BadInput where neither does.
         """
         return given_or_stated(self.parameters, [self.topics[topic]], name)
 
     def prior(self, topic: str) -> tuple[Integers, Floats, Floats]:
-        """Return the prior of every run: stamps (runs,), means (runs, d), covariances (runs, t, t).
+        """Return each run's prior of `topic`: stamps (runs,), means (runs, d), covariances (runs, t, t).
 
         They are of the estimate's components, in their order, whatever the log's order is. NaN where a
         run has none that can be used: it has failed, and gets no messages.
@@ -103,11 +103,11 @@ class OneRun(Mapping[str, Stream]):
     run: int
 
     def stated(self, topic: str, name: str) -> float:
-        """See `Given.stated`."""
+        """Return the parameter `name`, or what the channel of `topic` states; see `Given.stated`."""
         return self.given.stated(topic, name)
 
     def prior(self, topic: str) -> tuple[int, Floats, Floats]:
-        """Return the run's prior, see `Given.prior`: stamp, mean (d,), covariance (t, t)."""
+        """Return the run's prior of `topic`: stamp, mean (d,), covariance (t, t); see `Given.prior`."""
         stream = self[topic]
         time_ns, mean, covariance = gaussians(Ragged(stream, np.array([0, len(stream)])))
         return int(time_ns[0]), mean[0], covariance[0]

@@ -79,9 +79,13 @@ class Diagnostics(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Holds innovations of a batch's measurements: stamps (n,), (n, m) with covariances (n, m, m).
+    """Holds innovations of a batch's measurements.
 
-    `target` (n,) is what each was about; 0 unless given.
+    Attributes:
+        time_ns: (n,), the stamps.
+        innovation: (n, m), measured minus predicted.
+        covariance: (n, m, m), those of the innovations.
+        target: (n,), what each was about; 0 unless given.
     """
 
     time_ns: Integers
@@ -154,14 +158,14 @@ class Outputs:
     def of_block(self, messages: Messages, results: Results, failing: Integers) -> list[Ragged]:
         """Return the outputs of one block; of several estimates at a stamp the last stands."""
         # what is said of a covariance that is none is for the replay to find
-        said = np.isfinite(np.einsum("nd->n", results.mean))
-        rows = _last_of_stamps(messages, np.flatnonzero(said))
+        is_estimate = np.isfinite(np.einsum("nd->n", results.mean))
+        rows = _last_of_stamps(messages, np.flatnonzero(is_estimate))
         columns = messages.time_ns, messages.offsets, self.components, self.truth
         state = states_in(rows, f"{self.topic}/state", *columns, results.mean, results.covariance)
         failures = {}
         for run in failing.tolist():
             begin, end = messages.offsets[run : run + 2]
-            last = np.flatnonzero(said[begin:end]).max(initial=-1)
+            last = np.flatnonzero(is_estimate[begin:end]).max(initial=-1)
             end_ns = messages.time_ns[min(begin + last + 1, end - 1)]
             failures[run] = Failure(int(end_ns), DIVERGED)
         made = [
@@ -206,11 +210,11 @@ class Outputs:
         stream = innovation_stream(topic, self.measured, self.truth, columns)
         return Ragged(stream, np.searchsorted(rows, messages.offsets))
 
-    def _further_of_block(self, messages: Messages, told: Floats) -> Iterator[Ragged]:
+    def _further_of_block(self, messages: Messages, numbers: Floats) -> Iterator[Ragged]:
         first = 0
         for name, schema in self.further.items():
             names = [field.name for field in schema.fields[1:]]
-            own, first = told[:, first : first + len(names)], first + len(names)
+            own, first = numbers[:, first : first + len(names)], first + len(names)
             rows = np.flatnonzero(np.isfinite(own[:, 0]))
             columns = dict(zip(names, own[rows].T, strict=True))
             stream = make_stream(f"{self.topic}/{name}", schema, messages.time_ns[rows], **columns)
@@ -235,17 +239,21 @@ class Outputs:
             yield self._innovations_of_run(estimates.innovations)
         for name, schema in self.further.items():
             if name in estimates.further:
-                told = estimates.further[name]
-                columns: dict[str, Any] = dict(told.columns)
-                yield make_stream(f"{self.topic}/{name}", schema, told.time_ns, **columns)
+                further = estimates.further[name]
+                columns: dict[str, Any] = dict(further.columns)
+                yield make_stream(f"{self.topic}/{name}", schema, further.time_ns, **columns)
 
-    def _innovations_of_run(self, told: Measured | None) -> Stream:
+    def _innovations_of_run(self, innovations: Measured | None) -> Stream:
         m = len(self.measured)
-        told = told or Measured(np.empty(0, np.int64), np.empty((0, m)), np.empty((0, m, m)))
-        time_ns, innovation, covariance = self._checked("innovations.", told[:3], ((), (m,), (m, m)))
+        innovations = innovations or Measured(
+            np.empty(0, np.int64), np.empty((0, m)), np.empty((0, m, m))
+        )
+        time_ns, innovation, covariance = self._checked(
+            "innovations.", innovations[:3], ((), (m,), (m, m))
+        )
         count = len(time_ns)
         weighted = np.linalg.solve(covariance, innovation[..., None])[..., 0]
-        target = np.zeros(count, np.int64) if told.target is None else told.target
+        target = np.zeros(count, np.int64) if innovations.target is None else innovations.target
         squared, accepted = np.einsum("ni,ni->n", innovation, weighted), np.ones(count, np.int64)
         columns = InnovationColumns(time_ns, target, accepted, innovation, covariance, squared)
         return innovation_stream(f"{self.topic}/innovation", self.measured, self.truth, columns)

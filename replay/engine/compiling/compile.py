@@ -47,6 +47,9 @@ def compiled(
     Args:
         function: plain Python over arrays and numbers.
         allocates: whether it makes arrays.
+
+    Returns:
+        The function that does the same compiled.
     """
 
     @cache

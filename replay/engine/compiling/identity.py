@@ -20,9 +20,9 @@ _OF_PYTHON = {"numpy", *sys.stdlib_module_names}
 
 def identity(function: FunctionType) -> str:
     """Return the words of a function, each thing that it needs described once."""
-    told: dict[int, int] = {}
+    known: dict[int, int] = {}
     kept: list[Any] = []  # whose ids are keys
-    return "\n".join(_words(function, told, kept, ()))
+    return "\n".join(_words(function, known, kept, ()))
 
 
 @cache
@@ -33,11 +33,11 @@ def digest_of(room: str) -> str:
     return sha256(b"".join(sources)).hexdigest()
 
 
-def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[str]) -> Iterator[str]:
+def _words(value: Any, known: dict[int, int], kept: list[Any], names: Sequence[str]) -> Iterator[str]:
     """Return the words of what is used by code that has these names, among them its attributes."""
 
     def of(part: Any) -> Iterator[str]:
-        return _words(part, told, kept, names)
+        return _words(part, known, kept, names)
 
     own = getattr(value, "kernel_identity", None)
     if callable(own) and not isinstance(value, type):  # it knows what it is, see replay.tracing
@@ -51,8 +51,8 @@ def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[st
     elif isinstance(value, np.ndarray):
         yield f"{value.dtype} {value.shape} {sha256(value.tobytes()).hexdigest()}"
     elif isinstance(value, FunctionType):
-        if _is_told(value, told, kept):
-            yield f"again {told[id(value)]}"
+        if _is_known(value, known, kept):
+            yield f"again {known[id(value)]}"
             return
         yield f"def {value.__name__} {value.__defaults__!r}"
         yield from _code(value.__code__)
@@ -74,8 +74,8 @@ def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[st
                     yield name
                     yield from of(vars(value)[name])
     elif hasattr(value, "__dict__") and not callable(value):
-        if _is_told(value, told, kept):
-            yield f"again {told[id(value)]}"
+        if _is_known(value, known, kept):
+            yield f"again {known[id(value)]}"
             return
         yield from of(type(value))
         for name, each in sorted(vars(value).items()):
@@ -89,11 +89,11 @@ def _words(value: Any, told: dict[int, int], kept: list[Any], names: Sequence[st
         yield repr(value)
 
 
-def _is_told(value: Any, told: dict[int, int], kept: list[Any]) -> bool:
+def _is_known(value: Any, known: dict[int, int], kept: list[Any]) -> bool:
     """Tell whether it was described before, which it is from now on."""
-    if id(value) in told:
+    if id(value) in known:
         return True
-    told[id(value)] = len(told)
+    known[id(value)] = len(known)
     kept.append(value)
     return False
 

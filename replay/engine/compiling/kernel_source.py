@@ -22,7 +22,7 @@ _NAME = "_defined_here"
 
 
 class DoesNotCompile(BadInput):
-    """Raised for a function that numba cannot compile, with its line and the reason."""
+    """Says which function numba cannot compile, with its line and the reason."""
 
 
 class KernelSource:

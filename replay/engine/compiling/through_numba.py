@@ -68,10 +68,10 @@ class _Loop:
         return through
 
     def _explained(self, error: NumbaError) -> DoesNotCompile:
-        said = re.sub(r"\x1b\[\d*m", "", str(error))  # bold where colorama is installed
-        reason = next(line for line in said.splitlines() if not line.startswith("Failed in"))
+        text = re.sub(r"\x1b\[\d*m", "", str(error))  # bold where colorama is installed
+        reason = next(line for line in text.splitlines() if not line.startswith("Failed in"))
         reason = re.sub(r",? ?(defined )?at \w+_[0-9a-f]{16} \(\d+\)", "", reason)
-        line = re.search(r'File "(\w+_[0-9a-f]{16})", line (\d+)', said)
+        line = re.search(r'File "(\w+_[0-9a-f]{16})", line (\d+)', text)
         place = self._places.get((line[1], int(line[2])), "") if line else ""
         return DoesNotCompile(f"kernel '{self._name}' does not compile: {reason}{place}")
 

@@ -1,4 +1,4 @@
-"""Which topic each innovation is of, where an estimator takes several: that with a message of its stamp.
+"""Finds which topic each innovation is of, where an estimator takes several: the same stamp tells.
 
 Innovations do not say it. Where messages of several topics have one stamp, and as many innovations have
 it, these are of them in the order of the file. Where they are fewer or more, or have another stamp, as
@@ -22,7 +22,7 @@ MOST_WAITING = 1 << 18
 
 
 class _Messages(NamedTuple):
-    """Messages (n,): of which run, when, the place in its file, the number of the topic."""
+    """Holds messages (n,): of which run, when, the place in its file, the number of the topic."""
 
     run: Integers
     time_ns: Integers
@@ -32,7 +32,7 @@ class _Messages(NamedTuple):
 
 @dataclass
 class Attribution:
-    """Innovations by topic, for one estimator.
+    """Counts innovations by topic, for one estimator.
 
     Attributes:
         used, gated: how many were taken, and how many refused, by topic.

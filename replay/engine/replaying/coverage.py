@@ -14,7 +14,7 @@ Integers = NDArray[np.int64]
 
 
 class Coverage:
-    """At what intervals a case's estimates come, run by run, in bins of factors of two.
+    """Counts the intervals between a case's estimates, run by run, in bins of factors of two.
 
     Intervals much longer than the usual one, and than a second, are gaps. The last block is counted
     when somebody asks.
@@ -27,7 +27,7 @@ class Coverage:
     def __init__(self, topic: str, starts_ns: Integers) -> None:
         self.topic = topic
         self.last_ns = starts_ns.copy()
-        self.said = np.zeros(len(starts_ns), bool)
+        self.has_estimates = np.zeros(len(starts_ns), bool)
         self._runs = len(starts_ns)
         self._last_block: tuple[Integers, ...] = ()
 
@@ -37,9 +37,9 @@ class Coverage:
         offsets, time_ns = estimates.offsets, estimates.stream.publish_time_ns
         self._last_block = offsets, time_ns, self.last_ns
         if len(time_ns):
-            is_told = offsets[1:] > offsets[:-1]
-            self.said = self.said | is_told
-            self.last_ns = np.where(is_told, time_ns[offsets[1:] - 1], self.last_ns)
+            has_some = offsets[1:] > offsets[:-1]
+            self.has_estimates = self.has_estimates | has_some
+            self.last_ns = np.where(has_some, time_ns[offsets[1:] - 1], self.last_ns)
 
     @cached_property
     def _counts(self) -> Integers:

@@ -190,16 +190,16 @@ class Estimator(Generic[ParametersType]):
         return self.summary
 
     def specified(self, label: str, settings: Mapping[str, Any]) -> "Estimator[Any]":  # noqa: ARG002
-        """Return the estimator that settings make of it: another where they name a foreign filter."""
+        """Return what `settings` of `label` make of it: another where they name a foreign filter."""
         return self
 
     # one of any model has these by what the name says: `_OfAnyModel`
     def parameters_with(self, name: str, variant: Mapping[str, Any]) -> type[Parameters]:  # noqa: ARG002
-        """Return the parameters that count under a name with a variant, such as `smoother:iterated`."""
+        """Return the parameters that count under `name` with `variant`, as `smoother:iterated`."""
         return self.parameters
 
     def parameters_by_model(self, name: str, variant: Mapping[str, Any]) -> dict[str, type[Parameters]]:  # noqa: ARG002
-        """Return the parameters for each model that it may estimate; none where it is of no model."""
+        """Return by model the parameters under `name` with `variant`; none where it is of no model."""
         return {}
 
 

@@ -152,14 +152,14 @@ def _take(
         ready = arrivals.moment_ns < _reached(streams)[arrivals.run]
     newest_ns, behind_ns = _find_behind(arrivals, ready, state.newest_ns)
     is_late = behind_ns > late.back_ns
-    told = [_skipped(bound.name, arrivals, is_late, late)]
+    skipped = [_skipped(bound.name, arrivals, is_late, late)]
     arrived_ns = state.arrived_ns
     if late.policy == "wait":
         arrived_ns, waited = _waited(bound.name, streams, arrived_ns, late)
-        told.append(waited)
+        skipped.append(waited)
     inner, made = bound.run(state.inner, _block(arrivals, ready & ~is_late))
     waiting = {} if ready.all() else _block(arrivals, ~ready).streams
-    return _State(inner, waiting, newest_ns, arrived_ns), [*told, *made]
+    return _State(inner, waiting, newest_ns, arrived_ns), [*skipped, *made]
 
 
 class _Arrivals(NamedTuple):

@@ -84,7 +84,7 @@ class RunMonitor:
         self._first_ns, self._last_ns = np.full(runs, FOREVER), np.full(runs, -1)
         self._unable: dict[int, str] = {}
         self._failed: dict[int, Failure] = {}
-        self._told: dict[str, list[Ragged]] = {}
+        self._failures: dict[str, list[Ragged]] = {}
         self._coverages: dict[str, Coverage] = {}
         self._states: set[str] = set()
         self._speaks = False
@@ -128,7 +128,7 @@ class RunMonitor:
         for each in sound:
             topic, schema = each.stream.topic, each.stream.schema.full_name
             if schema == FAILURE:
-                self._told.setdefault(topic, []).append(each)
+                self._failures.setdefault(topic, []).append(each)
                 continue
             if schema == GAUSSIAN and self.plane is not None:
                 passed.append(replace(each, stream=in_plane(each.stream, self.plane)))
@@ -148,24 +148,24 @@ class RunMonitor:
         """Return all failures of all runs: those found here beside the estimator's own."""
         if self.usage is not None:
             self.usage.shares.end()
-        told = {topic: join(parts) for topic, parts in self._told.items()}
+        failures = {topic: join(parts) for topic, parts in self._failures.items()}
         for run, reason in self._unable.items():
             if self._last_ns[run] >= 0:
                 self._failed[run] = Failure(int(self._first_ns[run]), reason)
         failed = set(self._failed).union(
-            *(np.flatnonzero(np.diff(each.offsets)).tolist() for each in told.values())
+            *(np.flatnonzero(np.diff(each.offsets)).tolist() for each in failures.values())
         )
         self._find_silence(failed)
         own_topic = f"/estimates/{self.name}/failure"
-        topic = own_topic if own_topic in told else next(iter(told), own_topic)
-        if not (self._failed or told):
+        topic = own_topic if own_topic in failures else next(iter(failures), own_topic)
+        if not (self._failed or failures):
             return [_no_failures(topic, self.runs)]
         if self._failed:
             runs = sorted(self._failed)
             own = failure_stream(topic, [self._failed[run] for run in runs])
             ours = Ragged(own, np.searchsorted(runs, np.arange(self.runs + 1)))
-            told[topic] = join([told[topic], ours]) if topic in told else ours
-        return list(told.values())
+            failures[topic] = join([failures[topic], ours]) if topic in failures else ours
+        return list(failures.values())
 
     def coverage(self) -> list[Ragged]:
         """For each case, how much of every run's span was estimated; none of a run without messages.
@@ -305,7 +305,7 @@ class RunMonitor:
         coverages = [self._coverages[case] for case in self._states]
         if not coverages:
             return
-        mute = ~reduce(np.logical_or, (coverage.said for coverage in coverages))
+        mute = ~reduce(np.logical_or, (coverage.has_estimates for coverage in coverages))
         found = mute
         if not self._is_batch:
             silent = (coverage.misses(self._last_ns) for coverage in coverages)

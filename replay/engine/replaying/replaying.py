@@ -114,9 +114,9 @@ def replay(
     if refused and not is_part:
         raise next(iter(refused.values()))
     states = [start.state for start in starts]
-    told = [ragged for start in starts for ragged in start.told]
-    if told:
-        yield told
+    beginnings = [ragged for start in starts for ragged in start.streams]
+    if beginnings:
+        yield beginnings
     for bound, monitor, given in zip(estimators, monitors, states, strict=True):
         if isinstance(bound, Batch):
             for block in _required(ensemble, bound.streams, order, sys.maxsize):
@@ -157,13 +157,13 @@ class _Start(NamedTuple):
         state: of a recursion, or what a batch is given; _REFUSED where it can start in no run.
         unable: by run why it cannot start there.
         why: the reason where it can start in no run.
-        told: the streams of what it begins with.
+        streams: those of what it begins with.
     """
 
     state: Any
     unable: Mapping[int, str] = {}
     why: BadInput | None = None
-    told: Sequence[Ragged] = ()
+    streams: Sequence[Ragged] = ()
 
 
 def _kept_start(
@@ -203,17 +203,17 @@ def _start(
     stamps: Clock,
 ) -> _Start:
     """Begin an estimator; what can start in no run says why."""
-    told: Sequence[Ragged] = ()
+    streams: Sequence[Ragged] = ()
     try:
-        found, told = _initialized(ensemble, bound, static, order, stamps)
+        found, streams = _initialized(ensemble, bound, static, order, stamps)
         given, unable = start_of_runs({**static, **found}, bound.priors)
         with code_of(bound.name):
             state = given if isinstance(bound, Batch) else bound.start(given)
     except BadInput as error:
-        return _Start(_REFUSED, dict.fromkeys(range(len(ensemble)), str(error)), error, told)
+        return _Start(_REFUSED, dict.fromkeys(range(len(ensemble)), str(error)), error, streams)
     starts = len(unable) < len(ensemble)
     why = None if starts else BadInput(f"{unable[0]}; the filter cannot start")
-    return _Start(state, unable, why, told)
+    return _Start(state, unable, why, streams)
 
 
 def _initialized(
@@ -239,11 +239,11 @@ def _refused(estimators: Sequence[Bound], starts: Sequence[_Start]) -> dict[str,
 
     Of what one estimator estimates (each robot, say), what cannot start fails alone.
     """
-    told_of: dict[str, list[BadInput | None]] = {}
+    errors_of: dict[str, list[BadInput | None]] = {}
     for bound, start in zip(estimators, starts, strict=True):
-        told_of.setdefault(bound.name.partition("/")[0], []).append(start.why)
+        errors_of.setdefault(bound.name.partition("/")[0], []).append(start.why)
     return {
-        label: errors[0] for label, errors in told_of.items() if errors[0] is not None and all(errors)
+        label: errors[0] for label, errors in errors_of.items() if errors[0] is not None and all(errors)
     }
 
 

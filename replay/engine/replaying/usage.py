@@ -62,7 +62,7 @@ class Row(NamedTuple):
 
 @dataclass
 class Usage:
-    """Counts of one bound estimator, over all runs.
+    """Counts what became of the measurements of one bound estimator, over all runs.
 
     Attributes:
         name: the bound estimator's.
@@ -182,7 +182,7 @@ class Usage:
                 for why, count in self.skipped.items()
                 if len(group) == len(topics) or _topic_in(why, group)
             }
-            told = [f"{count} skipped: {why}" for why, count in skipped.items()]
+            reasons = [f"{count} skipped: {why}" for why, count in skipped.items()]
             messages = sum(self.given[topic] for topic in group)
             row = Row(label, " + ".join(group), messages, None, None, sum(skipped.values()), "")
             if self.speaks:
@@ -195,9 +195,9 @@ class Usage:
                 for fact, count in self.facts[topic].items()
                 if count and (fact != EARLY or row.unused > 0)  # a tracker may use those too
             ]
-            if row.unused > 0 and not facts and not told:
-                told = [SILENT]
-            yield row._replace(why="; ".join([*told, *facts]))
+            if row.unused > 0 and not facts and not reasons:
+                reasons = [SILENT]
+            yield row._replace(why="; ".join([*reasons, *facts]))
 
     @property
     def _is_by_topic(self) -> bool:

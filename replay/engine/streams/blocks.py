@@ -67,7 +67,7 @@ class Ragged:
         return len(self.offsets) - 1
 
     def of_run(self, run: int) -> Stream:
-        """Return the rows of one run, without a copy."""
+        """Return the rows of the run numbered `run`, without a copy."""
         return self.stream.take(slice(int(self.offsets[run]), int(self.offsets[run + 1])))
 
 
@@ -105,7 +105,7 @@ class Block(NamedTuple):
     findings: Findings | None = None
 
     def once(self, key: Hashable, find: Callable[[], Found]) -> Found:
-        """Return what is found of these messages alone, which may be known from an earlier replay."""
+        """Return what `find` finds of these messages, or an earlier replay has kept under `key`."""
         return find() if self.findings is None else self.findings.once(key, find)
 
     def column(self, *names: str, missing: float = np.nan) -> NDArray:

@@ -96,16 +96,16 @@ def join_streams(parts: Sequence[Stream]) -> Stream:
         return concatenate(parts)
     lists = [_reasons(part) for part in parts]
     merged = list(dict.fromkeys(reason for each in lists for reason in each))
-    told = {REASONS: json.dumps(merged)}
-    return concatenate([_renumbered(part, merged, told) for part in parts])
+    metadata = {REASONS: json.dumps(merged)}
+    return concatenate([_renumbered(part, merged, metadata) for part in parts])
 
 
-def _renumbered(part: Stream, merged: list[str], told: Mapping[str, str]) -> Stream:
+def _renumbered(part: Stream, merged: list[str], metadata: Mapping[str, str]) -> Stream:
     """Renumber a part by the merged list; what its own list lacks stays beyond it."""
     places = np.array([*map(merged.index, _reasons(part)), len(merged)])
     numbers = places[np.minimum(part["reason"].astype(np.int64), len(places) - 1)]
     columns = {**part.columns, "reason": numbers.astype(part["reason"].dtype)}
-    return replace(part, columns=columns, metadata={**part.metadata, **told})
+    return replace(part, columns=columns, metadata={**part.metadata, **metadata})
 
 
 def _reasons(stream: Stream) -> list[str]:

@@ -38,13 +38,13 @@ class Vectors(NamedTuple):
     sigma: str = ""
 
     def complaint(self, topic: str) -> str:
-        """Explain why a message was not used; "" where there is no covariance that could be missing."""
+        """Say why messages of `topic` were not used; "" where no covariance could be missing."""
         mend = f"; give --set {self.sigma}=..." if self.sigma else ""
         return f"topic {topic}: {self.covariance} is missing{mend}" if self.covariance else ""
 
 
 class Fixes(NamedTuple):
-    """Measured vectors (n, d), their covariances (n, d, d) and what is missing (n,) of the latter.
+    """Holds measured vectors (n, d), their covariances (n, d, d), and what is missing (n,) of these.
 
     A covariance that the log lacks (NaN, or a variance of zero) is that of the given sigma, and missing
     where none is given. Components of the vector that are NaN need none.

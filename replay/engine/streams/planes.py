@@ -36,7 +36,7 @@ _STATES = {schemas.TRUTH_STATE.full_name: "state", schemas.GAUSSIAN_ESTIMATE.ful
 
 
 class Movement(NamedTuple):
-    """The transform p -> scale rotation p + translation_m from one frame to another."""
+    """Holds the transform p -> scale rotation p + translation_m from one frame to another."""
 
     rotation: Floats = np.eye(3)
     translation_m: Floats = np.zeros(3)
@@ -56,7 +56,7 @@ class Movement(NamedTuple):
 
 
 def between(origin: Origin, other: Origin) -> Movement:
-    """The transform from the plane of an origin into that of another one."""
+    """Return the transform from the plane of an origin into that of another one."""
     axes, others = (tangent_axes(*each[:2]) for each in (origin, other))
     return Movement(others @ axes.T, np.array(into_tangent_plane(origin, other), float))
 
@@ -64,10 +64,18 @@ def between(origin: Origin, other: Origin) -> Movement:
 def moved_states(
     components: Mapping[str, str], mean: Floats, movement: Movement
 ) -> tuple[Floats, Floats]:
-    """States (n, d) in another frame, and the Jacobian (t, t) of this in the tangent space.
+    """Move states (n, d) into another frame, with the Jacobian (t, t) of this in the tangent space.
 
     Positions and velocities turn, headings and orientations as well; the latter have their covariance in
     the body's frame, where it stays. All other components are taken to be of the body.
+
+    Args:
+        components: those of the state by name, with their kinds.
+        mean: (n, d).
+        movement: from the frame of the states to the other one.
+
+    Returns:
+        The states (n, d), and the Jacobian (t, t).
     """
     names, kinds = list(components), list(components.values())
     tangent = [name for name, _ in tangent_components(names, kinds)]
@@ -92,7 +100,7 @@ def moved_states(
 
 
 def into_plane_of(stream: Stream, origin: Origin) -> Stream:
-    """A stream that states the origin of its plane, in the plane of another one.
+    """Return a stream that states the origin of its plane, in the plane of another one.
 
     Latitudes and longitudes stay: what is stated of them is the plane that they are taken into. Raises
     BadInput where it is not known how such messages are taken into another plane.

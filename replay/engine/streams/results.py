@@ -87,7 +87,21 @@ def states_in(
     mean: Floats,
     covariance: Floats,
 ) -> Ragged:
-    """Make the states in some rows, in order, of columns whose run r owns offsets[r]:offsets[r + 1]."""
+    """Make the states in some rows, in order, of columns whose run r owns offsets[r]:offsets[r + 1].
+
+    Args:
+        rows: (k,), the rows to take, in order.
+        topic: the name of the stream.
+        time_ns: (n,), the stamps.
+        offsets: (runs + 1,), where the runs begin in the columns.
+        components: those of the state by name, with their kinds.
+        truth: the topic of the truth; None where there is none.
+        mean: (n, d).
+        covariance: (n, t, t).
+
+    Returns:
+        The stream of the k states, run by run.
+    """
     stream = state_stream(topic, time_ns[rows], components, truth, mean[rows], covariance[rows])
     return Ragged(stream, np.searchsorted(rows, offsets))
 

@@ -51,7 +51,7 @@ class Source(Protocol):
         """Return whole topics, in publish-time order."""
 
     def empty(self, topic: str) -> Stream:
-        """Return the topic without its messages."""
+        """Return `topic` without its messages."""
 
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
@@ -63,12 +63,7 @@ class Source(Protocol):
 
 
 def is_sensed(source: Source, topic: str) -> bool:
-    """Tell whether a topic is the run's own, and columns: no estimates, no images.
-
-    Args:
-        source: the run.
-        topic: the name.
-    """
+    """Tell whether `topic` of the run `source` is its own, and columns: no estimates, no images."""
     if topic.startswith("/estimates/"):
         return False
     try:
@@ -79,10 +74,7 @@ def is_sensed(source: Source, topic: str) -> bool:
 
 
 class _Readable(Mapping[str, Stream]):
-    """Represents a source as a person reads it: whole streams by topic.
-
-    A topic that is not there raises `UnknownName`.
-    """
+    """Maps topics to whole streams, as a person reads a source; raises `UnknownName` for others."""
 
     def __getitem__(self: Source, topic: str) -> Stream:
         if topic not in self.topics:
@@ -111,7 +103,12 @@ class _Readable(Mapping[str, Stream]):
 
 @dataclass(frozen=True, repr=False)
 class LogSource(_Readable):
-    """Represents a log file, or a span of it, read lazily; it maps its topics to their streams."""
+    """Represents a log file, or a span of it, read lazily; it maps its topics to their streams.
+
+    Attributes:
+        log: the opened file.
+        start_ns, end_ns: the span, its end left out; None where it does not begin or end.
+    """
 
     log: Log
     start_ns: int | None = None
@@ -133,15 +130,11 @@ class LogSource(_Readable):
         return self.zero_ns("publish_time")
 
     def zero_ns(self, clock: Clock) -> int:
-        """Return what times in seconds count from, by one of the two clocks.
-
-        It is the epoch that the log states; without one the first stamp of that clock, for the two may
-        have nothing in common (simulated and wall time, say).
-        """
+        """Return what times in s count from: the log's epoch, without one the first of `clock`."""
         return self.log.run.epoch_ns if self.log.run else read_span(self.log, clock)[0]
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Find the first and the last stamp in ns by one of the clocks; zeros where there are none."""
+        """Find the first and the last stamp in ns by `clock`; zeros where there are none."""
         return read_span(self.log, clock)
 
     @property
@@ -150,17 +143,17 @@ class LogSource(_Readable):
         return self.log.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return whole topics, in publish-time order, whatever the source's span."""
+        """Return all of `topics` in publish-time order, whatever the source's span."""
         return read_streams(self.log, topics)
 
     def empty(self, topic: str) -> Stream:
-        """Return the topic without its messages."""
+        """Return `topic` without its messages."""
         return read_empty(self.log, topic)
 
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Blocks of the source's span."""
+        """Yield the span of `topics` by the clock `order`, up to `block_messages` in a block."""
         return read_blocks(
             self.log,
             topics,
@@ -177,7 +170,14 @@ class LogSource(_Readable):
 
 @dataclass(frozen=True, repr=False)
 class MemorySource(_Readable):
-    """Represents a recording in memory: read and replayed as if it had been written and read back."""
+    """Represents a recording in memory: read and replayed as if it had been written and read back.
+
+    Attributes:
+        streams: by topic.
+        run: how it was recorded.
+        name: what messages call it.
+        start_ns, end_ns: the span, its end left out; None where it does not begin or end.
+    """
 
     streams: Mapping[str, Stream]
     run: RunMetadata
@@ -191,11 +191,11 @@ class MemorySource(_Readable):
         return self.run.epoch_ns
 
     def zero_ns(self, clock: Clock) -> int:  # noqa: ARG002
-        """Return what times in seconds count from: the epoch, by either clock."""
+        """Return what times in seconds count from: the epoch, whatever the `clock`."""
         return self.epoch_ns
 
     def extent(self, clock: Clock) -> tuple[int, int]:
-        """Return the first and the last stamp in ns by one of the clocks; zeros where there are none."""
+        """Return the first and the last stamp in ns by `clock`; zeros where there are none."""
         times = [stream.times(clock) for stream in self.streams.values() if len(stream)]
         first_ns = min((int(each.min()) for each in times), default=0)
         return first_ns, max((int(each.max()) for each in times), default=0)
@@ -209,11 +209,11 @@ class MemorySource(_Readable):
         }
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
-        """Return whole topics, in publish-time order."""
+        """Return all of `topics` in publish-time order."""
         return {topic: self.in_order(topic, "publish_time") for topic in topics}
 
     def empty(self, topic: str) -> Stream:
-        """Return the topic without its messages."""
+        """Return `topic` without its messages."""
         return self.streams[topic].take(slice(0, 0))
 
     def blocks(
@@ -222,7 +222,7 @@ class MemorySource(_Readable):
         order: Clock,
         block_messages: int,  # noqa: ARG002
     ) -> Iterator[dict[str, Stream]]:
-        """Yield the source's span in one block, unless there is nothing: all is in memory already."""
+        """Yield the span of `topics` by `order` in one block, whatever `block_messages` asks for."""
         spans = {topic: self._within(self.in_order(topic, order), order) for topic in topics}
         block = {topic: stream for topic, stream in spans.items() if len(stream)}
         if block:
@@ -247,14 +247,14 @@ class MemorySource(_Readable):
         return stream.take(slice(int(start), int(end)))
 
     def in_order(self, topic: str, order: Clock) -> Stream:
-        """Return a topic by one of the clocks; equal stamps as in the file."""
+        """Return `topic` by the clock `order`; equal stamps as in the file."""
         stream = self.stream_of(topic)
         if is_in_order(gather([stream]), order):
             return stream
         return stream.take(np.lexsort((stream.position, stream.times(order))))
 
     def stream_of(self, topic: str) -> Stream:
-        """Return a topic as it was recorded; raises BadInput where it is not there."""
+        """Return `topic` as it was recorded; raises BadInput where it is not there."""
         if topic not in self.streams:
             raise BadInput(f"{self.name}: no topic {topic}; it has {', '.join(sorted(self.streams))}")
         return self.streams[topic]
@@ -321,8 +321,7 @@ class Ensemble(list[SourceType]):
                 if there is None or (there.schema_name, there.metadata) != stated:
                     raise BadInput(
                         f"{source.name}: topic {topic} differs from that of {first.name}; the runs of "
-                        "an "
-                        "ensemble have the same topics and types, so replay this one on its own"
+                        "an ensemble have the same topics and types, so replay this one on its own"
                     )
             self._alike.add(topic)
 

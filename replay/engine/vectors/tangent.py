@@ -79,7 +79,7 @@ def _common(names: Sequence[str]) -> str:
 def named_now(
     given: Mapping[str, Number], components: Sequence[str], kinds: Sequence[str]
 ) -> dict[str, Number]:
-    """What is given by errors' components, whose names may be those of the release before.
+    """Return what is given by errors' components, whose names may be those of the release before.
 
     >>> named_now({"qw_x_rad": 0.1}, ("qw", "qx", "qy", "qz"), ("quaternion",) * 4)
     {'rotation_x_rad': 0.1}

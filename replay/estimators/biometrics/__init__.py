@@ -1,1 +1,1 @@
-"""Fusion of biometric scores; begin with `biometrics`."""
+"""Fuses biometric scores; begin with `biometrics`."""

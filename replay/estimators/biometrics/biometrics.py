@@ -1,4 +1,4 @@
-"""Fusion of biometric scores: rules, classifiers and mixture models, as batch estimators.
+"""Fuses biometric scores: rules, classifiers and mixture models, as batch estimators.
 
 Zheng & Blasch, "An exploration of the impacts of three factors in multimodal biometric score fusion",
 JAIF 2014. Each estimator fuses subsets of the matchers (`subsets_of`), a case each, into the stream
@@ -44,7 +44,7 @@ LIKELIHOOD_RATIOS = ("qda", "lda", "logistic")
 
 
 class Subsets(Parameters):
-    """What is fused.
+    """States what is fused.
 
     Attributes:
         subsets: names of the subsets of matchers to fuse; without any, all there are.
@@ -54,7 +54,7 @@ class Subsets(Parameters):
 
 
 class RuleParameters(Subsets):
-    """How scores are normalised and fused.
+    """States how scores are normalised and fused.
 
     Attributes:
         normalisation: how scores are normalised, over all comparisons or, column-min-max, per gallery
@@ -67,7 +67,7 @@ class RuleParameters(Subsets):
 
 
 class LearnerParameters(Subsets):
-    """What a fusion learns from, and what it judges.
+    """States what a fusion learns from, and what it judges.
 
     Attributes:
         seed: seed of folds and impostors.
@@ -87,7 +87,7 @@ class LearnerParameters(Subsets):
 
 
 class ClassifierParameters(LearnerParameters):
-    """A classifier of scikit-learn.
+    """Chooses a classifier of scikit-learn.
 
     Attributes:
         classifier: which one.
@@ -101,7 +101,7 @@ class ClassifierParameters(LearnerParameters):
 
 
 class MixtureParameters(LearnerParameters):
-    """HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
+    """Chooses HMM(m, n, g): m matchers of each of n modalities, g Gaussians per state and class.
 
     Attributes:
         topology: how states follow one another; joint is one state, with all scores as its vector.
@@ -128,7 +128,7 @@ def learn_classifier(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """A classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
+    """Return a classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
 
     QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
     """
@@ -302,7 +302,7 @@ def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
 def fused_stream(
     compared: Comparisons, pairs: Pairs, fused: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Fused scores (n,) as score vectors of one, in the order of arrival; topic and name come later."""
+    """Make score vectors of one of fused scores (n,), in arrival order; topic and name come later."""
     order = np.lexsort((pairs.gallery, pairs.probe, compared.arrival_ns[pairs.probe]))
     return make_stream(
         "",

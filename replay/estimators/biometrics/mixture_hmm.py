@@ -1,4 +1,4 @@
-"""Hidden Markov models with Gaussian mixtures, fitted by Baum-Welch to many short sequences.
+"""Fits hidden Markov models with Gaussian mixtures by Baum-Welch to many short sequences.
 
 Zheng & Blasch, JAIF 2014, 3.2: HMM(m, n, g) takes a sequence of n vectors of m scores; every state has
 a mixture of g Gaussians. With one state it is a mixture; left to right it is a product of mixtures, one
@@ -17,7 +17,7 @@ UNEVEN = 1e-9  # far more than rounding, and far less than scores say
 
 
 class MixtureHmm(NamedTuple):
-    """A model of s states with g components of m dimensions.
+    """Holds a model of s states with g components of m dimensions.
 
     `initial` (s,), `transition` (s, s), `weights` (s, g), `means` (s, g, m), `covariances`
     (s, g, m, m).
@@ -46,6 +46,11 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
     The means start at the k-means of the vector that has the state's number.
 
     Raises BadInput where there are fewer sequences than components.
+
+    Args:
+        sequences: (count, n, m), NaN where a score is missing.
+        how: the model's sizes, and how it is fitted.
+        rng: of the k-means.
     """
     whole = sequences[~np.isnan(sequences).any(axis=(1, 2))]
     if len(whole) <= how.components:
@@ -64,7 +69,15 @@ def fit(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
 
 def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
-    """The log-likelihood (count,) of sequences (count, n, m); missing (NaN) scores integrate out."""
+    """Compute the log-likelihood (count,) of sequences; missing (NaN) scores integrate out.
+
+    Args:
+        model: the fitted model.
+        sequences: (count, n, m), NaN where a score is missing.
+
+    Returns:
+        (count,).
+    """
     count, length, size = sequences.shape
     vectors = sequences.reshape(-1, size)
     emission = np.empty((len(vectors), *model.weights.shape))

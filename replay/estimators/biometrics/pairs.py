@@ -1,4 +1,4 @@
-"""Pairs of probes and gallery entries: normalised scores, rules over them, and folds of users."""
+"""Makes pairs of probes and gallery entries: normalised scores, rules, and folds of users."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -31,10 +31,14 @@ class Pairs(NamedTuple):
 
 
 def normalise(scores: Floats, how: str) -> Floats:
-    """Scores (users, users, matchers) on a common scale; missing ones (NaN) stay missing.
+    """Bring scores to a common scale; missing ones (NaN) stay missing.
 
     `tanh` is Jain, Nandakumar & Ross 2005 with mean and deviation for Hampel's estimates. A gallery
     column whose scores are all equal becomes 0. Raises BadInput where z has no deviation to divide by.
+
+    Args:
+        scores: (users, users, matchers), NaN where missing.
+        how: the name of the normalisation.
     """
     match how:
         case "z" | "tanh":
@@ -72,7 +76,7 @@ RULES: dict[str, Callable[..., Floats]] = {
 
 
 def all_pairs(users: int) -> Pairs:
-    """Every probe with every gallery entry."""
+    """Return every probe with every gallery entry."""
     return Pairs(np.repeat(np.arange(users), users), np.tile(np.arange(users), users))
 
 
@@ -90,7 +94,7 @@ def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
 
 
 def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
-    """The fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
+    """Return the fold (users,) of every user; raises BadInput where a fold would have fewer than two."""
     if users < 2 * folds:
         fewer = f", or at most {users // 2} folds" if users >= 4 else ""
         raise BadInput(
@@ -102,9 +106,16 @@ def user_folds(users: int, folds: int, rng: np.random.Generator) -> Integers:
 def cross_validate(
     vectors: Floats, pairs: Pairs, learner: Learner, limit: int, rng: np.random.Generator
 ) -> Floats:
-    """Fused scores (n,) of vectors (n, m), each learnt without the users of its gallery user's fold.
+    """Fuse scores (n,), each learnt without the users of its gallery user's fold.
 
     `limit` bounds how many impostor vectors are learnt from.
+
+    Args:
+        vectors: (n, m), a score of each matcher.
+        pairs: the users of each vector, and the folds of users.
+        learner: makes a fusion of the vectors that it learns from.
+        limit: how many impostor vectors are learnt from at most.
+        rng: draws these.
     """
     fused = np.empty(len(vectors))
     genuine = pairs.probe == pairs.gallery

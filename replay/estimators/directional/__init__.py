@@ -1,1 +1,1 @@
-"""Filters of axes, orientations and pairs of angles; begin with `directional`."""
+"""Filters axes, orientations and pairs of angles; begin with `directional`."""

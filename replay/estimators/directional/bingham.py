@@ -1,4 +1,4 @@
-"""Filters for axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
+"""Filters axes (d = 2) and orientations (d = 4): x+ = x (+) u (+) w and z = x (+) v.
 
 The recursive Bingham filter of Kurz, Gilitschenski, Julier, Hanebeck, JAIF 9(2), 2014, and the modified
 Kalman filters that it is compared with. All take an ensemble as ragged rows and go through it in
@@ -32,7 +32,7 @@ from replay.engine.compiling.compile import compile_over_runs
 
 
 class Steps(NamedTuple):
-    """The steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
+    """Holds the steps of many runs end to end: run r owns the rows offsets[r]:offsets[r + 1].
 
     A row is a prediction with a known increment u, then an update with a measurement z; a row of NaN
     in either leaves that half of the step out.
@@ -65,21 +65,21 @@ def _unit_or_nan(x: NDArray, what: str) -> Floats:
 
 
 class BinghamNoise(NamedTuple):
-    """System noise w and measurement noise v, without batch axes, with modes at or near the identity."""
+    """Holds system noise w and measurement noise v, no batch axes, modes at or near the identity."""
 
     system: Bingham
     measurement: Bingham
 
 
 class Gaussian(NamedTuple):
-    """Gaussian states: mean (..., d) and covariance (..., d, d)."""
+    """Holds Gaussian states: mean (..., d) and covariance (..., d, d)."""
 
     mean: Floats
     covariance: Floats
 
 
 class GaussianNoise(NamedTuple):
-    """Covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
+    """Holds covariances (d, d) of w - e_1 and v - e_1 about the identity e_1."""
 
     system: Floats
     measurement: Floats
@@ -93,7 +93,7 @@ def _over_runs(run_once: Callable[..., None]) -> Callable[..., None]:
 def run_bingham_filter(
     noise: BinghamNoise, state: Bingham, steps: Steps, rotations: Floats | None = None
 ) -> tuple[Bingham, Bingham]:
-    """The recursive Bingham filter: algorithms 1 and 2.
+    """Run the recursive Bingham filter: algorithms 1 and 2.
 
     Args:
         noise: see there.

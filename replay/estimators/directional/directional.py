@@ -1,4 +1,4 @@
-"""The filters of axes, orientations and pairs of headings, as a replay has them.
+"""Offers the filters of axes, orientations and pairs of headings to a replay.
 
 The numerics are in `bingham` and `torus`; here they are bound to streams. Noise and prior are what the
 channel states, unless a parameter says otherwise.
@@ -48,7 +48,7 @@ Advance = Callable[[Any, Messages, Results], Any]
 
 
 class BinghamParameters(Parameters):
-    """Distributions of prior and noises; one that is none is what the log's channel states.
+    """States distributions of prior and noises; one that is none is what the log's channel states.
 
     Attributes:
         prior: distribution of the orientation at the start.
@@ -62,7 +62,7 @@ class BinghamParameters(Parameters):
 
 
 class KalmanParameters(BinghamParameters):
-    """How noise is added.
+    """States how noise is added.
 
     Attributes:
         rotated: whether the noise is turned into the state's frame; the paper adds it as it is.
@@ -72,7 +72,7 @@ class KalmanParameters(BinghamParameters):
 
 
 class HeadingsFilterParameters(Parameters):
-    """The model of the scenario `headings`; a number that is none is what the log's channel states.
+    """States the model of `headings`; a number that is none is what the log's channel states.
 
     Attributes:
         coupling_rad: per step the first heading turns by this times the cosine of the second, the second
@@ -95,7 +95,7 @@ class HeadingsFilterParameters(Parameters):
 
 
 class TorusParameters(HeadingsFilterParameters):
-    """The samples of the filter.
+    """States the samples of the filter.
 
     Attributes:
         central_weight: weight of the central one of the five samples (w5 in the paper).
@@ -105,7 +105,7 @@ class TorusParameters(HeadingsFilterParameters):
 
 
 class UnscentedTorusParameters(HeadingsFilterParameters):
-    """How angles are compared.
+    """States how angles are compared.
 
     Attributes:
         wrapped: whether the innovation is taken the short way round; else all is merely modulo 2 pi.
@@ -115,7 +115,7 @@ class UnscentedTorusParameters(HeadingsFilterParameters):
 
 
 class Distributions(NamedTuple):
-    """The prior and both noises."""
+    """Holds the prior and both noises."""
 
     prior: DirectionalNoise
     system: DirectionalNoise
@@ -150,7 +150,7 @@ def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
 
 
 def as_bingham(noise: DirectionalNoise) -> Bingham:
-    """The Bingham distribution, or that with the second moment of the projected Gaussian."""
+    """Return the Bingham distribution, or that with the second moment of the projected Gaussian."""
     d = len(noise.diagonal)
     if noise.distribution == "bingham":
         return make_bingham(np.eye(d), noise.diagonal)
@@ -161,7 +161,7 @@ def as_bingham(noise: DirectionalNoise) -> Bingham:
 
 
 def as_covariance(noise: DirectionalNoise) -> Floats:
-    """The Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
+    """Return the Gaussian's covariance (d, d), or (57) of the Bingham distribution about its mode."""
     if noise.distribution == "gaussian":
         return np.diag(noise.diagonal)
     return bingham.hemisphere_covariance(as_bingham(noise))
@@ -205,7 +205,7 @@ def _widened(state: Any, runs: int) -> Any:
 
 
 def heading_model(given: Given[Any], topic: str = "headings") -> HeadingModel:
-    """The model that parameters and channel state."""
+    """Return the model that parameters and channel state."""
     stated = {name: given.stated(topic, name) for name in HeadingsFilterParameters.model_fields}
     system, measurement = (
         equal_sigmas(stated[f"{which}_sigma_rad"], stated[f"{which}_correlation"])

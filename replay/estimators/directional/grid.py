@@ -1,4 +1,4 @@
-"""Reference filters: Bayes' rule on a grid over the half circle and over the torus.
+"""Filters by Bayes' rule on a grid over the half circle and the torus, as a reference.
 
 They approximate no density, only the domain, and show what any filter of the same model can reach.
 """
@@ -39,7 +39,7 @@ class GridEstimates(NamedTuple):
 
 
 def run_axis_grid_filter(noise: BinghamNoise, state: Floats, steps: Steps) -> tuple[Floats, Floats]:
-    """The reference for `run_bingham_filter` with d = 2.
+    """Run the reference for `run_bingham_filter` with d = 2.
 
     Args:
         noise: see there.
@@ -77,7 +77,7 @@ def run_torus_grid_filter(
     measurement: Floats,
     motion: Motion = turn_together,
 ) -> GridEstimates:
-    """The reference for `run_toroidal_filter`.
+    """Run the reference for `run_toroidal_filter`.
 
     Args:
         model: see there.
@@ -107,7 +107,7 @@ def run_torus_grid_filter(
 
 
 def torus_grid(n: int) -> Floats:
-    """The angles (n, n, 2) of an n x n grid over [-pi, pi)^2."""
+    """Return the angles (n, n, 2) of an n x n grid over [-pi, pi)^2."""
     angle = 2.0 * np.pi / n * np.arange(n) - np.pi
     return np.stack(np.meshgrid(angle, angle, indexing="ij"), axis=-1)
 

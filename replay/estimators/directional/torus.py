@@ -1,4 +1,4 @@
-"""Filters for two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
+"""Filters two angles, x+ = motion(x) + w and z = x + v, modulo 2 pi.
 
 The recursive toroidal filter that Kurz and Hanebeck, "Deterministic Sampling on the Torus for Bivariate
 Circular Estimation", 2016, announce, and beside it the unscented Kalman filter with their UKF samples.
@@ -42,7 +42,7 @@ _VAGUE = 1e18
 
 
 class HeadingModel(NamedTuple):
-    """The system and its noise.
+    """Describes the system and its noise.
 
     Attributes:
         coupling_rad: c in the motion.
@@ -97,7 +97,7 @@ def run_toroidal_filter(
     motion: Motion = turn_together,
     central_weight: float = 0.2,
 ) -> tuple[WrappedNormal, WrappedNormal]:
-    """The recursive toroidal filter.
+    """Run the recursive toroidal filter.
 
     A prediction moves five samples and refits by circular moments and r_c (by mixed maximum likelihood
     where these allow no covariance), then adds the system noise; an update refits the exact product.
@@ -127,7 +127,7 @@ def run_unscented_filter(
     motion: Motion = turn_together,
     wrapped: bool,
 ) -> tuple[WrappedNormal, WrappedNormal]:
-    """The unscented Kalman filter with the paper's five equally weighted samples.
+    """Run the unscented Kalman filter with the paper's five equally weighted samples.
 
     Args as `run_toroidal_filter`, and
         wrapped: take the innovation in [-pi, pi); else everything is merely taken modulo 2 pi.

@@ -1,1 +1,1 @@
-"""Positions from angles and arrival times, by least squares over batches; begin with `acoustic`."""
+"""Finds positions from angles and arrival times, by batch least squares; begin with `acoustic`."""

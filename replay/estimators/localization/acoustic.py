@@ -69,7 +69,7 @@ class Detections(NamedTuple):
     position_m: Floats
 
     def take(self, rows: NDArray[np.intp]) -> "Detections":
-        """The runs `rows`."""
+        """Return the runs `rows`."""
         return Detections(*(column[rows] for column in self))
 
 
@@ -90,7 +90,14 @@ def estimate(setting: Setting, heard: Detections) -> Solution:
 
 
 def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m: Floats) -> Bound:
-    """CRLB at the truth: shooters (runs, 2), trajectories (runs,), sensors (sensors, 2) or per run."""
+    """Compute the CRLB at the truth.
+
+    Args:
+        setting: how the estimator sees the world.
+        shooter_m: (runs, 2).
+        trajectory_rad: (runs,), the direction of the bullet.
+        sensor_m: (sensors, 2), or (runs, sensors, 2).
+    """
     heard = noise_free(setting.medium, shooter_m, trajectory_rad, sensor_m)
     parts = [shooter_m]
     if setting.mode != Mode.BEARINGS_ONLY:
@@ -130,10 +137,15 @@ def starting_point(setting: Setting, heard: Detections) -> Floats:
 
 
 def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linearization:
-    """The chosen measurements at `parameters` (runs, n), one block of correlated errors per sensor.
+    """Linearize the chosen measurements, one block of correlated errors per sensor.
 
     Where the sensors are not estimated, the bound that follows leaves out how the position fixes' share
     in the covariance depends on the parameters.
+
+    Args:
+        setting: how the estimator sees the world.
+        heard: one shot per run, as all sensors heard it.
+        parameters: (runs, n), at which it is linearised.
     """
     position = heard.position_m
     if setting.estimate_sensors:
@@ -155,7 +167,7 @@ def linearize(setting: Setting, heard: Detections, parameters: Floats) -> Linear
 
 
 class _Geometry(NamedTuple):
-    """How the shooter stands to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
+    """Holds how the shooter stands to the sensors, (runs, sensors); the trajectory is (runs, 1)."""
 
     azimuth_rad: Floats
     range_m: Floats
@@ -163,7 +175,7 @@ class _Geometry(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """k measurements of every sensor, NaN where missing, and their derivatives in a last axis.
+    """Holds k measurements of every sensor, NaN where missing, with derivatives in a last axis.
 
     residual (runs, sensors, k), jacobian (..., k, d), covariance (..., k, k), and its derivative slope
     (..., k, k, d): by azimuth, range and trajectory (d = 3) at first, by all parameters in the end.

@@ -1,4 +1,4 @@
-"""Estimator `shooter:MODE`: where the shots of a log came from, shot by shot (Osborne et al. 2014)."""
+"""Offers the estimator `shooter:MODE`: where shots of a log came from (Osborne et al. 2014)."""
 
 from collections.abc import Iterator, Mapping
 
@@ -25,7 +25,7 @@ from replay.estimators.localization.solutions import (
 
 
 class ShooterParameters(Parameters):
-    """What the sensors send, and what is estimated.
+    """States what the sensors send, and what is estimated.
 
     Attributes:
         mode: what the sensors send to the fusion centre.

@@ -1,4 +1,4 @@
-"""Iterated least squares over many runs at once, and the bound that belongs to it.
+"""Solves iterated least squares over many runs at once, with the bound that belongs to it.
 
 A model says, for parameters (runs, n), how far each measurement is from its prediction, how predictions
 change with the parameters, and how noisy the measurements are. From that one answer come the step of
@@ -74,7 +74,7 @@ SENTENCES = {
 
 
 class Bound(NamedTuple):
-    """The CRLB of each run: covariance (runs, n, n) and rank (runs,).
+    """Holds the CRLB of each run: covariance (runs, n, n) and rank (runs,).
 
     A parameter that takes part in an unobservable direction has infinite variance and no covariances.
     """
@@ -84,7 +84,7 @@ class Bound(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """Estimates (runs, n), the CRLB at them, and how each run ended; `cost` is half of chi-square."""
+    """Holds estimates (runs, n), the CRLB at them, and how each run ended; `cost` is half chi-square."""
 
     parameters: Floats
     covariance: Floats
@@ -100,7 +100,7 @@ class Solution(NamedTuple):
 
 
 class _Whitened(NamedTuple):
-    """A linearization in standard deviations, and the whitener that made it so."""
+    """Holds a linearization in standard deviations, and the whitener that made it so."""
 
     residual: Floats
     jacobian: Floats
@@ -125,6 +125,12 @@ def solve(model: Model, start: Floats, *, tolerance: float = 1e-6, max_iteration
     next full step is shorter than `tolerance` standard deviations in the metric of its own information;
     that step is still taken. A row of `start` that is not finite is a run without a starting point.
     Raises BadInput for a wrong shape only.
+
+    Args:
+        model: (parameters (k, n), rows (k,)) -> the linearisation of these runs.
+        start: (runs, n), not finite for a run without a starting point.
+        tolerance: in standard deviations.
+        max_iterations: how many steps there are at most.
     """
     if start.ndim != 2 or 0 in start.shape:
         raise BadInput(f"least squares: start has shape {start.shape}; give (runs, parameters)")
@@ -311,7 +317,12 @@ def describe_direction(names: Sequence[str], direction: Floats) -> str:
 
 
 def mask_missing(at: Linearization, present: Booleans) -> Linearization:
-    """Take out the measurements that are not `present` (runs, m): they then carry no information."""
+    """Take out the measurements that are not `present` (runs, m): they then carry no information.
+
+    Args:
+        at: the linearisation of runs.
+        present: (runs, m).
+    """
     if present.all():
         return at
     kept, slope = present, at.covariance_jacobian

@@ -1,4 +1,4 @@
-"""Target positions and attitude biases from lines of sight: the schemes of Belfadel et al., JAIF 2014.
+"""Finds targets and attitude biases from lines of sight: schemes of Belfadel et al., JAIF 2014.
 
 The parameters are the positions of all targets (x, y, z each) and then those attitude biases (yaw,
 pitch, roll of each sensor) that are not known. Scheme 3 knows none of them; schemes 1 and 2 take all as
@@ -75,15 +75,28 @@ def parameter_names(scene: Scene, targets: Sequence[int], sensors: Sequence[int]
 
 
 def predict(scene: Scene, parameters: Floats) -> Floats:
-    """Azimuth and elevation in rad without noise, (runs, targets, sensors, 2), for (runs, n)."""
+    """Predict azimuth and elevation in rad, without noise.
+
+    Args:
+        scene: what is known of the sensors.
+        parameters: (runs, n).
+
+    Returns:
+        (runs, targets, sensors, 2), in rad.
+    """
     return np.stack(line_of_sight(*_geometry(scene, parameters)), axis=-1)
 
 
 def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Solution:
-    """Positions and wanted biases from lines of sight (runs, targets, sensors, 2), NaN where not seen.
+    """Estimate positions and wanted biases from lines of sight.
 
     The search begins at `start` (runs, n), else where the rays meet. Raises BadInput where shapes do not
     fit or a noise is not positive.
+
+    Args:
+        scene: what is known before the measurements.
+        measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
+        start: (runs, n), where the search begins; else where the rays meet.
     """
     _check(scene, measured)
     return solve(
@@ -93,7 +106,15 @@ def estimate(scene: Scene, measured: Floats, start: Floats | None = None) -> Sol
 
 
 def starting_point(scene: Scene, measured: Floats) -> Floats:
-    """Find where the rays of each target meet, biases taken as zero, (runs, n)."""
+    """Find where the rays of each target meet, biases taken as zero, (runs, n).
+
+    Args:
+        scene: what is known before the measurements.
+        measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
+
+    Returns:
+        (runs, n).
+    """
     attitude = scene.nominal_attitude_rad + np.nan_to_num(scene.known_bias_rad)
     unit = np.stack(direction(measured[..., 0], measured[..., 1], attitude.T[:, None]), axis=-1)
     targets = intersect_rays(scene.position_m, unit).reshape(len(measured), -1)
@@ -118,7 +139,13 @@ def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
 
 
 def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearization:
-    """Lines of sight (runs, targets, sensors, 2), NaN where not seen, at `parameters` (runs, n)."""
+    """Linearize lines of sight at parameters.
+
+    Args:
+        scene: what is known before the measurements.
+        measured: (runs, targets, sensors, 2), in rad, NaN where not seen.
+        parameters: (runs, n).
+    """
     runs, targets, sensors, _ = measured.shape
     m = 2 * targets * sensors
     geometry = _geometry(scene, parameters)
@@ -141,9 +168,14 @@ def linearize(scene: Scene, measured: Floats, parameters: Floats) -> Linearizati
 
 
 def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observability:
-    """Rank and unobservable directions for one run: `measured` (targets, sensors, 2), parameters (n,).
+    """Find rank and unobservable directions for one run.
 
     `measured` only says which lines of sight there are: NaN where none.
+
+    Args:
+        scene: what is known before the measurements.
+        measured: (targets, sensors, 2), NaN where there is no line of sight.
+        parameters: (n,).
     """
     counted = (range(1, count + 1) for count in measured.shape[:2])
     names = parameter_names(scene, *counted)
@@ -183,7 +215,7 @@ def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | 
 
 
 def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
-    """CRLB standard deviations in rad of all wanted biases (columns) when one (row) is known.
+    """Compute the CRLB sigmas (rad) of all wanted biases (columns) when one (row) is known.
 
     One run, as for `observability`. A row with infinite or large values is a bias that must not be the
     one to fix: what cannot be observed goes on without it.

@@ -1,4 +1,4 @@
-"""Estimators `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
+"""Offers `los-positions` and `los-biases`: the schemes of Belfadel et al. on a log's streams.
 
 What is solved together, a batch, holds each line of sight once: where a sensor sees a target again the
 next batch begins. Scheme 1 is `los-positions` on a log without biases, scheme 2 the same on one with
@@ -34,11 +34,11 @@ NEEDS = "per sensor N /sensorN/line_of_sight, /sensorN/position and /sensorN/att
 
 
 class PositionsParameters(Parameters):
-    """There are none: all biases are taken as zero."""
+    """There are no parameters: all biases are taken as zero."""
 
 
 class BiasesParameters(Parameters):
-    """What is known of the biases.
+    """States what is known of the biases.
 
     Attributes:
         known_bias_deg: biases that are known, in deg, such as `sensor_2_roll = 0`; all others are
@@ -49,7 +49,7 @@ class BiasesParameters(Parameters):
 
 
 class Sightings(NamedTuple):
-    """Batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
+    """Holds batches and their lines of sight (batches, targets, sensors, 2), NaN where not seen."""
 
     batches: Batches
     targets: list[int]
@@ -83,7 +83,7 @@ def _find(
 
 
 def known_biases(sensors: Sequence[int], parameters: Parameters) -> Floats:
-    """The known biases (sensors, 3) in rad, NaN where wanted."""
+    """Return the known biases (sensors, 3) in rad, NaN where wanted."""
     if not isinstance(parameters, BiasesParameters):
         return np.zeros((len(sensors), 3))
     names = [f"sensor_{s}_{angle}" for s in sensors for angle in ANGLES]

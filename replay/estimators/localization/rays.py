@@ -9,10 +9,17 @@ PARALLEL = 1e-12
 
 
 def intersect_rays(origin_m: Floats, direction: Floats) -> Floats:
-    """The point nearest to rays in least squares, (..., d): (sum(I - u u'))^-1 sum((I - u u') origin).
+    """Find the point nearest to rays: (sum(I - u u'))^-1 sum((I - u u') origin), by least squares.
 
     Unit vectors `direction` u are (..., rays, d), origins (rays, d) or alike; a ray of NaNs is left out.
     NaN where the rays do not meet: fewer than two are left, all are parallel, or all point away from it.
+
+    Args:
+        origin_m: (rays, d), or with the batch axes of `direction`.
+        direction: u (..., rays, d), of unit length; NaN leaves a ray out.
+
+    Returns:
+        (..., d), in m.
     """
     missing = np.isnan(direction)
     unit = np.where(missing, 0.0, direction)

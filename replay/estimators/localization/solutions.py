@@ -25,7 +25,7 @@ class Batches(NamedTuple):
     time_ns: Integers
 
     def ragged(self, stream: Stream, rows: Booleans) -> Ragged:
-        """An output stream with a message for each of these batches."""
+        """Return an output stream with a message for each of these batches."""
         return Ragged(stream, np.searchsorted(self.run[rows], np.arange(self.runs + 1)))
 
 
@@ -63,7 +63,7 @@ def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integ
 def solution_streams(
     topic: str, truth: str, components: Sequence[str], batches: Batches, solution: Solution
 ) -> list[Ragged]:
-    """The streams TOPIC/state, TOPIC/solution and TOPIC/failure of one solution for each batch.
+    """Return the streams TOPIC/state, TOPIC/solution and TOPIC/failure of one solution for each batch.
 
     A batch that failed has no state; its failure is one of `SENTENCES`.
     """
@@ -97,7 +97,7 @@ def solution_streams(
 
 
 def positive(topic: Topic, name: str) -> float:
-    """A positive number that the channel's metadata states; raises BadInput where it does not."""
+    """Return a positive number that the channel's metadata states; raises BadInput where it does not."""
     value = stated([topic], name)
     if not 0.0 < value < np.inf:
         raise BadInput(f"topic {topic.name} states {name} = {value:g}, which must be positive")

@@ -1,1 +1,1 @@
-"""Models for every recursive method, one file a system; begin with `landmarks`."""
+"""Models systems for every recursive method, one file each; begin with `landmarks`."""

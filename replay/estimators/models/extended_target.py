@@ -1,4 +1,4 @@
-"""The extended target: a random walk, and a measurement with multiplicative noise.
+"""Models the extended target: a random walk, measured with multiplicative noise.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.B; Baum, Faion and Hanebeck, "Modeling the Target Extent with Multiplicative Noise", FUSION 2012. The
@@ -22,7 +22,7 @@ STATES = 4
 
 
 class ExtendedTargetParameters(ModelParameters):
-    """Variances that are added per step, and that of a point.
+    """States variances that are added per step, and that of a point.
 
     Attributes:
         size_drift_m2: variance that a step adds to half sides.
@@ -36,12 +36,12 @@ class ExtendedTargetParameters(ModelParameters):
 
 
 def stay(target: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """A random walk's mean."""
+    """Return a random walk's mean."""
     return target[0], target[1], target[2], target[3]
 
 
 def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances of one step of the walk."""
+    """Return the variances of one step of the walk."""
     size, place = parameters.size_drift_m2, parameters.position_drift_m2
     return size, size, place, place
 
@@ -53,13 +53,13 @@ def measure(target: Components, noise: Components, reference: Any, parameters: A
 
 
 def point_noise(parameters: Any) -> Components:
-    """The variances of the scales and of the point."""
+    """Return the variances of the scales and of the point."""
     variance = parameters.point_variance_m2
     return SCALE_VARIANCE, SCALE_VARIANCE, variance, variance
 
 
 def read(stream: Stream) -> Floats:
-    """The pseudo-measurement (n, 4)."""
+    """Return the pseudo-measurement (n, 4)."""
     return np.stack(quadratic(read_vectors(stream, "position_m", PLANE).T), axis=1)
 
 

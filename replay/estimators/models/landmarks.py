@@ -1,4 +1,4 @@
-"""Localization of robots in the plane from odometry and whatever else there is.
+"""Localizes robots in the plane from odometry and whatever else there is.
 
 Sightings of mapped landmarks, position fixes, poses, headings; a gyro may say how fast the robot turns
 in place of its wheels. The state is (x_m, y_m, heading_rad); the odometry's velocity holds until the
@@ -27,7 +27,7 @@ LANDMARKS = Map("/landmarks", schemas.LANDMARK, "landmark_id", "position_m", PLA
 
 
 class DeadReckoningParameters(ModelParameters):
-    """What odometry errs by; None takes what the log's channels state.
+    """States what odometry errs by; None takes what the log's channels state.
 
     A noise density is the standard deviation of the readings times the root of the step between them:
     0.1 m/s at 20 Hz is 0.1 * 0.05**0.5 = 0.022 m/s/sqrt(Hz).
@@ -50,7 +50,7 @@ class DeadReckoningParameters(ModelParameters):
 
 
 class LocalizationParameters(DeadReckoningParameters):
-    """Noise and bias of the sensors.
+    """States noise and bias of the sensors.
 
     Attributes:
         sigma_heading_rad: standard deviation of a heading, or of a pose's angle, that does not state it.
@@ -77,7 +77,7 @@ class LocalizationParameters(DeadReckoningParameters):
 
 
 def move(pose: Components, velocity: Components, duration_s: Any, parameters: Any) -> Components:
-    """The pose at the end of an arc."""
+    """Return the pose at the end of an arc."""
     forward, turn = velocity
     true = (
         parameters.forward_scale * forward,
@@ -134,7 +134,7 @@ def bearing_noise(parameters: Any) -> Components:
 
 
 def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
-    """Where the antenna is."""
+    """Return where the antenna is."""
     cosine, sine = np.cos(pose[2]), np.sin(pose[2])
     forward, left = parameters.lever_x_m, parameters.lever_y_m
     return pose[0] + cosine * forward - sine * left, pose[1] + sine * forward + cosine * left

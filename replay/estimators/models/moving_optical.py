@@ -1,4 +1,4 @@
-"""Moving targets, and attitude biases and clocks of the sensors on aircraft that see them: a model.
+"""Models moving targets, and attitude biases and clocks of the sensors on aircraft that see them.
 
 The geometry is that of Belfadel, Osborne and Bar-Shalom, JAIF 2014 (`recorders.models.optical`), but
 nothing stands still and nothing is synchronised. A message states the sensor's pose by the sensor's own
@@ -31,7 +31,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class MovingSightParameters(ModelParameters):
-    """Noise of motion and sights, and the errors of attitudes and clocks.
+    """States noise of motion and sights, and the errors of attitudes and clocks.
 
     Attributes:
         acceleration_density: noise of a target's acceleration, in m/s^2/sqrt(Hz).
@@ -80,7 +80,7 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances that white accelerations add.
+    """Return the variances that white accelerations add.
 
     What they have in common within one step is left out: steps are fractions of a second, in which the
     places' own noise is millimetres, and a triangle of 23 components takes minutes to compile.
@@ -90,7 +90,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def to_body(orientation: Components, x: Components) -> Components:
-    """A vector in the frame of a body with this orientation (w, x, y, z)."""
+    """Return a vector in the frame of a body with this orientation (w, x, y, z)."""
     w, a, b, c = orientation
     return (
         (w * w + a * a - b * b - c * c) * x[0]
@@ -119,7 +119,7 @@ def sight(state: Components, reference: Components, bias: Components, clock_s: A
 
 
 def sight_noise(parameters: Any) -> Components:
-    """The variances of both angles."""
+    """Return the variances of both angles."""
     return parameters.sigma_azimuth_rad**2, parameters.sigma_elevation_rad**2
 
 

@@ -29,7 +29,7 @@ _NS = 1e-9
 
 
 class RangingParameters(ModelParameters):
-    """Noise, bias and height of the motion, and how the start is found.
+    """States noise, bias and height of the motion, and how the start is found.
 
     The start is found by least squares in the first ranges, from positions to all sides of the anchors'
     middle.
@@ -58,7 +58,7 @@ class RangingParameters(ModelParameters):
 
 
 class PoseRangingParameters(RangingParameters):
-    """The same, and how the body turns.
+    """States how the body turns, too.
 
     Attributes:
         turn_acceleration_density: noise of the angular acceleration, in rad/s^2/sqrt(Hz).
@@ -80,7 +80,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The rows of the lower triangle of the noise's covariance."""
+    """Return the rows of the lower triangle of the noise's covariance."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     return place, 0.0, place, mixed, 0.0, speed, 0.0, mixed, 0.0, speed
 
@@ -92,7 +92,7 @@ def move_pose(state: Components, control: Components, duration_s: Any, parameter
 
 
 def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The rows of the lower triangle of the noise's covariance."""
+    """Return the rows of the lower triangle of the noise's covariance."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     angle, turning, turn = noise_moments(parameters.turn_acceleration_density**2, duration_s)
     # fmt: off
@@ -108,19 +108,19 @@ def move_pose_noise(state: Components, duration_s: Any, parameters: Any) -> Comp
 
 
 def distance(tag: Components, anchor: Components) -> Any:
-    """The distance of two points in space."""
+    """Return the distance of two points in space."""
     dx, dy, dz = tag[0] - anchor[0], tag[1] - anchor[1], tag[2] - anchor[2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 def see(state: Components, anchor: Components, parameters: Any) -> Components:
-    """The range of an anchor."""
+    """Return the range of an anchor."""
     here = state[0], state[1], parameters.height_m
     return (distance(here, anchor) + parameters.bias_range_m,)
 
 
 def see_by_tag(state: Components, reference: Components, parameters: Any) -> Components:
-    """The range of an anchor from a tag on the body, which `reference` has behind the anchor."""
+    """Return the range of an anchor from a tag on the body, which `reference` has behind the anchor."""
     cosine, sine = np.cos(state[2]), np.sin(state[2])
     ahead, left, up = reference[3], reference[4], reference[5]
     tag = (
@@ -132,12 +132,12 @@ def see_by_tag(state: Components, reference: Components, parameters: Any) -> Com
 
 
 def see_noise(parameters: Any) -> Components:
-    """The variance of a range."""
+    """Return the variance of a range."""
     return (parameters.sigma_range_m**2,)
 
 
 def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """The position that fits the first ranges best; see `RangingParameters`, and `find_pose`."""
+    """Return the position that fits the first ranges best; see `RangingParameters`, and `find_pose`."""
     time_ns, ranges, anchors, _ = first_ranges(streams, parameters, 3)
 
     def residuals(place: Floats) -> Floats:
@@ -149,7 +149,7 @@ def find_position(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """The pose at rest that fits the first ranges best, sought from several headings.
+    """Return the pose at rest that fits the first ranges best, sought from several headings.
 
     Args:
         streams: `ranges`, the map of anchors, and the tags.
@@ -213,7 +213,7 @@ def first_ranges(
 
 
 def places(points: Stream | None, asked: Map) -> dict[int, Floats]:
-    """The places (3,) of a map by number."""
+    """Return the places (3,) of a map by number."""
     if points is None:
         return {}
     return dict(zip(points[asked.number].tolist(), points[asked.point], strict=True))
@@ -226,7 +226,7 @@ def around(anchors: Floats, parameters: Any) -> list[Floats]:
 
 
 def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
-    """The least of the robust least squares from several starts."""
+    """Return the least of the robust least squares from several starts."""
     from scipy.optimize import least_squares  # which takes long to import
 
     scale = 3.0 * parameters.sigma_range_m

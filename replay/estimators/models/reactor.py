@@ -1,4 +1,4 @@
-"""The batch reactor: a quadratic motion, a linear measurement.
+"""Models the batch reactor: a quadratic motion, a linear measurement.
 
 Steinbring and Hanebeck, "LRKF Revisited: The Smart Sampling Kalman Filter (S2KF)", JAIF 2014, section
 VI.A and appendix (which prints x_hat where the noise's mean w_hat is meant). In discrete time: every
@@ -18,7 +18,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class ReactorParameters(ModelParameters):
-    """Time step, and variances per step.
+    """States the time step, and variances per step.
 
     Attributes:
         step_s: length of a time step.
@@ -37,7 +37,7 @@ def move(pressures: Components, control: Any, duration_s: Any, parameters: Any) 
 
 
 def process_noise(pressures: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variance of each pressure's noise in a step."""
+    """Return the variance of each pressure's noise in a step."""
     return parameters.process_variance, parameters.process_variance
 
 

@@ -33,7 +33,7 @@ CUT = 3.0
 
 
 class MovingShooterParameters(ModelParameters):
-    """Noise of motion, sensors and air, and how the start is found.
+    """States noise of motion, sensors and air, and how the start is found.
 
     Attributes:
         acceleration_density: noise of the shooter's acceleration, in m/s^2/sqrt(Hz).
@@ -74,7 +74,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The rows of the lower triangle of the noise's covariance."""
+    """Return the rows of the lower triangle of the noise's covariance."""
     place, mixed, speed = noise_moments(parameters.acceleration_density**2, duration_s)
     aim = parameters.trajectory_density**2 * duration_s
     # fmt: off
@@ -89,7 +89,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def hear(state: Components, sensor: Components, parameters: Any) -> Components:
-    """The muzzle blast's direction of arrival, the bullet's direction, and the shockwave's lead.
+    """Return the muzzle blast's direction of arrival, the bullet's direction, and the shockwave's lead.
 
     The lead is that of a shockwave from the left of the muzzle blast, and that of one from the right: a
     sensor is on one side of the line of fire, and that it knows. Each goes on beyond the line without a
@@ -106,7 +106,7 @@ def hear(state: Components, sensor: Components, parameters: Any) -> Components:
 
 
 def hear_noise(parameters: Any) -> Components:
-    """The variances of what is heard."""
+    """Return the variances of what is heard."""
     return (
         parameters.sigma_muzzle_blast_rad**2,
         parameters.sigma_shockwave_rad**2,
@@ -140,7 +140,7 @@ def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> f
 
 
 def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """The shot that fits most of the first reports; BadInput where nothing tells it.
+    """Return the shot that fits most of the first reports; BadInput where nothing tells it.
 
     Wherever the muzzle blasts of two sensors meet, with every direction of the bullet that was heard, is
     tried; from where the residuals, cut off at three standard deviations, are least, least squares go on

@@ -31,7 +31,7 @@ WIDER = 100.0  # of the standard deviations of what is found: a start that is wo
 
 
 class SoundSourceParameters(ModelParameters):
-    """The air and the start.
+    """States the air and the start.
 
     The start is found by least squares; its standard deviation is a hundred times what these say, so
     that it counts little beside the differences.
@@ -71,7 +71,7 @@ def read_variances(stream: Stream) -> Floats:
 
 
 def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """The place that fits the differences of the first stamp best, sought from all sides.
+    """Return the place that fits the differences of the first stamp best, sought from all sides.
 
     Raises BadInput where they are fewer than the coordinates that they have to tell.
     """

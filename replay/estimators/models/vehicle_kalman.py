@@ -23,7 +23,7 @@ from replay.inference.model.parameters import ModelParameters
 
 
 class VehicleParameters(ModelParameters):
-    """How the vehicle moves, and the rates of change between its modes.
+    """States how the vehicle moves, and the rates of change between its modes.
 
     Attributes:
         turn_rate_radps: turn rate that the vehicle keeps.
@@ -49,12 +49,12 @@ class VehicleParameters(ModelParameters):
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """A coordinated turn."""
+    """Move by a coordinated turn."""
     return turn(state, parameters.turn_rate_radps, duration_s)
 
 
 def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
+    """Return the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
     place, mixed, velocity = noise_moments(parameters.acceleration_sigma_mps2, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 
@@ -71,7 +71,7 @@ def stand(state: Components, control: Any, duration_s: Any, parameters: Any) -> 
 
 
 def standing_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances of what little a standing vehicle moves."""
+    """Return the variances of what little a standing vehicle moves."""
     velocity = parameters.standing_sigma_mps**2
     return velocity * duration_s**2, velocity, velocity * duration_s**2, velocity
 
@@ -94,7 +94,7 @@ def position(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def fix_noise(parameters: Any) -> Components:
-    """The variances of a fix that does not state them."""
+    """Return the variances of a fix that does not state them."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 

@@ -1,1 +1,1 @@
-"""Inertial navigation: its model, its sensors, its alignment; begin with `navigation`."""
+"""Navigates by inertial units: model, sensors, alignment; begin with `navigation`."""

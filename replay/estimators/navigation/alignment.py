@@ -43,7 +43,7 @@ SIDEWAYS_RAD, ALIKE = np.radians(60.0), 0.8  # accelerations so far apart, and a
 
 
 class AlignmentParameters(ModelParameters):
-    """How the unit is mounted and delayed, and how the state at the start is found.
+    """States how the unit is mounted and delayed, and how the state at the start is found.
 
     Tilt comes from the first samples. The body is assumed to rest until a margin before it first moves.
     The heading is the course at the first speed that is high enough, less the turn of the gyro until
@@ -105,14 +105,14 @@ class AlignmentParameters(ModelParameters):
 
 
 def specific_force(samples: Any, bias: Any, parameters: Any) -> Any:
-    """The specific force of the body by samples of the unit, force and rate, of this bias."""
+    """Return the specific force of the body by samples of the unit, force and rate, of this bias."""
     x, y, z = mounted(samples[:3], parameters)
     sx, sy, sz = parameters.force_scale_x, parameters.force_scale_y, parameters.force_scale_z
     return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)
 
 
 def turn_rate(samples: Any, bias: Any, parameters: Any) -> Any:
-    """The turn rate of the body, see `specific_force`."""
+    """Return the turn rate of the body, see `specific_force`."""
     x, y, z = mounted(samples[3:], parameters)
     sx, sy, sz = parameters.gyro_scale_x, parameters.gyro_scale_y, parameters.gyro_scale_z
     return (x - bias[0]) / (1.0 + sx), (y - bias[1]) / (1.0 + sy), (z - bias[2]) / (1.0 + sz)

@@ -1,4 +1,4 @@
-"""Orientation of a body that is carried about, from a gyro, an accelerometer and a magnetometer.
+"""Estimates the orientation of a body that is carried about, from gyro, accelerometer, magnetometer.
 
 The state is the rotation, the gyro's bias, the velocity, and the magnetic field of the place. The
 accelerometer drives the velocity, which stays small: what is carried about does not get away. So gravity
@@ -35,7 +35,7 @@ FIELD: Mapping[str, Kind] = {f"field_{axis}_ut": "linear" for axis in "xyz"}
 
 
 class AttitudeParameters(ModelParameters):
-    """Noise of the unit and of the body's motion, and the uncertainty at the start.
+    """States noise of the unit and of the body's motion, and the uncertainty at the start.
 
     That the velocity is about zero and the field about constant is used once a second, since their
     errors last about as long.
@@ -75,7 +75,7 @@ class AttitudeParameters(ModelParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """The state after a step with the mean of both ends' samples."""
+    """Return the state after a step with the mean of both ends' samples."""
     qw, qx, qy, qz, bx, by, bz, vx, vy, vz, north, up = state
     fx, fy, fz, wx, wy, wz = control
     half_s = 0.5 * duration_s
@@ -89,7 +89,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances that a step adds."""
+    """Return the variances that a step adds."""
     turned = parameters.gyro_noise_density**2 * duration_s
     bias = parameters.gyro_bias_density**2 * duration_s
     moved = parameters.force_noise_density**2 * duration_s
@@ -98,31 +98,31 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances that a gap of the unit adds."""
+    """Return the variances that a gap of the unit adds."""
     turned, moved = (parameters.gap_turn_radps * duration_s) ** 2, parameters.sigma_velocity_mps**2
     return turned, turned, turned, 0.0, 0.0, 0.0, moved, moved, moved, 0.0, 0.0
 
 
 def velocity(state: Components, reference: Any, parameters: Any) -> Components:
-    """The velocity, which is zero on average."""
+    """Return the velocity, which is zero on average."""
     _, _, _, _, _, _, _, vx, vy, vz, _, _ = state
     return vx, vy, vz
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """The variances of how fast it is carried about."""
+    """Return the variances of how fast it is carried about."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 
 
 def feel_north(state: Components, reference: Any, parameters: Any) -> Components:
-    """The magnetic field in the body's axes: that of the place has no part to the east."""
+    """Return the magnetic field in the body's axes: that of the place has no part to the east."""
     qw, qx, qy, qz, _, _, _, _, _, _, north, up = state
     return into_body((qw, qx, qy, qz), (0.0, north, up))
 
 
 def field_noise(parameters: Any) -> Components:
-    """The variances of a field that is not disturbed."""
+    """Return the variances of a field that is not disturbed."""
     variance = parameters.sigma_field_ut**2
     return variance, variance, variance
 
@@ -141,7 +141,7 @@ def read_velocity(stream: Stream) -> Floats:
 
 
 def read_field(stream: Stream) -> Floats:
-    """The field (n, 3), once a period."""
+    """Return the field (n, 3), once a period."""
     return np.where(first_of_periods(stream)[:, None], stream["magnetic_field_ut"], np.nan)
 
 

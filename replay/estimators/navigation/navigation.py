@@ -1,4 +1,4 @@
-"""Inertial navigation, corrected by what a log has of position and velocity.
+"""Navigates by an inertial unit, corrected by what a log has of position and velocity.
 
 The state of 15 components, with an inertial unit for its control: position and velocity in a local
 plane of east, north, up, the orientation of the body (forward, left, up) in it, and the biases of gyro
@@ -42,7 +42,7 @@ POSITION, VELOCITY = components_of(NAVIGATION[:3]), components_of(NAVIGATION[3:6
 
 
 class NavigationParameters(AlignmentParameters):
-    """Noise of the inertial unit and the other sensors, where they are mounted, and gaps.
+    """States noise of the inertial unit and other sensors, where they are mounted, and gaps.
 
     The biases are those of the body's axes. Gravity and the rotation of the earth are those of the
     plane's origin. If the unit is silent for longer than `inertial_gap_s`, all but the biases becomes
@@ -119,7 +119,7 @@ def read_inertial(stream: Stream) -> Floats:
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """The state after a step with the mean of both ends' samples."""
+    """Return the state after a step with the mean of both ends' samples."""
     px, py, pz, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, bx, by, bz = state
     moved = strapdown(
         (px, py, pz, vx, vy, vz, qw, qx, qy, qz),
@@ -133,7 +133,7 @@ def move(state: Components, control: Components, duration_s: Any, parameters: An
 
 
 def move_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances that white noise of the samples, and the walks of their biases, add."""
+    """Return the variances that white noise of the samples, and the walks of their biases, add."""
     force = parameters.force_noise_density**2 * duration_s
     rate = parameters.gyro_noise_density**2 * duration_s
     gyro_bias = parameters.gyro_bias_density**2 * duration_s
@@ -171,12 +171,12 @@ def velocity(state: Components, samples: Components, parameters: Any) -> Compone
 
 
 def fix_noise(parameters: Any) -> Components:
-    """The variances of a fix that does not state them."""
+    """Return the variances of a fix that does not state them."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
 def velocity_noise(parameters: Any) -> Components:
-    """The variances of a velocity that does not state them."""
+    """Return the variances of a velocity that does not state them."""
     variance = parameters.sigma_velocity_mps**2
     return variance, variance, variance
 

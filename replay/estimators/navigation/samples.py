@@ -20,7 +20,7 @@ NS = 1e-9
 
 
 class ImuSamples(NamedTuple):
-    """A unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
+    """Holds a unit's samples in the body's axes: times (n,), specific force and turn rate (n, 3)."""
 
     time_ns: Integers
     force: Floats
@@ -28,7 +28,7 @@ class ImuSamples(NamedTuple):
 
 
 class GnssMotion(NamedTuple):
-    """A receiver's velocities: when they were of (n,), velocities (n, 3), covariances (n, 3, 3)."""
+    """Holds a receiver's velocities (n, 3), covariances (n, 3, 3), and when they were of (n,)."""
 
     topic: str
     time_ns: Integers
@@ -36,7 +36,7 @@ class GnssMotion(NamedTuple):
     covariance: Floats
 
     def first_above(self, row: int, limit_mps: float) -> int | None:
-        """The first row from this one on with a greater horizontal speed."""
+        """Return the first row from this one on with a greater horizontal speed."""
         faster = np.flatnonzero(np.hypot(*self.mps[row:, :2].T) > limit_mps)
         return row + int(faster[0]) if len(faster) else None
 
@@ -48,7 +48,7 @@ def mounted(sample: Any, parameters: Any) -> Any:
 
 
 def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
-    """The finite samples at the times at which they were measured."""
+    """Return the finite samples at the times at which they were measured."""
     columns = [
         np.stack(mounted(inertial[name].T, parameters), axis=1)
         for name in ("specific_force_mps2", "turn_rate_radps")
@@ -68,7 +68,7 @@ def stated_or(sigma: float | None, otherwise: Any) -> Any:
 
 
 def read_motion(streams: Mapping[str, Stream], parameters: Any) -> GnssMotion | None:
-    """The velocities that are finite; None where there are none."""
+    """Return the velocities that are finite; None where there are none."""
     stream = streams.get("velocity")
     if stream is None:
         return None

@@ -19,14 +19,14 @@ from replay.inference.model.model import Control, Sensor
 
 
 def be_headed(state: Components, reference: Any, parameters: Any) -> Components:
-    """The direction of the body's forward axis in the plane, from east to north."""
+    """Return the direction of the body's forward axis in the plane, from east to north."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     east, north, _ = into_plane((qw, qx, qy, qz), (1.0, 0.0, 0.0))
     return (np.arctan2(north, east),)
 
 
 def be_high(state: Components, reference: Any, parameters: Any) -> Components:
-    """The height over the plane's origin."""
+    """Return the height over the plane's origin."""
     _, _, pz, _, _, _, _, _, _, _, _, _, _, _, _, _ = state
     return (pz,)
 
@@ -42,26 +42,26 @@ def roll_along(state: Components, samples: Components, parameters: Any) -> Compo
 
 
 def stand(state: Components, reference: Any, parameters: Any) -> Components:
-    """The velocity, which is zero where the body stands."""
+    """Return the velocity, which is zero where the body stands."""
     _, _, _, vx, vy, vz, _, _, _, _, _, _, _, _, _, _ = state
     return vx, vy, vz
 
 
 def stay_on_wheels(state: Components, samples: Components, parameters: Any) -> Components:
-    """The velocity of the axle to the left and up, see `roll_along`."""
+    """Return the velocity of the axle to the left and up, see `roll_along`."""
     _, left, up = roll_along(state, samples, parameters)
     return left, up
 
 
 def feel_north(state: Components, reference: Any, parameters: Any) -> Components:
-    """The magnetic field in the body's axes."""
+    """Return the magnetic field in the body's axes."""
     _, _, _, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     field = parameters.field_east_ut, parameters.field_north_ut, parameters.field_up_ut
     return into_body((qw, qx, qy, qz), field)
 
 
 def see_anchor(state: Components, reference: Components, parameters: Any) -> Components:
-    """The range of an anchor from a tag on the body, which `reference` has behind the anchor."""
+    """Return the range of an anchor from a tag on the body, which `reference` has behind the anchor."""
     px, py, pz, _, _, _, qw, qx, qy, qz, _, _, _, _, _, _ = state
     ax, ay, az, tx, ty, tz = reference
     x, y, z = into_plane((qw, qx, qy, qz), (tx, ty, tz))
@@ -69,41 +69,41 @@ def see_anchor(state: Components, reference: Components, parameters: Any) -> Com
 
 
 def heading_noise(parameters: Any) -> Components:
-    """The variance of a heading."""
+    """Return the variance of a heading."""
     return (parameters.sigma_heading_rad**2,)
 
 
 def height_noise(parameters: Any) -> Components:
-    """The variance of a height."""
+    """Return the variance of a height."""
     return (parameters.sigma_height_m**2,)
 
 
 def wheel_noise(parameters: Any) -> Components:
-    """The variances of a wheel's speed, and of its slip to the side and up."""
+    """Return the variances of a wheel's speed, and of its slip to the side and up."""
     slip = parameters.sigma_slip_mps**2
     return parameters.sigma_wheel_mps**2, slip, slip
 
 
 def standing_noise(parameters: Any) -> Components:
-    """The variances of a velocity that is zero."""
+    """Return the variances of a velocity that is zero."""
     variance = parameters.sigma_standing_mps**2
     return variance, variance, variance
 
 
 def slip_noise(parameters: Any) -> Components:
-    """The variances of the slip of wheels, to the side and up."""
+    """Return the variances of the slip of wheels, to the side and up."""
     variance = parameters.sigma_slip_mps**2
     return variance, variance
 
 
 def field_noise(parameters: Any) -> Components:
-    """The variances of a field that does not state them."""
+    """Return the variances of a field that does not state them."""
     variance = parameters.sigma_field_ut**2
     return variance, variance, variance
 
 
 def range_noise(parameters: Any) -> Components:
-    """The variance of a range."""
+    """Return the variance of a range."""
     return (parameters.sigma_range_m**2,)
 
 
@@ -135,7 +135,7 @@ def read_rolling(stream: Stream) -> Floats:
 
 
 def carried_sensors(unit: Control) -> tuple[Sensor, ...]:
-    """The sensors of a body that this inertial unit drives."""
+    """Return the sensors of a body that this inertial unit drives."""
     return (
         Sensor(
             "heading",

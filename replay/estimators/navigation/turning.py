@@ -25,23 +25,23 @@ UP = 0.0, 0.0, 1.0
 
 
 def heading(state: Components) -> Components:
-    """The error (15,) of a heading that is off by a radian: the body is turned about up."""
+    """Return the error (15,) of a heading that is off by a radian: the body is turned about up."""
     x, y, z = into_body(state[6:10], UP)
     return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
 def move(state: Components, step: Components, slope: Components) -> Components:
-    """The state after an update, see `replay.inference.model.model.Correction`."""
+    """Return the state after an update, see `replay.inference.model.model.Correction`."""
     return _moved(state, step, slope, 0.0)
 
 
 def move_back(state: Components, step: Components, slope: Components) -> Components:
-    """The state after a step of the way back."""
+    """Return the state after a step of the way back."""
     return _moved(state, step, slope, 1.0)
 
 
 def step_to(state: Components, target: Components, slope: Components) -> Components:
-    """The step (15,) of the way back that moves the state to the target."""
+    """Return the step (15,) of the way back that moves the state to the target."""
     orientation = state[6:10]
     up = into_body(orientation, UP)
     down = _times(-1.0, up)

@@ -1,1 +1,1 @@
-"""Networks of nodes and robots that share estimates; begin with `networks`."""
+"""Estimates in networks of nodes and robots that share estimates; begin with `networks`."""

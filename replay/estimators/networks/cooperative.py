@@ -1,4 +1,4 @@
-"""Cooperative localization: robots that share position estimates when they see each other.
+"""Localizes robots that share position estimates when they see each other.
 
 Every robot follows its odometry; the anchors use the mapped landmarks as well. When a robot sees
 another, each of the two takes the sighting as a measurement of itself that rests on the other one:
@@ -51,7 +51,7 @@ Mode = Literal["alone", "naive", "ci", "joint"]
 
 
 class CooperativeParameters(Parameters):
-    """How robots use their sightings of each other, and which of them use landmarks.
+    """States how robots use their sightings of each other, and which of them use landmarks.
 
     Noise that is none is what the channels state.
 
@@ -120,7 +120,7 @@ Cooperating = Given[CooperativeParameters]
 
 
 def start(given: Cooperating) -> tuple[Cooperating, CooperativeState]:
-    """All robots at their priors, and the maps.
+    """Return all robots at their priors, and the maps.
 
     A robot whose prior cannot be used takes no part, and the others do not use it. Raises BadInput where
     that is so for all, or the map is not planar.

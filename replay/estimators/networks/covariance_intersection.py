@@ -1,4 +1,4 @@
-"""Fusion of estimates whose errors are correlated in an unknown way: covariance intersection and kin.
+"""Fuses estimates whose errors correlate in an unknown way: covariance intersection and kin.
 
 Jin, Lee, Hashimoto, DIND networks, 5.2, (14)-(15); Niehsen, Information Fusion Based on Fast Covariance
 Intersection (2002); Franken, Huepper, Improved Fast Covariance Intersection (2005); Noack, Sijs,
@@ -35,7 +35,7 @@ CI_TRACE, CI_DETERMINANT, NIEHSEN, FRANKEN, NAIVE, INVERSE_CI, SPLIT_CI = range(
 
 
 class Fusions(NamedTuple):
-    """Mean (..., n), covariance (..., n, n), the weights (..., K) and their certificate `gap` (...,).
+    """Holds mean (..., n), covariance (..., n, n), weights (..., K) and their certificate `gap` (...,).
 
     By the conditions of Karush, Kuhn and Tucker no weights better the criterion (the trace's logarithm,
     or the determinant's divided by n) by more than the gap; it is 0 where a rule optimises nothing. A
@@ -220,7 +220,7 @@ def fuse_together(
 
 
 def rule_number(name: str) -> int:
-    """The number of a rule of RULES; raises BadInput for another name."""
+    """Return the number of a rule of RULES; raises BadInput for another name."""
     if name not in RULES:
         raise BadInput(f"no fusion rule '{name}'; there are: {', '.join(RULES)}")
     return RULES.index(name)

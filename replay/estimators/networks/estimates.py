@@ -1,4 +1,4 @@
-"""The algebra of estimates that are fused: inverses, transforms and searches, in place."""
+"""Computes with estimates that are fused: inverses, transforms and searches, in place."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ GOLDEN = 0.6180339887498949
 
 
 class Estimate(NamedTuple):
-    """Means (..., n), covariances (..., n, n), and the parts of these independent of all others.
+    """Holds means (..., n), covariances (..., n, n), and the parts of these independent of all others.
 
     Only split CI looks at the parts.
     """
@@ -74,7 +74,7 @@ def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats)
 
 
 def determinant(matrix: Floats) -> float:
-    """The determinant of a matrix that is positive definite, else 0."""
+    """Return the determinant of a matrix that is positive definite, else 0."""
     size = len(matrix)
     factor = np.zeros((size, size))
     if not cholesky(factor, matrix, size):

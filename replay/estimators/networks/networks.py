@@ -1,4 +1,4 @@
-"""Replay of a sensor network: every node filters with its own sensor and fuses what arrives from others.
+"""Replays a sensor network: every node filters with its own sensor and fuses what others send.
 
 Jin, Lee, Hashimoto, DIND networks, 4.2: predict; x* = update with the own measurement; send x*; fuse the
 prediction (not x*) with the x* received, by a rule of `covariance_intersection`; update with the own
@@ -54,7 +54,7 @@ FAILURES = ("a covariance is singular or no longer finite",)
 
 
 class NetworkParameters(Parameters):
-    """The fusion rule, what nodes send, and a node that sends false estimates.
+    """States the fusion rule, what nodes send, and a node that sends false estimates.
 
     Attributes:
         rule: the fusion rule; "alone" fuses nothing, "centralised" is one filter with all sensors and no
@@ -299,7 +299,7 @@ def _find(_: str, topics: Mapping[str, Topic], parameters: NetworkParameters) ->
 
 
 def state_of(prior: Topic) -> list[str]:
-    """A prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
+    """Return a prior's components: positions and then the velocity of each, such as `x_m` and `vx_mps`.
 
     Raises BadInput where they are not these.
     """

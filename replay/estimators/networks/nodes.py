@@ -20,7 +20,7 @@ from replay.inference.run.loops import over_stamps
 
 
 class Activities(NamedTuple):
-    """Every moment of every node at which it measures, sends or receives, by run, time and node.
+    """Holds each moment of a node at which it measures, sends or receives, by run, time and node.
 
     Run r owns offsets[r]:offsets[r + 1]; activity a uses the measurements from measured[a] to
     measured[a + 1] and the messages from received[a] to received[a + 1]. `message` (m,) is the activity
@@ -37,7 +37,7 @@ class Activities(NamedTuple):
 
 
 class Sensing(NamedTuple):
-    """Measurements in the order of their activities: (k, n), NaN where a component is not measured.
+    """Holds measurements in the order of their activities: (k, n), NaN where not measured.
 
     `variance` (nodes, n) and `density` (nodes,) are the nodes' models.
     """
@@ -195,7 +195,7 @@ def observe_all(
 
 
 def squared_distance(difference: Floats, covariance: Floats) -> float:
-    """The squared Mahalanobis distance; infinity where the covariance is singular."""
+    """Return the squared Mahalanobis distance; infinity where the covariance is singular."""
     information = np.empty_like(covariance)
     if not inverted(covariance, information):
         return np.inf
@@ -207,7 +207,7 @@ def squared_distance(difference: Floats, covariance: Floats) -> float:
 
 
 def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
-    """The Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
+    """Return the Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
     size = len(mean)
     information, difference = np.empty_like(covariance), np.empty(size)
     if not inverted(of_covariance, information):

@@ -1,1 +1,1 @@
-"""Orientation from inertial and magnetic samples; begin with `orientation`."""
+"""Estimates orientation from inertial and magnetic samples; begin with `orientation`."""

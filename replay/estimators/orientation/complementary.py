@@ -1,4 +1,4 @@
-"""Orientation by the common methods of inertial units: Madgwick's, Mahony's, and Laidig and Seel's VQF.
+"""Estimates orientation by common methods: Madgwick's, Mahony's, and Laidig and Seel's VQF.
 
 They are what filters are compared with, and tell no covariance: one is assumed. Madgwick, "An
 efficient orientation filter for inertial and inertial/magnetic sensor arrays", 2010; Mahony, Hamel,
@@ -27,7 +27,7 @@ HALF = np.sqrt(0.5)
 
 
 class AssumedParameters(Parameters):
-    """What is assumed, since the method estimates no covariance.
+    """States what is assumed, since the method estimates no covariance.
 
     Attributes:
         sigma_deg: standard deviation about each axis that is stated.
@@ -42,7 +42,7 @@ class AssumedParameters(Parameters):
 
 
 class MadgwickParameters(AssumedParameters):
-    """The gain; the default is the author's for such a unit.
+    """States the gain; the default is the author's for such a unit.
 
     Attributes:
         gain: gain of the gradient's direction, in rad/s.
@@ -52,7 +52,7 @@ class MadgwickParameters(AssumedParameters):
 
 
 class MahonyParameters(AssumedParameters):
-    """The gains.
+    """States the gains.
 
     Attributes:
         gain: gain of the correction, in 1/s.
@@ -64,7 +64,7 @@ class MahonyParameters(AssumedParameters):
 
 
 class VqfParameters(AssumedParameters):
-    """The time constants.
+    """States the time constants.
 
     Attributes:
         inclination_s: time constant of the correction of inclination.
@@ -176,12 +176,12 @@ def follow_mahony(
 
 
 def unit_vectors(value: Floats) -> Any:
-    """The directions of force and field, and the turn rate between them."""
+    """Return the directions of force and field, and the turn rate between them."""
     return unit(value[:3]), (value[3], value[4], value[5]), unit(value[6:])
 
 
 def began(run: int, messages: Messages, row: int, state: ComplementaryState) -> Any:
-    """The orientation so far; of the first sample that of its force and field."""
+    """Return the orientation so far; of the first sample that of its force and field."""
     q = state.orientation[run]
     if q[0] == 0.0 and q[1] == 0.0 and q[2] == 0.0 and q[3] == 0.0:
         q[0], q[1], q[2], q[3] = triad(messages.value[row, :3], messages.value[row, 6:])
@@ -208,7 +208,7 @@ def keep(
 
 
 def solve_vqf(streams: OneRun, parameters: VqfParameters) -> Estimates:
-    """The library's estimate of every sample; samples are taken to be evenly spaced.
+    """Return the library's estimate of every sample; samples are taken to be evenly spaced.
 
     Raises BadInput where the library is not installed.
     """

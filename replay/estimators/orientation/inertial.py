@@ -1,4 +1,4 @@
-"""Orientation from inertial and magnetic samples: dead reckoning, corrected by the Bingham filter.
+"""Estimates orientation from inertial and magnetic samples by dead reckoning and Bingham filter.
 
 Beside it what it has to beat: dead reckoning alone, and the attitude of every sample alone.
 
@@ -58,7 +58,7 @@ class InertialModel(NamedTuple):
 
 
 class InertialSamples(NamedTuple):
-    """The samples of many runs end to end, in time order: run r owns offsets[r]:offsets[r + 1].
+    """Holds the samples of many runs in time order: run r owns offsets[r]:offsets[r + 1].
 
     Attributes:
         offsets: (runs + 1,).
@@ -128,7 +128,7 @@ class ReckoningState(NamedTuple):
 
 
 def start_reckoning(runs: int) -> ReckoningState:
-    """The state before the first sample: nothing known."""
+    """Return the state before the first sample: nothing known."""
     none_yet = np.full((runs, 2), -1)
     return ReckoningState(
         np.zeros((runs, 4)), none_yet, np.zeros((runs, 3, 3)), np.zeros(runs, np.int64)
@@ -136,7 +136,7 @@ def start_reckoning(runs: int) -> ReckoningState:
 
 
 def start_inertial_filter(runs: int) -> InertialState:
-    """The state before the first sample: nothing known."""
+    """Return the state before the first sample: nothing known."""
     return InertialState(
         np.full((runs, 3), -1),
         np.zeros((runs, 3)),
@@ -194,7 +194,7 @@ def run_dead_reckoning(
 def attitudes(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None = None
 ) -> OrientationEstimates:
-    """The TRIAD attitude of every sample alone: gravity is taken for all that is felt.
+    """Return the TRIAD attitude of every sample alone: gravity is taken for all that is felt.
 
     Args and errors as `run_inertial_filter`.
     """

@@ -1,4 +1,4 @@
-"""The estimators of orientation from inertial samples, as a replay has them; see `inertial`."""
+"""Offers the estimators of orientation from inertial samples to a replay; see `inertial`."""
 
 import math
 from collections.abc import Callable
@@ -35,7 +35,7 @@ Advance = Callable[
 
 
 class InertialParameters(Parameters):
-    """Noise and averaging of inertial samples, the same for all logs.
+    """States noise and averaging of inertial samples, the same for all logs.
 
     Attributes:
         rest_s: the body rests for so long first.
@@ -53,7 +53,7 @@ class InertialParameters(Parameters):
 
     @property
     def model(self) -> InertialModel:
-        """The same in radians."""
+        """Return the same in radians."""
         return InertialModel(
             rest_s=self.rest_s,
             block_s=self.block_s,
@@ -64,7 +64,7 @@ class InertialParameters(Parameters):
 
 
 class GyroParameters(InertialParameters):
-    """How the gyro's bias is treated.
+    """States how the gyro's bias is treated.
 
     Attributes:
         unbiased: whether the gyro's mean over the rest is subtracted.
@@ -93,7 +93,7 @@ def of_inertial_samples(
     follow: Callable[..., None] | None = None,
     follow_all: Callable[..., None] | None = None,
 ) -> Estimator[Any]:
-    """An estimator of orientation from nine-axis samples; see `recursive`."""
+    """Return an estimator of orientation from nine-axis samples; see `recursive`."""
     return recursive(
         summary,
         parameters=parameters,

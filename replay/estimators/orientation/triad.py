@@ -1,4 +1,4 @@
-"""Orientation from two directions (TRIAD), and steps of an orientation by a turn."""
+"""Finds orientation from two directions (TRIAD), and steps of an orientation by a turn."""
 
 import math
 
@@ -25,7 +25,7 @@ def fill_isotropic(sigma_rad: float, z: NDArray) -> None:
 
 
 def turn_quaternion(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, float, float, float]:
-    """The quaternion of a rotation vector."""
+    """Return the quaternion of a rotation vector."""
     x, y, z = 0.5 * x_rad, 0.5 * y_rad, 0.5 * z_rad
     angle = math.sqrt(x * x + y * y + z * z)
     scale = math.sin(angle) / angle if angle > 0.0 else 1.0
@@ -62,7 +62,7 @@ def triad(force: Components, field: Components) -> tuple[float, float, float, fl
 
 
 def unit(vector: Components) -> Components:
-    """The direction of a vector of three components; NaN where it has none."""
+    """Return the direction of a vector of three components; NaN where it has none."""
     x, y, z = vector[0], vector[1], vector[2]
     length = np.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length

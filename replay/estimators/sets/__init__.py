@@ -1,1 +1,1 @@
-"""Guaranteed sets of positions from bounded errors; begin with `set_membership`."""
+"""Computes guaranteed sets of positions from bounded errors; begin with `set_membership`."""

@@ -1,4 +1,4 @@
-"""Guaranteed sets over time: position sets moved by odometry with bounded errors, cut by every frame.
+"""Moves guaranteed position sets by odometry with bounded errors, and cuts them by every frame.
 
 Briechle, Hanebeck (2004) gives the set of one frame of relative bearings, see `set_membership`; moving
 and intersecting sets is the recursion of Schweppe, Recursive State Estimation: Unknown but Bounded
@@ -78,7 +78,7 @@ LEAVES = ("range_bearing", "bearing", "relative_bearing")
 
 
 class SetFilterParameters(SetParameters):
-    """Bounds of the errors; those that are none are what the channels state.
+    """States bounds of the errors; those that are none are what the channels state.
 
     Over a span of T s the position of the odometry is off by at most `position_error_m` + T
     `position_error_mps`, seen from the pose at the beginning, and its heading by at most
@@ -106,7 +106,7 @@ class SetFilterParameters(SetParameters):
 
 
 class SetStep(NamedTuple):
-    """The estimate at one frame.
+    """Holds the estimate at one frame.
 
     Attributes:
         time_ns: of the frame.
@@ -138,7 +138,7 @@ class Anchor:
 
 
 def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
-    """The motion between two stamps (2,) by the poses (2, 3) that odometry has there."""
+    """Return the motion between two stamps (2,) by the poses (2, 3) that odometry has there."""
     span_s = float(time_ns[1] - time_ns[0]) * 1e-9
     *displacement, turn = relative_pose(*poses)
     return Motion(
@@ -149,7 +149,7 @@ def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
 def narrowed(
     headings: Headings, places: shapely.Geometry, seen: Bearings, bound_rad: float
 ) -> Headings | None:
-    """The headings from which landmarks are seen as they were; None where there are none."""
+    """Return the headings from which landmarks are seen as they were; None where there are none."""
     left: Headings | None = headings
     for place, bearing in zip(*seen, strict=True):
         if left is not None:
@@ -165,7 +165,7 @@ def follow(
     bounds: Bounds,
     parameters: SetFilterParameters,
 ) -> list[SetStep]:
-    """The estimates of one run, from its first frame with a set on."""
+    """Return the estimates of one run, from its first frame with a set on."""
     anchor: Anchor | None = None
     steps = []
     for frame, seen in found:
@@ -261,7 +261,7 @@ def _area(parts: Sequence[shapely.Geometry]) -> float:
 
 
 def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
-    """A set at every frame of every run; see `replay.engine.api.functions.batch`."""
+    """Return a set at every frame of every run; see `replay.engine.api.functions.batch`."""
     known, bounds = given.setup
     stated = map(repr, (*bounds.position, *bounds.heading, bounds.bearing_rad))
     metadata = {

@@ -1,4 +1,4 @@
-"""Guaranteed position fixes from bounded relative bearings, one set per frame of one stamp.
+"""Computes guaranteed fixes from bounded relative bearings, one set per frame of one stamp.
 
 Briechle, Hanebeck (2004). The estimate is the set itself: the exact one, its tightest box, or the
 pseudo-ellipsoids with L = 4 and L = 8. An empty set is a fault; the relative bearing to blame is
@@ -33,7 +33,7 @@ LEAVES = ("relative_bearing", "range_bearing", "bearing")
 
 
 class SetParameters(Parameters):
-    """The form of the sets, and the bounds they come from; a bound that is none is the log's.
+    """States the form of the sets, and the bounds they come from; a bound that is none is the log's.
 
     Bearings of one stamp give all their pairs.
 
@@ -60,7 +60,7 @@ class SetParameters(Parameters):
 
 
 def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floats]:
-    """The border of the chosen set of one frame; none where it is empty."""
+    """Return the border of the chosen set of one frame; none where it is empty."""
     if parameters.shape in ("l4", "l8"):
         order: Literal[4, 8] = 4 if parameters.shape == "l4" else 8
         try:
@@ -76,7 +76,7 @@ def polygons(pairs: Pairs, arena: Arena, parameters: SetParameters) -> list[Floa
 
 
 def solve(given: Given[SetParameters]) -> list[Ragged]:
-    """A set for every frame of every run; see `replay.engine.api.functions.batch`."""
+    """Return a set for every frame of every run; see `replay.engine.api.functions.batch`."""
     known: Known = given.setup
     prefix, metadata = f"/estimates/{given.name}", set_metadata(given.topics["seen"].name, known)
     solved = []
@@ -108,7 +108,7 @@ def set_metadata(topic: str, known: Known) -> dict[str, str]:
 def set_streams(
     prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[int, list[Floats]]]
 ) -> tuple[Stream, Stream]:
-    """The sets of a run, by stamp the borders of each, and how many vertices each has."""
+    """Return the sets of a run, by stamp the borders of each, and how many vertices each has."""
 
     def whole(numbers: Iterable[int]) -> Integers:
         return np.fromiter(numbers, np.int64)
@@ -135,7 +135,7 @@ def set_streams(
 
 
 def fault_stream(prefix: str, blamed: Sequence[tuple[Frame, int]]) -> Stream:
-    """The relative bearings that are to blame for empty sets, by the frame and its pair."""
+    """Return the relative bearings that are to blame for empty sets, by the frame and its pair."""
     pairs = np.array([frame.numbers[pair] for frame, pair in blamed], np.int64).reshape(-1, 2)
     return make_stream(
         f"{prefix}/fault",

@@ -1,4 +1,4 @@
-"""Trackers of many targets: scans, detections, reports, and the PHD filter.
+"""Tracks many targets: scans, detections, reports, and the PHD filter.
 
 Begin with `tracker`.
 """

@@ -1,4 +1,4 @@
-"""The Gaussian mixture PHD filter: how many things there are, and where, from unordered scans.
+"""Estimates how many things there are, and where, from unordered scans: the Gaussian mixture PHD.
 
 Source: Vo, Ma, "The Gaussian mixture probability hypothesis density filter", IEEE TSP 54(11), 2006,
 table I (recursion), II (pruning, merging), III (extraction). Things appear anywhere alike, as in Beard,
@@ -47,7 +47,7 @@ Probability = Annotated[float, Field(gt=0, le=1)]
 
 
 class PhdParameters(Parameters):
-    """Motion, births and detections of targets; what is none is what the scans' channel states.
+    """States motion, births and detections of targets; what is none is what the scans' channel states.
 
     Attributes:
         sensor: the sensor to use, such as `network`; without one each sensor has a filter of its own.
@@ -85,7 +85,7 @@ Filtering = Given[PhdParameters]
 
 
 def start(given: Filtering) -> tuple[Filtering, Mixture]:
-    """A component of weight 1 at each prior; without one nothing is known yet.
+    """Return a component of weight 1 at each prior; without one nothing is known yet.
 
     Raises BadInput where there is no room for all.
     """
@@ -118,7 +118,7 @@ def no_components(runs: int, most: int) -> Mixture:
 
 
 def filter_scans(before: Mixture, scans: Scans, settings: PhdSettings) -> tuple[Mixture, Sets]:
-    """The mixtures after the scans, and the sets that each scan leads to."""
+    """Return the mixtures after the scans, and the sets that each scan leads to."""
     columns: Any = before
     mixture = Mixture(*(column.copy() for column in columns))
     runs, most = mixture.weight.shape

@@ -1,4 +1,4 @@
-"""The recursion of the Gaussian mixture PHD filter: predict, update, merge, prune and extract."""
+"""Recurses the Gaussian mixture PHD filter: predict, update, merge, prune and extract."""
 
 from typing import Any, NamedTuple
 
@@ -58,7 +58,7 @@ class Mixture(NamedTuple):
 
 
 class Scans(NamedTuple):
-    """Scans of all runs in time order; scan s has the detections first[s]:end[s] of `place` (n, 2)."""
+    """Holds scans of all runs in time order; scan s has detections first[s]:end[s] of `place` (n, 2)."""
 
     offsets: Integers
     time_ns: Integers
@@ -210,7 +210,7 @@ def update(
 
 
 def squared_distance(work: PhdMemory, member: int, other: int) -> float:
-    """The Mahalanobis distance, squared, of two means by the member's covariance."""
+    """Return the Mahalanobis distance, squared, of two means by the member's covariance."""
     squared = 0.0
     for row in range(STATES):
         value = work.mean[member, row] - work.mean[other, row]

@@ -38,7 +38,7 @@ class ReportSettings(NamedTuple):
 
 @varying(2)
 class Tracks(NamedTuple):
-    """The tracks of all runs: first axis run, second a place for each track, of which `used` are taken.
+    """Holds the tracks of all runs: axes run and a place for each track, of which `used` are taken.
 
     Attributes:
         used: (runs,); met: (runs,) how many there ever were, which numbers them.
@@ -65,7 +65,7 @@ class Tracks(NamedTuple):
 
 
 class Reports(NamedTuple):
-    """The reports of all runs in time order; velocity (n, 2) with its own variance (n,) besides.
+    """Holds the reports of all runs in time order; velocity (n, 2) with its own variance (n,) besides.
 
     The variance is large where course or speed is not known.
     """
@@ -107,7 +107,7 @@ class ReportMemory(NamedTuple):
 
 
 def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, float, float]:
-    """The spread of one axis after a while of constant velocity with white acceleration."""
+    """Return the spread of one axis after a while of constant velocity with white acceleration."""
     return (
         spread[0]
         + duration_s * (2.0 * spread[1] + duration_s * (spread[2] + density * duration_s / 3.0)),
@@ -119,7 +119,7 @@ def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, f
 def reported(
     spread: Floats, level: int, duration_s: float, velocity_variance: float, settings: ReportSettings
 ) -> tuple[float, float, float]:
-    """The spread of one axis of what is reported after a while, at a level of noise."""
+    """Return the spread of one axis of what is reported after a while, at a level of noise."""
     a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
     return (
         a + settings.position_variance[level],
@@ -149,7 +149,7 @@ def differences(
 
 
 def mixed(weight: float, settings: ReportSettings) -> float:
-    """The weight of a level before the next report."""
+    """Return the weight of a level before the next report."""
     return (1.0 - settings.forgetting) * weight + settings.forgetting / LEVELS
 
 

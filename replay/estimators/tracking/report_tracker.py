@@ -1,4 +1,4 @@
-"""Tracks of vessels from reports that do not say whose they are.
+"""Tracks vessels from reports that do not say whose they are.
 
 Every report goes to the track from which it is most likely, or begins a new one. Tracks are taken for
 independent point processes: what counts is how likely track i reports now (its rate) times how likely
@@ -48,7 +48,7 @@ FOUR = Annotated[tuple[PositiveFloat, ...], Field(min_length=LEVELS, max_length=
 
 
 class ReportTrackerParameters(Parameters):
-    """What is assumed of vessels and their receivers; the same for all.
+    """States what is assumed of vessels and their receivers; the same for all.
 
     There are several levels of noise, the smallest first, which each track weighs.
 
@@ -114,7 +114,7 @@ def advance(given: Reporting, before: Tracks, block: Block) -> tuple[Tracks, lis
 
 
 def covariances(spread: Floats) -> Floats:
-    """The covariances (n, 4, 4) of spreads (n, 3)."""
+    """Return the covariances (n, 4, 4) of spreads (n, 3)."""
     found = np.zeros((len(spread), 4, 4))
     for axis in (0, 2):
         found[:, axis, axis] = spread[:, 0]
@@ -181,7 +181,7 @@ def _memory(reports: int, places: int) -> ReportMemory:
 
 
 def settings_of(parameters: ReportTrackerParameters) -> ReportSettings:
-    """The parameters as the kernel has them; births per m^2 and s.
+    """Return the parameters as the kernel has them; births per m^2 and s.
 
     Raises BadInput where the last level is not the widest: gates are made with that.
     """

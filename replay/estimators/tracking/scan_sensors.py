@@ -1,4 +1,4 @@
-"""The kinds of sensors of unordered scans that a tracker takes, and what they are like.
+"""Describes the kinds of sensors of unordered scans that a tracker takes.
 
 A target is (x_m, vx_mps, y_m, vy_mps) in the plane; `origin` is where the sensor is.
 """
@@ -82,7 +82,7 @@ def place_clutter(detection: Any, parameters: Any) -> Component:
 def place_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """A target where it was detected."""
+    """Return a target where it was detected."""
     x = detection[0] - parameters.bias_x_m + origin[0]
     y = detection[1] - parameters.bias_y_m + origin[1]
     return (x, y), place_noise((x, 0.0, y, 0.0), origin, parameters), 1.0
@@ -122,7 +122,7 @@ def polar_of(target: Components, origin: Any, parameters: Any) -> Components:
 
 
 def polar_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """The variances of range and bearing."""
+    """Return the variances of range and bearing."""
     (variance,) = bearing_noise(target, origin, parameters)
     return parameters.sigma_m**2, variance
 
@@ -136,7 +136,7 @@ def polar_clutter(detection: Any, parameters: Any) -> Component:
 def polar_birth(
     detection: Any, origin: Any, parameters: Any
 ) -> tuple[Components, Components, Component]:
-    """A target where it was detected."""
+    """Return a target where it was detected."""
     range_m, bearing_rad = detection[0] - parameters.bias_range_m, detection[1] - parameters.bias_rad
     cosine, sine = np.cos(bearing_rad), np.sin(bearing_rad)
     x, y = origin[0] + range_m * cosine, origin[1] + range_m * sine

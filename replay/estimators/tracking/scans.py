@@ -1,4 +1,4 @@
-"""Scans of unordered detections, of one sensor or several: which detections are of which scan.
+"""Reads scans of unordered detections of one sensor or several: which detections are of which scan.
 
 A sensor that moves names the topic of its own position in the metadata of its scans, as ORIGIN.
 """
@@ -19,7 +19,7 @@ ORIGIN = "origin"
 
 
 class SensorTopics(NamedTuple):
-    """The sensors of a log: kind, scans, detections, and the topic of each one's own position or ""."""
+    """Names a log's sensors: kind, scans, detections, and each one's topic of own positions or ""."""
 
     kinds: tuple[int, ...]
     scans: tuple[str, ...]
@@ -33,7 +33,7 @@ class SensorTopics(NamedTuple):
 
 
 class Fix(NamedTuple):
-    """A sensor's own position (2,)."""
+    """Holds a sensor's own position (2,)."""
 
     time_ns: int
     place: Floats
@@ -43,7 +43,7 @@ Fixes = dict[str, list[Fix | None]]
 
 
 def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fixes: Fixes) -> Scans:
-    """The scans of all runs and sensors in the order in which their messages are replayed.
+    """Return the scans of all runs and sensors in the order in which their messages are replayed.
 
     `fixes` are the last own positions of earlier blocks, by topic and run. Raises BadInput as `by_scan`
     does, and where a sensor's own position is not known yet.
@@ -136,7 +136,7 @@ def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Float
 
 
 def latest_fixes(fixes: Ragged, known: Sequence[Fix | None]) -> list[Fix | None]:
-    """The last own position of every run after a block."""
+    """Return the last own position of every run after a block."""
     places = read_vectors(fixes.stream, "position_m", PLANE)
     latest = list(known)
     for run in range(fixes.runs):
@@ -148,13 +148,13 @@ def latest_fixes(fixes: Ragged, known: Sequence[Fix | None]) -> list[Fix | None]
 
 
 def rows_of(scan: Stream, detected: Stream) -> Integers:
-    """The row of each detection's scan."""
+    """Return the row of each detection's scan."""
     order = np.argsort(scan["scan_id"], kind="stable")
     return order[np.searchsorted(scan["scan_id"][order], detected["scan_id"])]
 
 
 def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
-    """Where a sensor is at its scans, (n, 2): at its last fix, or at zero where it has none."""
+    """Return where a sensor is at its scans, (n, 2): at its last fix, or at zero where it has none."""
     if fix is None:
         return np.zeros((len(scan), 2))
     last = np.searchsorted(fix.publish_time_ns, scan.publish_time_ns, side="right") - 1
@@ -162,6 +162,6 @@ def places_of_sensor(scan: Stream, fix: Stream | None) -> Floats:
 
 
 def detected_places(scan: Stream, detected: Stream, fix: Stream | None) -> Floats:
-    """Where the detections are in the plane, (n, 2)."""
+    """Return where the detections are in the plane, (n, 2)."""
     own = places_of_sensor(scan, fix)[rows_of(scan, detected)]
     return own + read_vectors(detected, "position_m", PLANE)

@@ -1,4 +1,4 @@
-"""Errors of sensors that stay: components of every track's state beside the target's.
+"""Describes errors of sensors that stay: components of every track's state beside the target's.
 
 A registration error is constant and that of all tracks; a correlated one is each track's own, such as
 where on a hull a box lies, and another one after `correlation_s`: a first-order Gauss-Markov process.
@@ -25,7 +25,7 @@ BY_SORT = ("registration", "correlated")
 
 
 class Errors(NamedTuple):
-    """The errors of sensors, the registration errors first.
+    """Describes the errors of sensors, the registration errors first.
 
     Attributes:
         names: of the components.
@@ -43,7 +43,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Sequence[Any]) -> Errors:
-    """The errors that settings give their sensors a sigma for."""
+    """Return the errors that settings give their sensors a sigma for."""
     names: list[str] = []
     sigmas, times, shared = [], [], 0
     places = [{f"{sort}_at_{i}": -1.0 for sort in BY_SORT for i in range(2)} for _ in sensors]

@@ -28,7 +28,7 @@ POSITION, VELOCITY = ("x_m", "y_m"), ("vx_mps", "vy_mps")
 
 
 class TargetParameters(ModelParameters):
-    """How targets move that keep their velocity.
+    """States how targets move that keep their velocity.
 
     Attributes:
         acceleration_density: power spectral density of the acceleration, in m^2/s^3.
@@ -44,7 +44,7 @@ def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> C
 
 
 def acceleration_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
+    """Return the lower triangle of the covariance that white acceleration adds to (x, vx, y, vy)."""
     place, mixed, velocity = noise_moments(parameters.acceleration_density, duration_s)
     return place, mixed, velocity, 0.0, 0.0, place, 0.0, 0.0, mixed, velocity
 

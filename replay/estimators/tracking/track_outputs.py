@@ -32,7 +32,7 @@ def track_outputs(
     *,
     repeated: int = 0,
 ) -> list[Ragged]:
-    """The streams of the tracker `name` for these scans.
+    """Return the streams of the tracker `name` for these scans.
 
     `repeated` is how many scans after a late one, the last of which these are of, were used again.
     """

@@ -1,4 +1,4 @@
-"""A tracker whose tracks are smoothed: it says at the end what all detections say of every state."""
+"""Smooths a tracker's tracks: says at the end what all detections say of every state."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -21,7 +21,7 @@ class TrackSmootherState(NamedTuple):
 
 
 def smoothing_tracks(tracker: Recursive, targets: Targets) -> Recursive:
-    """The tracker, which keeps what it says until the end and says its tracks smoothed.
+    """Return the tracker, which keeps what it says until the end and says its tracks smoothed.
 
     Raises BadInput where the motion of its targets is not linear, or they have several.
     """

@@ -1,4 +1,4 @@
-"""Tracks of vessels and other targets from the unordered scans of several sensors at once.
+"""Tracks vessels and other targets from the unordered scans of several sensors at once.
 
     tracker:nearest     the surest pair of track and detection first
     tracker:hungarian   the best map of tracks to detections (global nearest neighbour)
@@ -55,7 +55,7 @@ Probability = Annotated[float, Field(gt=0, lt=1)]
 
 
 class TrackerParameters(Parameters):
-    """How targets move, how tracks begin and end, and what sensors are like.
+    """States how targets move, how tracks begin and end, and what sensors are like.
 
     What is none is what the channel of a sensor's scans states; a value given here holds for all
     sensors.
@@ -220,7 +220,7 @@ class TrackerParameters(Parameters):
 
 
 def find_sensors(topics: Mapping[str, Topic], wanted: Sequence[str]) -> SensorTopics:
-    """The sensors with scans and places, bearings, or both range and bearing.
+    """Return the sensors with scans and places, bearings, or both range and bearing.
 
     Raises BadInput where one that is wanted is not there, its own position is not, or none sees places.
     """
@@ -313,7 +313,7 @@ def settings_of(
 
 
 def tracker_of(parameters: TrackerParameters, targets: Targets, settings: TrackerSettings) -> Tracker:
-    """The parts that the parameters ask for."""
+    """Return the parts that the parameters ask for."""
     stage, shared = targets.stage, settings.errors.shared
     stage = stage_of(*stage, names=settings.names)
     sensors = tuple(measuring(stage.model, kind, settings.names) for kind in KINDS)

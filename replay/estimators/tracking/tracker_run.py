@@ -18,7 +18,7 @@ from replay.inference.association.tracks import Tracks, no_tracks
 
 
 class TrackerSetup(NamedTuple):
-    """A tracker as it is bound to a log: its name, the sensors, their settings, room for tracks."""
+    """Holds a tracker as bound to a log: its name, the sensors, their settings, room for tracks."""
 
     name: str
     found: SensorTopics
@@ -34,11 +34,11 @@ class TrackerSetup(NamedTuple):
         return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
 
     def track(self, tracks: Tracks, scans: Scans) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
-        """The tracks after some scans, and what is said of them."""
+        """Return the tracks after some scans, and what is said of them."""
         return track_scans(self.tracker, scans, self.settings, self.newborn, tracks)
 
     def outputs(self, scans: Scans, tracked: TrackOutputs, *, repeated: int = 0) -> list[Ragged]:
-        """The streams of what is said of these scans; see `track_outputs`."""
+        """Return the streams of what is said of these scans; see `track_outputs`."""
         return track_outputs(
             self.name, self.found, self.tracker.stage, scans, tracked, repeated=repeated
         )

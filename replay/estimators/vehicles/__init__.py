@@ -1,4 +1,4 @@
-"""Cooperative vehicles: joint filters of several vehicles with unordered fixes.
+"""Filters several cooperative vehicles jointly, with unordered fixes.
 
 Begin with `streams`.
 """

@@ -42,7 +42,7 @@ class Scanning(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """Maps of all runs, sorted by run: the detection of every vehicle (h, vehicles), or MISSED.
+    """Holds maps of all runs, sorted by run: each vehicle's detection (h, vehicles), or MISSED.
 
     `log_weight` (h,) is what scanning alone says, without the likelihood of the places.
     """
@@ -70,7 +70,7 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
 
 def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """The most probable map of every run, vehicles taken as independent (Hungarian method)."""
+    """Return the most probable map of every run, vehicles taken as independent (Hungarian method)."""
     runs, vehicles, detections = log_likelihood.shape
     gain = log_likelihood + scanning.log_odds_of_detection
     chosen = np.full((runs, vehicles), MISSED)
@@ -94,7 +94,7 @@ def _assigned(gain: Floats) -> Integers:
 
 
 def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """All maps of every run inside the gates, but for those of next to no weight.
+    """Return all maps of every run inside the gates, but for those of next to no weight.
 
     Where a scan is whole and clean, no vehicle is missed, unless nothing is left for it.
     """

@@ -51,7 +51,7 @@ def follow_axis(
 
 
 class Bounds(NamedTuple):
-    """Total errors in m of settled filters, by what is made of the infrastructure sensor.
+    """Holds total errors in m of settled filters, by what is made of the infrastructure sensor.
 
     Each measured combination of the positions is known as with all fixes, the others by own fixes alone.
     """
@@ -74,7 +74,7 @@ def bounds(
 
 
 def exact_total_error(vehicles: int, fix_variance_m2: float, steps: int, *, stochastic: bool) -> float:
-    """The Kalman filter's root of the expected squared total error over so many steps, in m."""
+    """Return the Kalman filter's root of the expected squared total error over so many steps, in m."""
     axis = follow_axis(fix_variance_m2, steps=steps)
     squared = axis.stochastic if stochastic else axis.deterministic
     return float(np.sqrt(2 * vehicles * squared.mean()))

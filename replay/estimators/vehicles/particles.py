@@ -1,4 +1,4 @@
-"""Particle filters of cooperative vehicles with unordered fixes.
+"""Filters cooperative vehicles with unordered fixes by particles.
 
 Sources: Zhang et al., "Cooperative vehicle-infrastructure localization based on the symmetric
 measurement equation filter", 2016 (a bootstrap filter on sums of powers: their exact likelihood is a
@@ -64,7 +64,7 @@ _choose = compiled(choose_systematically, allocates=False)
 
 
 class ParticlesParameters(Parameters):
-    """The method and its random numbers, which depend on `seed` and on the run's first fixes.
+    """States the method and its random numbers, which depend on `seed` and on the run's first fixes.
 
     Attributes:
         method: what particles are of, and their number, as in associations-60; -topology adds the
@@ -77,7 +77,7 @@ class ParticlesParameters(Parameters):
 
 
 class Cloud(NamedTuple):
-    """The particles of all runs.
+    """Holds the particles of all runs.
 
     Each is a Gaussian of all vehicles (runs * particles, n): of a bootstrap filter its mean alone, the
     covariances are empty. Log weights are (runs, particles). Generators are made when a run's first
@@ -100,7 +100,7 @@ class Method(NamedTuple):
 
 
 def parse_method(method: str, seed: int) -> Method:
-    """A method from its name; raises BadInput for another."""
+    """Return a method from its name; raises BadInput for another."""
     found = re.fullmatch(r"([a-z]+)-([1-9]\d*)(-topology)?", method)
     if found is None or found[1] not in KINDS:
         known = ", ".join(f"{kind}-1000" for kind in KINDS)

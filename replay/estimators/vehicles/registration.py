@@ -26,7 +26,7 @@ LEAST_SPREAD = 5.0
 
 
 class Registration(NamedTuple):
-    """Sensor poses (runs, 3), the detection of every vehicle, and whether both can be believed."""
+    """Holds sensor poses (runs, 3), the detection of every vehicle, and whether both can be believed."""
 
     pose: Floats
     detection: Integers
@@ -34,11 +34,16 @@ class Registration(NamedTuple):
 
 
 def register(places: Floats, detections: Floats, variance_m2: Floats | float) -> Registration:
-    """The pose that lays full scans (runs, vehicles, 2) best on places (runs, vehicles, 2), any order.
+    """Find the pose that lays full scans best on places, in any order.
 
     It is not clear where even the best fits badly (something else was taken for a vehicle), another
     order fits nearly as well, or the vehicles are too close together. `variance_m2` (runs,) is that of a
     place and a detection together. Raises BadInput for too many vehicles.
+
+    Args:
+        places: (runs, vehicles, 2), in m.
+        detections: (runs, vehicles, 2), in the sensor's frame, in m.
+        variance_m2: (runs,), that of a place and a detection together.
     """
     vehicles = places.shape[1]
     if vehicles > MOST_VEHICLES:
@@ -66,7 +71,12 @@ def register(places: Floats, detections: Floats, variance_m2: Floats | float) ->
 
 
 def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
-    """Tell whether detections (runs, vehicles, 2), NaN for none, are far enough apart for a heading."""
+    """Tell whether detections (runs, vehicles, 2), NaN for none, are far enough apart for a heading.
+
+    Args:
+        detections: (runs, vehicles, 2), in m, NaN for none.
+        variance_m2: (runs,), of a detection.
+    """
     count = np.isfinite(detections[..., 0]).sum(axis=1)
     squared = np.nansum((detections - _middle(detections)) ** 2, axis=(1, 2))
     return np.asarray((count > 1) & (squared > count * LEAST_SPREAD**2 * variance_m2))
@@ -80,9 +90,16 @@ def _middle(places: Floats) -> Floats:
 
 
 def fitted_pose(places: Floats, detections: Floats) -> Floats:
-    """The poses (runs, 3) that lay detections best on places in the same order, (runs, vehicles, 2).
+    """Find the poses that lay detections best on places in the same order.
 
     Pairs where either is NaN are left out.
+
+    Args:
+        places: (runs, vehicles, 2), in m.
+        detections: (runs, vehicles, 2), in the sensor's frame, in m, in the same order.
+
+    Returns:
+        (runs, 3), x, y in m and heading in rad.
     """
     missing = np.any(np.isnan(places + detections), axis=2, keepdims=True)
     places, detections = np.where(missing, np.nan, places), np.where(missing, np.nan, detections)

@@ -1,4 +1,4 @@
-"""Cooperative vehicles from the streams of a log: which method uses what, and what it says.
+"""Filters cooperative vehicles from a log's streams: which method uses what, and what it says.
 
 A method is named `FIXES` or `FIXES-SENSOR`, as in `vehicles:hungarian-topology`: how the fixes are
 associated, and what is made of the infrastructure sensor. What came at one time in all runs is a frame;
@@ -52,7 +52,7 @@ FAILED = "the estimate is no longer finite"
 
 
 class VehiclesParameters(Parameters):
-    """The method, and what it may assume.
+    """States the method, and what it may assume.
 
     Attributes:
         method: `FIXES` or `FIXES-SENSOR`: how fixes are used, and what of the roadside sensor is, as in
@@ -102,7 +102,7 @@ class Frames(NamedTuple):
 
 
 class VehiclesResults(NamedTuple):
-    """Means (runs, frames, n) and covariances after every frame, and maps where single ones are used.
+    """Holds means (runs, frames, n), covariances after every frame, and maps where single ones are used.
 
     `associated` has arrays (runs, frames, vehicles, ...); NaN innovations where nothing was associated.
     """
@@ -163,7 +163,7 @@ def find_vehicles(name: str, topics: Mapping[str, Topic], fixes: str, sensor: st
 
 
 def vehicle_numbers(topics: Mapping[str, Topic]) -> list[int]:
-    """The numbers of the vehicles of a log."""
+    """Return the numbers of the vehicles of a log."""
     return list(numbered(topics, "vehicle", "prior", schemas.GAUSSIAN_ESTIMATE))
 
 
@@ -185,7 +185,7 @@ def _start(given: Given[Any]) -> tuple[Setup, VehiclesState]:
 
 
 def start(setup: Setup, given: Given[Any]) -> VehiclesState:
-    """Every run's priors."""
+    """Return every run's priors."""
     runs = given.runs
     mean, covariance = np.zeros((runs, setup.states)), np.zeros((runs, setup.states, setup.states))
     for vehicle, prior in enumerate(given):
@@ -211,7 +211,7 @@ def run(setup: Setup, carried: VehiclesState, block: Block) -> tuple[VehiclesSta
 
 
 def frames_of(setup: Setup, block: Block) -> Frames:
-    """A block's messages by run and frame."""
+    """Return a block's messages by run and frame."""
     events = block.events
     runs = len(events.offsets) - 1
     run_of = np.repeat(np.arange(runs), np.diff(events.offsets))
@@ -316,7 +316,7 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
 def outputs_of(
     setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
 ) -> Iterator[Ragged]:
-    """Every vehicle's estimates, the pose's where it is estimated, and who failed."""
+    """Yield every vehicle's estimates, the pose's where it is estimated, and who failed."""
     runs, count = frames.time_ns.shape
     is_estimated = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
 

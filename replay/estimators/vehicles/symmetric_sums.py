@@ -1,4 +1,4 @@
-"""Symmetric functions of noisy numbers as pseudo-measurements: sums of powers and sums of products.
+"""Makes pseudo-measurements of symmetric functions of noisy numbers: sums of powers, of products.
 
 Sources: Kamen, "Multiple target tracking based on symmetric measurement equations", IEEE TAC 1992;
 Leven and Lanterman, "Unscented Kalman filters for multiple target tracking with symmetric measurement
@@ -20,7 +20,7 @@ Numbers = NDArray  # real or complex
 
 
 class Pseudo(NamedTuple):
-    """A pseudo-measurement at p: what is expected (..., n), its Jacobian by p, a factor W of its noise.
+    """Holds a pseudo-measurement at p: expectation (..., n), Jacobian by p, a factor W of its noise.
 
     The Jacobian is (..., n, n), W (..., n, terms).
     """

@@ -1,4 +1,4 @@
-"""The joint filter's updates, by what a method makes of fixes and of the infrastructure sensor.
+"""Updates the joint filter, by what a method makes of fixes and of the infrastructure sensor.
 
 Each takes the joint states of some runs and what came in them at one time, and returns them updated.
 """
@@ -59,7 +59,7 @@ SENSOR = {
 
 
 class Setup(NamedTuple):
-    """A bound method: what it is told. `numbers` are the vehicles', as in the names of their topics."""
+    """Holds what a bound method is told; `numbers` are the vehicles', as in their topics' names."""
 
     name: str
     numbers: tuple[int, ...]
@@ -94,7 +94,7 @@ def split_method(method: str) -> tuple[str, str]:
 
 
 def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
-    """The joint states with those of some rows changed."""
+    """Return the joint states with those of some rows changed."""
     if len(rows) == len(joint.mean):
         return changed
     mean, covariance = joint.mean.copy(), joint.covariance.copy()
@@ -103,13 +103,20 @@ def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
 
 
 def where(chosen: Booleans, joint: Joint, change: Callable[[Joint], Joint]) -> Joint:
-    """The joint states, changed where chosen."""
+    """Return the joint states, changed where chosen."""
     rows = np.flatnonzero(chosen)
     return put(joint, rows, change(joint.of(rows))) if len(rows) else joint
 
 
 def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) -> Joint:
-    """Fixes (runs, vehicles, 2) of known vehicles; NaN where one is missing."""
+    """Update by fixes of known vehicles.
+
+    Args:
+        setup: the bound method.
+        joint: the Gaussians of all runs.
+        fixes: (runs, vehicles, 2), in m, NaN where one is missing.
+        noise: (runs, vehicles, 2, 2), in m^2.
+    """
     vehicles = setup.motion.vehicles
     innovation = (fixes - positions(setup.motion, joint.mean)).reshape(-1, 2 * vehicles)
     spread = np.zeros((len(fixes), vehicles, 2, vehicles, 2))
@@ -119,7 +126,7 @@ def update_by_fixes(setup: Setup, joint: Joint, fixes: Floats, noise: Floats) ->
 
 
 class Associated(NamedTuple):
-    """A single map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
+    """Holds one map: detections (runs, vehicles) or MISSED, innovations (..., 2) and covariances."""
 
     detection: Integers
     innovation: Floats
@@ -127,7 +134,13 @@ class Associated(NamedTuple):
 
 
 def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint, Associated | None]:
-    """Unordered fixes (runs, detections, 2), and their map where a single one is used."""
+    """Update by unordered fixes; returns their map too where a single one is used.
+
+    Args:
+        setup: the bound method.
+        joint: the Gaussians of all runs.
+        detections: (runs, detections, 2), in m.
+    """
     vehicles = setup.motion.vehicles
     associated = None
     for axes in ((0,), (1,)) if setup.fixes == "axes" else ((0, 1),):
@@ -146,7 +159,7 @@ def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint
 
 
 def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
-    """Symmetric sums of full scans (runs, detections, 2); others have no such sums and tell nothing.
+    """Update by symmetric sums of full scans (runs, detections, 2); others have none, tell nothing.
 
     Sums of numbers less their expected mean are linear combinations of the sums themselves; they lose
     fewer digits.
@@ -191,7 +204,15 @@ def _root(covariance: Floats) -> Floats:
 
 
 def blocks_of(matrices: Floats, vehicles: int) -> Floats:
-    """The blocks (runs, vehicles, a, a) on the diagonals of matrices (runs, vehicles a, vehicles a)."""
+    """Take the blocks on the diagonals of matrices.
+
+    Args:
+        matrices: (runs, vehicles a, vehicles a).
+        vehicles: how many there are.
+
+    Returns:
+        (runs, vehicles, a, a).
+    """
     size = matrices.shape[-1] // vehicles
     split = matrices.reshape(-1, vehicles, size, vehicles, size)
     index = np.arange(vehicles)
@@ -199,7 +220,7 @@ def blocks_of(matrices: Floats, vehicles: int) -> Floats:
 
 
 def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
-    """Detections less predictions, (h, vehicles * axes), in the vehicles' order; NaN where missed."""
+    """Return detections less predictions, (h, vehicles * axes), by vehicle; NaN where missed."""
     if places.shape[1] == 0:
         return np.full((len(maps.run), predicted[0].size), np.nan)
     chosen = places[maps.run[:, None], maps.detection]
@@ -208,7 +229,7 @@ def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Float
 
 
 def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
-    """Topology; scans with another number of detections than vehicles tell nothing, nor does a point."""
+    """Update by topology; scans with another number of detections, or a point, tell nothing."""
     vehicles = setup.motion.vehicles
     rows = np.flatnonzero(np.isfinite(seen[..., 0]).sum(axis=1) == vehicles)
     if vehicles < 2 or len(rows) == 0:
@@ -222,7 +243,7 @@ def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
 def update_by_pose(
     setup: Setup, joint: Joint, seen: Floats, registered: Booleans, may_start: Booleans
 ) -> tuple[Joint, Booleans]:
-    """Detections (runs, detections, 2) from a pose that is found along, and which runs have found it.
+    """Update by detections (runs, detections, 2) from a pose found along; also which runs found it.
 
     The pose is found anew, from what is known of the vehicles alone, where it was not yet known, and
     where it is supposed to change from scan to scan.

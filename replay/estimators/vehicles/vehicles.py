@@ -1,4 +1,4 @@
-"""The joint Gaussian filter of several vehicles, all runs of an ensemble at once.
+"""Filters several vehicles as one joint Gaussian, all runs of an ensemble at once.
 
 Sources: Zhang, Hinz, Gulati, Clarke, Knoll, "Cooperative vehicle-infrastructure localization based on
 the symmetric measurement equation filter", 2016; Bar-Shalom, Li, "Multitarget-Multisensor Tracking",
@@ -23,13 +23,13 @@ TOPOLOGY_GATE = float(chi2.isf(1e-6, 1))
 
 
 class Joint(NamedTuple):
-    """Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
+    """Holds Gaussians of the joint states: means (runs, n), covariances (runs, n, n)."""
 
     mean: Floats
     covariance: Floats
 
     def of(self, rows: Integers) -> "Joint":
-        """Some of the runs."""
+        """Return some of the runs."""
         return Joint(self.mean[rows], self.covariance[rows])
 
 
@@ -46,7 +46,7 @@ class Motion(NamedTuple):
 
 
 def positions(motion: Motion, mean: Floats) -> Floats:
-    """The vehicles' positions (runs, vehicles, 2) in means (runs, n)."""
+    """Return the vehicles' positions (runs, vehicles, 2) in means (runs, n)."""
     count = motion.vehicles
     return mean[:, : STATES * count].reshape(-1, count, STATES)[..., 0::2]
 
@@ -60,7 +60,7 @@ def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) ->
 
 
 def predict(motion: Motion, joint: Joint, duration_s: float) -> Joint:
-    """The joint state after `duration_s`: coordinated turns and white accelerations."""
+    """Return the joint state after `duration_s`: coordinated turns and white accelerations."""
     states = joint.mean.shape[1]
     transition, noise = np.eye(states), np.zeros((states, states))
     for vehicle in range(motion.vehicles):
@@ -87,7 +87,13 @@ class Gain(NamedTuple):
 
 
 def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
-    """Kalman's gain for measurement matrices (m, n) or (runs, m, n) and noises (runs, m, m)."""
+    """Compute Kalman's gain, and what it makes of the covariance.
+
+    Args:
+        covariance: (runs, n, n).
+        rows: (m, n), or (runs, m, n).
+        noise: (runs, m, m).
+    """
     cross = covariance @ rows.swapaxes(-1, -2)
     innovation = rows @ cross + noise
     inverse: Floats = np.asarray(np.linalg.inv(innovation), np.float64)
@@ -98,7 +104,14 @@ def gain_of(covariance: Floats, rows: Floats, noise: Floats) -> Gain:
 
 
 def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joint:
-    """Kalman's update by innovations (runs, m) with noises (runs, m, m); a NaN was not measured."""
+    """Update by Kalman's filter; an innovation of NaN was not measured.
+
+    Args:
+        joint: the Gaussians of all runs.
+        rows: (m, n), or (runs, m, n).
+        innovation: (runs, m), NaN where not measured.
+        noise: (runs, m, m).
+    """
     missing = np.isnan(innovation)
     if missing.any():
         there = ~missing
@@ -111,7 +124,7 @@ def update(joint: Joint, rows: Floats, innovation: Floats, noise: Floats) -> Joi
 
 
 class Weighed(NamedTuple):
-    """Hypotheses with their scores: log weight and likelihood of the innovations, zero where missed.
+    """Holds hypotheses with scores: log weight and likelihood of the innovations, zero where missed.
 
     `group` (h,) says which row of the gains a hypothesis has; those of a run that miss the same vehicles
     share one. `group_run` is the run of each row.
@@ -127,7 +140,7 @@ class Weighed(NamedTuple):
 def weigh(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Weighed:
-    """The likelihood of every hypothesis, by all vehicles together.
+    """Return the likelihood of every hypothesis, by all vehicles together.
 
     Args:
         joint: before the measurement.
@@ -152,7 +165,7 @@ def weigh(
 def collapse(
     joint: Joint, rows: Floats, innovations: Floats, noise: Floats, hypotheses: Hypotheses
 ) -> Joint:
-    """The Gaussian with the moments of the mixture over all associations of an unordered set.
+    """Return the Gaussian with the moments of the mixture over all associations of an unordered set.
 
     Exact weights: those of all maps of a set without loss are the terms of a permanent, so that this
     is what an exact symmetric measurement equation filter collapses to. Args as for `weigh`.
@@ -189,7 +202,7 @@ def _sums(values: Floats, group: Integers, groups: int) -> Floats:
 
 
 def normalised(score: Floats, run: Integers) -> Floats:
-    """exp(score), scaled to sum one in each run; runs are sorted."""
+    """Return exp(score), scaled to sum one in each run; runs are sorted."""
     first = np.flatnonzero(np.append(True, run[1:] != run[:-1]))
     count = np.diff(np.append(first, len(run)))
     weight = np.exp(score - np.repeat(np.maximum.reduceat(score, first), count))
@@ -197,7 +210,7 @@ def normalised(score: Floats, run: Integers) -> Floats:
 
 
 def spread_of(places: Floats) -> Floats:
-    """The sum of squared distances from the mean, (...,), of places (..., vehicles, 2)."""
+    """Return the sum of squared distances from the mean, (...,), of places (..., vehicles, 2)."""
     return np.sum((places - places.mean(axis=-2, keepdims=True)) ** 2, axis=(-2, -1))
 
 
@@ -215,7 +228,7 @@ def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats
 
 
 class Scalar(NamedTuple):
-    """A linearised scalar measurement: rows (runs, 1, n), innovations (runs,) with their variances.
+    """Holds a linearised scalar measurement: rows (runs, 1, n), innovations (runs,), their variances.
 
     `noise` (runs,) is the measurement's part of the variance.
     """
@@ -227,7 +240,7 @@ class Scalar(NamedTuple):
 
 
 def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
-    """The topology of scans (runs, vehicles, 2), whatever their frame and order.
+    """Return the topology of scans (runs, vehicles, 2), whatever their frame and order.
 
     The innovation is NaN where it is too improbable: something was missed and something else taken for
     a vehicle.

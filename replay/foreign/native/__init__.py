@@ -1,4 +1,4 @@
-"""Filters behind `fuselog_filter.h`: their library, and the loop that calls it by address.
+"""Calls filters behind `fuselog_filter.h`: loads their library, and calls it by address.
 
 Begin with `following`.
 """

@@ -35,7 +35,7 @@ STARTS_S = 60.0  # how long one may take to begin: it imports and compiles
 
 
 class Ended(Exception):
-    """A process ended, or was ended, before it was done: the reason."""
+    """Says why a process ended, or was ended, before it was done."""
 
 
 class Limits(NamedTuple):

@@ -11,7 +11,7 @@ from recorders.errors import BadInput, printable
 from replay.foreign.processes.isolation import LOOKS_S, Ended, Limits, Watch, end, how_ended
 from replay.foreign.processes.orphans import GUARD
 
-TOLD_BYTES = 300  # of what a program says on standard error
+TAIL_BYTES = 300  # of what a program says on standard error
 
 
 class Program:
@@ -29,19 +29,19 @@ class Program:
             ) from None
         GUARD.tell(self.process.pid)
         self.tail = b""
-        self._told = threading.Thread(target=self._keep_tail, daemon=True)
-        self._told.start()
+        self._reader = threading.Thread(target=self._keep_tail, daemon=True)
+        self._reader.start()
 
     def _keep_tail(self) -> None:
         assert self.process.stderr is not None
         with suppress(OSError, ValueError):
-            while said := self.process.stderr.read1(4096):  # type: ignore[attr-defined]
-                self.tail = (self.tail + said)[-TOLD_BYTES:]
+            while piece := self.process.stderr.read1(4096):  # type: ignore[attr-defined]
+                self.tail = (self.tail + piece)[-TAIL_BYTES:]
 
     def how_ended(self) -> str:
         """Say how it ended, and its last words."""
         code = self.process.wait()
-        self._told.join(1.0)
+        self._reader.join(1.0)
         lines = self.tail.decode(errors="replace").strip().splitlines()
         return how_ended(code) + (f": {printable(lines[-1])}" if lines and code else "")
 

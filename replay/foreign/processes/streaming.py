@@ -195,7 +195,7 @@ def follow_stream(
 
 
 class _Failed(Exception):
-    """A filter's own failure."""
+    """Says why the filter itself failed."""
 
 
 def _check(status: int, description: Description) -> None:

@@ -1,4 +1,4 @@
-"""What a process is given of a run in files, and gives back: both sides of `isolation`."""
+"""Hands a process what it needs of a run in files, and reads what it gives: both sides."""
 
 from collections.abc import Sequence
 from functools import partial

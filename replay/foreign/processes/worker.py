@@ -1,4 +1,4 @@
-"""The process in which a library's filters live: what they break breaks this process alone.
+"""Runs a library's filters in a process of its own: what they break breaks this process alone.
 
 It is started by `isolation`, takes tasks as lines of JSON, and ends when its standard input does. The
 library finds nothing to read there, and what it prints goes nowhere.

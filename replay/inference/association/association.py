@@ -35,7 +35,19 @@ from replay.inference.association.clusters import (
 def nearest(
     weights: Weights, tracks: int, detections: int, probability: Floats, memory: AssociationMemory
 ) -> int:
-    """Choose one map: the surest pair first, then the surest of the tracks and detections left."""
+    """Choose one map: the surest pair first, then the surest of the tracks and detections left.
+
+    Args:
+        weights: of pairs and of misses.
+        tracks: how many there are; arrays may be longer.
+        detections: likewise.
+        probability: (tracks, 1 + detections) filled: 1 where a map has a pair, or in the first
+            column no detection.
+        memory: what is worked in.
+
+    Returns:
+        0, as no cluster is approximated.
+    """
     for column in range(detections):
         memory.is_seen[column] = False
     for row in range(tracks):
@@ -62,6 +74,16 @@ def hungarian(
     """Choose the map of the greatest weight: successive shortest augmenting paths (Crouse, fig. 3).
 
     Column j of the assignment is detection j, and column detections + i stands for track i's miss.
+
+    Args:
+        weights: of pairs and of misses.
+        tracks: how many there are; arrays may be longer.
+        detections: likewise.
+        probability: (tracks, 1 + detections) filled, as by `nearest`.
+        memory: what is worked in.
+
+    Returns:
+        0, as no cluster is approximated.
     """
     columns = detections + tracks
     for column in range(columns):

@@ -91,6 +91,13 @@ def jpda(
     Tracks that share no detection, not even through others, are independent: each cluster is summed on
     its own, exactly where it has at most MOST_ENUMERATED tracks or as many detections. Returns how many
     tracks are in larger ones, whose marginals are those of belief propagation.
+
+    Args:
+        weights: of pairs and of misses.
+        tracks: how many there are; arrays may be longer.
+        detections: likewise.
+        probability: (tracks, 1 + detections) filled.
+        memory: what is worked in.
     """
     approximated = 0
     for column in range(detections):
@@ -227,7 +234,7 @@ def ending_without(slot: int, items: int, slots: int, memory: AssociationMemory)
 def propagate_beliefs(
     weights: Weights, rows: int, columns: int, probability: Floats, memory: AssociationMemory
 ) -> None:
-    """About the marginals of one cluster: messages between tracks and detections until they settle.
+    """Approximate the marginals of one cluster by messages between tracks and detections that settle.
 
     They are exact where the cluster is a tree, and more certain than exact ones else.
     """
@@ -274,6 +281,13 @@ def propagate_beliefs(
 
 
 def choose(row: int, column: int, detections: int, probability: Floats) -> None:
-    """Fill a track's row where its detection is chosen; NONE for none."""
+    """Fill a track's row where its detection is chosen; NONE for none.
+
+    Args:
+        row: the track's.
+        column: of the detection; NONE for none.
+        detections: how many there are.
+        probability: (tracks, 1 + detections), of which the row is filled with 0 and 1.
+    """
     for entry in range(1 + detections):
         probability[row, entry] = 1.0 if entry == 1 + column else 0.0

@@ -31,6 +31,14 @@ def smooth_tracks(
 
     `track` (n,) says whose each is; the estimates of a track are in time order. The motion of the
     stage is linear, and nothing controls it.
+
+    Args:
+        stage: the model of the targets.
+        parameters: the numbers that its functions read.
+        track: (n,), whose each estimate is.
+        time_ns: (n,), rising in each track.
+        mean: (n, size), filtered.
+        covariance: (n, size, size), filtered.
     """
     order = np.argsort(track, kind="stable")
     numbers, first = np.unique(track[order], return_index=True)

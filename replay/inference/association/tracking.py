@@ -256,7 +256,7 @@ def track_scans(
     runs, places = tracks.number.shape
     begin, end = scans.offsets[:-1], scans.offsets[1:]
     largest = int((scans.end - scans.first).max(initial=0))
-    said = []
+    batches = []
     for first in range(0, int((end - begin).max(initial=0)), BATCH):
         bounds = np.minimum(begin + first, end), np.minimum(begin + first + BATCH, end)
         rows = np.concatenate([np.arange(*pair) for pair in zip(*bounds, strict=True)])
@@ -268,8 +268,8 @@ def track_scans(
         memory = partial(_memory, tracker, places, largest)
         inputs = ScanInputs(batch, settings, newborn)
         _compiled(tracker)(runs, inputs, tracks, outputs, scratch=memory)
-        said.append((batch, outputs))
-    return tracks, said
+        batches.append((batch, outputs))
+    return tracks, batches
 
 
 def _memory(tracker: Tracker, places: int, detections: int) -> ScanMemory:

@@ -59,6 +59,16 @@ def no_tracks(
 
     `sizes` are those of the modes, of the state and of its tangent space; `shared` (k, k) is how
     uncertain what all tracks share is at first.
+
+    Args:
+        runs: how many.
+        places: for how many tracks of each run there is room.
+        sizes: of the modes, of the state and of its tangent space.
+        sensors: how many there are.
+        shared: (k, k), the covariance of what all tracks share.
+
+    Returns:
+        The tracks, of which none is used.
     """
     modes, n, t = sizes
     return Tracks(

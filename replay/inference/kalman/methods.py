@@ -64,7 +64,7 @@ class MethodParameters(Parameters):
 
 
 class UnscentedParameters(MethodParameters):
-    """Options of methods that may use the unscented transform.
+    """Defines options of methods that may use the unscented transform.
 
     Attributes:
         kappa: how far out sigma points are: 3 - n is Julier's choice, 0 the cubature filter. lrkf:ukf
@@ -76,7 +76,7 @@ class UnscentedParameters(MethodParameters):
 
 
 class RegressionParameters(MethodParameters):
-    """Options of methods that may use samples.
+    """Defines options of methods that may use samples.
 
     Attributes:
         sampling: name of the sampling, such as s2kf-50.

@@ -23,6 +23,14 @@ def orthogonalise(rows: Floats, weights: Floats, factor: Floats) -> bool:
     Modified Gram-Schmidt, so that no product of A with itself is made; a weight may be negative. The
     diagonal is positive, and zero with all below where a row depends on those before it. False, and the
     pivot NaN, where the product is not positive semidefinite.
+
+    Args:
+        rows: A (r, c), used up.
+        weights: w (c,).
+        factor: L (r, r), filled.
+
+    Returns:
+        Whether A diag(w) A' is positive semidefinite.
     """
     size, count = len(rows), len(weights)
     for i in range(size):
@@ -55,6 +63,13 @@ def fill_root(rows: Floats, covariance: Floats) -> bool:
 
     By Cholesky, with that pivot next which is the largest beside what it was: a covariance may be
     singular.
+
+    Args:
+        rows: (n, at least n), whose first n columns become N.
+        covariance: (n, n), used up.
+
+    Returns:
+        Whether the covariance is positive semidefinite.
     """
     size, whole = len(covariance), np.empty(len(covariance))
     for i in range(size):
@@ -77,7 +92,12 @@ def fill_root(rows: Floats, covariance: Floats) -> bool:
 
 
 def retriangulate(rows: Floats, factor: Floats) -> None:
-    """Fill the lower factor of A A', of rows A (t, t), which may be the factor itself."""
+    """Fill the lower factor of A A', of rows A (t, t), which may be the factor itself.
+
+    Args:
+        rows: A (t, t).
+        factor: (t, t), filled.
+    """
     array, weights = np.empty(rows.shape), np.empty(len(rows))
     for row in range(len(rows)):
         weights[row] = 1.0

@@ -180,7 +180,13 @@ def whiten(innovation: Innovation, size: int) -> tuple[float, float]:
 
 
 def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, float]:
-    """Turn v into L^-1 v; returns its square, and log det L L'."""
+    """Turn v into L^-1 v; returns its square, and log det L L'.
+
+    Args:
+        factor: L, lower, of which the first `size` rows and columns count.
+        difference: v (m,), changed in place.
+        size: how many components are measured.
+    """
     squared, determinant = 0.0, 1.0
     for i in range(size):
         entry = difference[i]
@@ -239,6 +245,11 @@ def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
     """Fill `step` (t,) with K v of a whitened innovation; its cross-covariance C becomes W = C L^-T.
 
     So K v = W L^-1 v, and K S K' = W W'.
+
+    Args:
+        innovation: v whitened, the factor L of S, and C (t, m).
+        size: how many components are measured.
+        step: (t,) filled.
     """
     difference, factor, cross = innovation
     for row in range(len(step)):
@@ -305,7 +316,14 @@ def propagate_covariance(covariance: Floats, transition: Floats, product: Floats
 
 
 def measured_covariance(covariance: Floats, rows: Floats, cross: Floats, spread: Floats) -> None:
-    """Fill C = P H' and S = H C, with H in `rows`, of which there may be more than are measured."""
+    """Fill C = P H' and S = H C, with H in `rows`, of which there may be more than are measured.
+
+    Args:
+        covariance: P (t, t).
+        rows: H (at least m, t).
+        cross: C (t, m) filled.
+        spread: S (m, m) filled.
+    """
     for i in range(len(spread)):
         for row in range(len(covariance)):
             entry = 0.0

@@ -1,7 +1,6 @@
 """Checks that a model is what it declares, by trying its functions: for the tests of its author.
 
-`check_model` tries a model's functions at random states: derivatives, what is declared linear or an
-angle, numbers of components, variances. What it finds is one sentence with the function's file and line.
+What `check_model` finds at random states is one sentence with the function's file and line.
 """
 
 from collections.abc import Mapping, Sequence
@@ -71,13 +70,16 @@ def check_model(
     states: ArrayLike | None = None,
     seed: int = 0,
 ) -> "Checked":
-    """Check all functions of a model against what it declares; returns what was checked, in sentences.
+    """Check all functions of a model against what it declares.
 
     Args:
         model: the model.
         parameters: their values; one that is neither given nor has a default is 1.
         states: (n, components) at which to try; random ones of order one unless given.
         seed: of the random states, controls and points of a map.
+
+    Returns:
+        Sentences on what was checked, and on what was not.
 
     Raises AssertionError, with one sentence, where a function cannot be traced, its derivatives differ
     from central differences or from those written by hand, a number of components is wrong, what is
@@ -134,7 +136,7 @@ def check_model(
 
 
 class Checked(tuple[str, ...]):
-    """Sentences on what was checked; a notebook shows them line by line."""
+    """Holds sentences on what was checked; a notebook shows them line by line."""
 
     def __repr__(self) -> str:
         return "\n".join(self)
@@ -144,16 +146,16 @@ def _checked(
     model: Model, calls: Sequence[_Call], parts: Sequence[Motion | Sensor], states: int
 ) -> Checked:
     """Say what was checked of every function, and what was not, since nothing is declared of it."""
-    said = [f"{model.summary}: {len(calls)} functions at {states} states"]
+    sentences = [f"{model.summary}: {len(calls)} functions at {states} states"]
     for call, part in zip(calls, parts, strict=True):
         by = ", ".join(["state", *(name for name, (size, _) in call.inputs.items() if size)])
         found = [f"derivatives by {by}", "angles, jumps and lengths"]
         found += ["linear"] if part.linear else []
         of_messages = isinstance(part, Sensor) and part.covariance
         found += ["variances"] if part.noise is not None and not of_messages else []
-        said.append(f"{call.what}: {'; '.join(found)}")
+        sentences.append(f"{call.what}: {'; '.join(found)}")
     others = {"moments": any(part.moments for part in parts), "start": model.start is not None}
-    return Checked([*said, *(f"{name}: not checked" for name, has in others.items() if has)])
+    return Checked([*sentences, *(f"{name}: not checked" for name, has in others.items() if has)])
 
 
 def _motion_call(model: Model, motion: Motion, numbers: Any) -> _Call:

@@ -87,10 +87,11 @@ class Motion:
     """Describes how the state moves.
 
     Attributes:
-        move: (state, control, duration_s, parameters) -> state. Where `noises` says how many numbers of
-            noise enter other than by addition, (state, control, noise, duration_s, parameters).
+        move: (state, control, duration_s, parameters) -> state; with `noises`, (state, control, noise,
+            duration_s, parameters) -> state.
         noise: (state, duration_s, parameters) -> the variances of the additive noise in the tangent
             space, or the rows of its covariance's lower triangle; with `noises`, the variances of these.
+        noises: how many numbers of noise enter `move` other than by addition.
         noise_block: how many components the triangle is of, where variances of the others follow it; of
             all of them for zero.
         control_noise: (duration_s, parameters) -> the variances of the control's error over the
@@ -116,7 +117,7 @@ class Motion:
     moments: Function | None = None
 
     def triangle(self, tangent: int) -> int:
-        """Count the numbers that `noise` returns where these are a lower triangle."""
+        """Count the numbers of `noise` where they are a triangle, for a state of size `tangent`."""
         block = self.noise_block or tangent
         return block * (block + 1) // 2 + tangent - block
 
@@ -153,6 +154,7 @@ class Sensor:
         vector: the field that holds what is measured as a vector. The channel's metadata say in
             `components` how its entries are called, in any order; those of a position need no names.
             Unless this is given, every component is a field of its own.
+        noises: how many numbers of noise enter `measure` other than by addition.
         covariance: the field that holds the vector's covariance; with `read`, stream -> (n, m, m), NaN
             where it is unknown.
         reference: what the message is about: a point of a map, or one of each of several maps.

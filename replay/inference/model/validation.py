@@ -94,9 +94,9 @@ def switching_of(where: str, model: Model, parameters: Any) -> tuple[Floats, Flo
     if switching.initial is not None:
         initial = np.array(switching.initial(parameters), float)
     if not (np.all(initial >= 0.0) and abs(initial.sum() - 1.0) < 1e-9):
-        told = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
+        given = ", ".join(f"{name} {each:g}" for name, each in zip(names, initial, strict=True))
         raise BadInput(
-            f"{where}: the initial probabilities of the modes are {told}; give numbers of zero or more "
+            f"{where}: the initial probabilities of the modes are {given}; give numbers of zero or more "
             "whose sum is one"
         )
     return rates, initial

@@ -45,7 +45,7 @@ AGREED = 0.1  # members become one where their means are on average so near, as 
 
 
 class GaussianSumParameters(UnscentedParameters, RegressionParameters):
-    """The filter of every member, and the number of members.
+    """States the filter of every member, and the number of members.
 
     Members lie side by side, and the standard deviation of each is half their distance, so that their
     sum is smooth. A narrower prior has fewer members; one that is no wider than a member is not split.

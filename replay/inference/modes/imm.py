@@ -54,7 +54,7 @@ from replay.inference.run.recursion import FilterEvents
 
 
 class InteractingParameters(UnscentedParameters, RegressionParameters):
-    """The filter of every mode, and what is written.
+    """States the filter of every mode, and what is written.
 
     Attributes:
         filter: the filter of every mode.

@@ -46,7 +46,7 @@ MOST_PARTICLES = 1_000_000
 
 
 class ParticleParameters(MethodParameters):
-    """The number of particles, and when they are resampled.
+    """States the number of particles, and when they are resampled.
 
     Random numbers depend on `seed` and on the run's first measurement.
 

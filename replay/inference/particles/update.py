@@ -186,7 +186,7 @@ def keep_predicted(own: SensorMemory) -> int:
     return size
 
 
-def is_told(own: SensorMemory, i: int, size: int) -> bool:
+def is_predicted(own: SensorMemory, i: int, size: int) -> bool:
     """Tell whether a particle predicts all components that are used."""
     for a in range(size):
         if np.isnan(own.differences[i, own.kept[a]]):
@@ -214,7 +214,7 @@ def innovate(weight: Floats, own: SensorMemory, size: int, angular: tuple[bool, 
         mean[own.kept[a]] = 0.0
     first, total = -1, 0.0
     for i in range(len(weight)):
-        if not is_told(own, i, size):
+        if not is_predicted(own, i, size):
             continue
         first = i if first < 0 else first
         total += weight[i]
@@ -278,7 +278,16 @@ def _likelihood(stage: Stage, number: int) -> Function:
 def gaussian_likelihood(
     states: Floats, i: int, data: Floats, parameters: Any, own: SensorMemory, size: int
 ) -> float:
-    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v."""
+    """Compute the log p of Gaussian noise, see `inflation`; the difference becomes L^-1 v.
+
+    Args:
+        states: (N, n), not read: the differences are known.
+        i: which particle.
+        data: (width,), of the event; not read.
+        parameters: the sensor's row, for `inflation`.
+        own: the sensor's memory, with differences and the factors of noise.
+        size: how many components are used.
+    """
     number = i if len(own.noise) > 1 else 0
     difference, factor, squared = own.differences[i], own.noise[number], 0.0
     for a in range(size):

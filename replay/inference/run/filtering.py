@@ -169,7 +169,7 @@ class Filter:
 
     @property
     def form(self) -> Form:
-        """What stands for covariances in what it carries."""
+        """Return what stands for covariances in what it carries."""
         return self.steps.form
 
     def origins(self, static: Mapping[str, Ragged], runs: int) -> Floats | None:

@@ -107,12 +107,12 @@ def started(name: str, facts: list[Fact]) -> list[Ragged]:
     if not facts:
         return []
     texts, times, which = zip(*facts, strict=True)
-    is_said = np.stack(which, axis=1)
+    holds = np.stack(which, axis=1)
     stream = reason_stream(
         f"/estimates/{name}/started",
         schemas.STARTED,
-        np.stack(times, axis=1)[is_said],
-        np.nonzero(is_said)[1],
+        np.stack(times, axis=1)[holds],
+        np.nonzero(holds)[1],
         texts,
     )
-    return [Ragged(stream, np.append(0, np.cumsum(is_said.sum(axis=1))))]
+    return [Ragged(stream, np.append(0, np.cumsum(holds.sum(axis=1))))]

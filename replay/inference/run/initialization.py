@@ -116,7 +116,7 @@ class Initializer:
             clock: by which the replay stamps estimates.
         """
         found: dict[str, Ragged] = {}
-        told: list[Ragged] = []
+        streams: list[Ragged] = []
         facts: list[Fact] = []
         origins = (
             None if self.found.origin is None else np.tile(self.found.origin, (run_count(first), 1))
@@ -126,7 +126,7 @@ class Initializer:
             time_ns, has_one, rows = first_of_runs(fixes, clock, None)
             found[topic.name] = of_runs(fixes.stream.take(rows[has_one]), has_one)
             origins = origins_of(found[topic.name])
-            told.append(self._told_origin(found[topic.name]))
+            streams.append(self._origin_stream(found[topic.name]))
             what = f"no channel states the origin of the plane: it is the first fix of {topic.name}"
             facts.append(Fact(what, time_ns, has_one))
         if not self.found.has_prior:
@@ -135,7 +135,7 @@ class Initializer:
             facts += begun
         elif self._prior_check is not None:
             facts += self._checked_prior(self._prior_check, first, static, origins)
-        return Initialized(found, [*told, *started(self.name, facts)])
+        return Initialized(found, [*streams, *started(self.name, facts)])
 
     def find_broad(
         self,
@@ -158,8 +158,8 @@ class Initializer:
             table = sensor_table(self.stage, number, ragged, Context({}, origins), self.settings)
             _when, has_message, rows = first_of_runs(ragged, clock, table.source >= 0)
             for run in np.flatnonzero(has_message):
-                told = state_by_message(self.stage, number, table.data[rows[run]])
-                references[run].append((sensor.measured, *told))
+                state = state_by_message(self.stage, number, table.data[rows[run]])
+                references[run].append((sensor.measured, *state))
         priors = broad_priors(self.stage.model, self.found.prior.name, times_ns, references)
         has_one = np.ones(runs, np.bool_)
         return [Initialized({**begun, prior.topic: of_runs(prior, has_one)}, []) for prior in priors]
@@ -213,8 +213,8 @@ class Initializer:
     def _assumption(self, name: str, number: float) -> str:
         """Write the sentence for a parameter that is assumed, with its meaning if the model gives it."""
         meaning = meanings(self.stage.model.parameters).get(name, "")
-        said = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
-        return f"{said} ({meaning.rstrip('.')})" if meaning else said
+        sentence = f"no channel states {name}: {number:g} is assumed; --set {name}=... sets it"
+        return f"{sentence} ({meaning.rstrip('.')})" if meaning else sentence
 
     @property
     def _without(self) -> str:
@@ -282,14 +282,14 @@ class Initializer:
     ) -> list["Fact"]:
         """Check the prior of runs against their first messages, as the model does."""
         given, parameters = self._given(first, static, origins)
-        said = [
+        sentences = [
             check_prior({name: ragged.of_run(run) for name, ragged in given.items()}, parameters)
             for run in range(run_count(first))
         ]
         time_ns, _, _ = first_of_runs(next(iter(given.values())), "publish_time", None)
         return [
-            Fact(text, time_ns, np.array([text in of_run for of_run in said]))
-            for text in dict.fromkeys(text for of_run in said for text in of_run)
+            Fact(text, time_ns, np.array([text in of_run for of_run in sentences]))
+            for text in dict.fromkeys(text for of_run in sentences for text in of_run)
         ]
 
     def _at_first(
@@ -381,12 +381,12 @@ class Initializer:
         ]
         return "; ".join(complaints)
 
-    def _told_origin(self, fixes: Ragged) -> Ragged:
+    def _origin_stream(self, fixes: Ragged) -> Ragged:
         """Make the stream of origins, as fixes on a topic of their own."""
         stream = fixes.stream
         columns: dict[str, Any] = {
             name: stream[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")
         }
         topic = f"/estimates/{self.name}/origin"
-        told = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
-        return Ragged(told, fixes.offsets)
+        origins = make_stream(topic, schemas.GEODETIC_FIX, stream.publish_time_ns, **columns)
+        return Ragged(origins, fixes.offsets)

@@ -1,4 +1,4 @@
-"""Smooths: the backward pass over a filter, iterated smoothing, and the posterior bound.
+"""Smooths by a backward pass over a filter, or by iteration, and computes the posterior bound.
 
 Begin with `backward_pass`.
 """

@@ -220,7 +220,14 @@ def reaching(kinds: tuple[str, ...]) -> Function:
 
 
 def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Floats) -> float:
-    """Compute the square of an offset in units of a noise, where that has a part; fills `whitened`."""
+    """Compute the square of an offset in units of a noise, where that has a part; fills `whitened`.
+
+    Args:
+        offset: (t,).
+        factors: of the covariances of all steps.
+        step: which of them.
+        whitened: (t,), of which the first rank entries are filled.
+    """
     factor, order, squared = factors.factor[step], factors.order[step], 0.0
     for k in range(factors.rank[step]):
         entry = offset[order[k]]
@@ -232,7 +239,7 @@ def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Float
 
 
 def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floats) -> int:
-    """Cholesky's factor of a positive semidefinite matrix: its rank, or -1 where it is none.
+    """Factor a positive semidefinite matrix by Cholesky, pivoted: its rank, or -1 where it is none.
 
     The row with the largest share of its diagonal entry left comes next; shares below NOTHING_LEFT are
     round-off. Fills `order`, and `factor` (t, rank), whose row order[k] ends in column k.
@@ -311,7 +318,13 @@ def affine_sensor(stage: Stage, number: int) -> Function:
 
 
 def robust(squared: float, loss: Floats) -> tuple[float, float]:
-    """Compute the cost of a residual whose square is given, and the weight that has its derivative."""
+    """Compute the cost of a residual whose square is given, and the weight that has its derivative.
+
+    Args:
+        squared: of the whitened residual.
+        loss: (2,), 0 for squares, 1 for Huber's, 2 for Cauchy's; and the length from which on it
+            counts less.
+    """
     bound = loss[1] ** 2
     if loss[0] == 1.0 and squared > bound:
         length = np.sqrt(squared)

@@ -32,7 +32,7 @@ from replay.inference.smoothing.bound_steps import Nodes, TrueTrajectory, bound_
 
 
 class BoundParameters(MethodParameters):
-    """Whose bound it is, and how truth is read.
+    """States whose bound it is, and how truth is read.
 
     Attributes:
         of: whether the bound of filters or that of smoothers.
@@ -173,7 +173,7 @@ class BoundFilter(Filter):
         before, kept = state.carried, state.kept
         after, (nodes, offsets), made = self.filtered(state, events)
         kept, first = self.begun(before, kept, nodes, offsets)
-        made += [first, self.steps_told(nodes, offsets)]
+        made += [first, self.step_stream(nodes, offsets)]
         if self.parameters.of == "smoother":
             kept = kept._replace(nodes=(*kept.nodes, (nodes, offsets)))
         else:
@@ -224,9 +224,9 @@ class BoundFilter(Filter):
         none = np.zeros_like(noise)
         rows = np.append(0, np.cumsum(output_streams))
         steps = Nodes(rows[1:], before.time_ns[output_streams], mean, noise, none, noise, none)
-        return kept._replace(has_begun=kept.has_begun | is_new), self.steps_told(steps, rows)
+        return kept._replace(has_begun=kept.has_begun | is_new), self.step_stream(steps, rows)
 
-    def steps_told(self, nodes: Nodes, offsets: Integers) -> Ragged:
+    def step_stream(self, nodes: Nodes, offsets: Integers) -> Ragged:
         """Return the stream of the steps to nodes."""
         t = self.stage.model.tangent
         stream = make_stream(

@@ -155,7 +155,14 @@ def bound_update(stage: Stage, number: int) -> Function:
 
 
 def add_information(information: Floats, rows: Floats, noise: Floats, size: int) -> None:
-    """Add H' R^-1 H of the first rows; R becomes its factor. NaN where R is not positive definite."""
+    """Add H' R^-1 H of the first rows; R becomes its factor. NaN where R is not positive definite.
+
+    Args:
+        information: (t, t), added to in place.
+        rows: H (at least size, t), used up.
+        noise: R, of which the first `size` rows and columns count; becomes its factor.
+        size: how many components are measured.
+    """
     t = len(information)
     if not cholesky(noise, noise, size):
         information[0, 0] = np.nan

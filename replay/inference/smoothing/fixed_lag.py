@@ -114,7 +114,17 @@ def extend(
     next_rest: Floats,
     work: BackMemory,
 ) -> None:
-    """Make one step of a step and the next, in place of the first."""
+    """Make one step of a step and the next, in place of the first.
+
+    Args:
+        gain: (t, t) of the first step, changed in place.
+        shift: (t,) of the first step, changed in place.
+        rest: (t, t) of the first step, changed in place.
+        next_gain: (t, t) of the next step.
+        next_shift: (t,) of the next step.
+        next_rest: (t, t) of the next step.
+        work: what is worked in.
+    """
     for row in range(len(shift)):
         for column in range(len(shift)):
             shift[row] += gain[row, column] * next_shift[column]

@@ -40,7 +40,7 @@ from replay.inference.smoothing.smoothers import Smoother, SmootherParameters
 
 
 class IteratedParameters(SmootherParameters):
-    """Options of smoother:iterated: the start of the search, its damping, and the loss of outliers.
+    """Defines options of smoother:iterated: where the search starts, its damping, the loss of outliers.
 
     Attributes:
         start: where the search starts: smoother (the extended filter, smoothed once), motion (the
@@ -111,7 +111,7 @@ class IteratedSmoother(Smoother):
         rows = way.wanted
         found = Estimates(kept.end, kept.time_ns[rows], kept.mean[rows], kept.covariance[rows])
         states = self.states(found, ragged_rows(rows, offsets))
-        return [states, *way.made, *self._told(ended, way)]
+        return [states, *way.made, *self._solution_streams(ended, way)]
 
     def smoothed_once(self, state: FilterState) -> "Way":
         """Return the extended smoother's states at all stamps, from the prior's on."""
@@ -222,7 +222,7 @@ class IteratedSmoother(Smoother):
         loop(runs, RunInputs(events, settings, gates), plan, found, ended, scratch=scratch)
         return ended
 
-    def _told(self, ended: Ended, way: Way) -> list[Ragged]:
+    def _solution_streams(self, ended: Ended, way: Way) -> list[Ragged]:
         """Describe how the searches ended, and every pass of each, at the last node of its run."""
         asked, some = self.parameters, np.diff(way.offsets) > 0
         last_ns = np.append(way.nodes.time_ns, 0)[way.offsets[1:] - 1]

@@ -52,7 +52,7 @@ IN_MEMORY_BYTES = 10**9  # of the nodes of whole runs; what is more goes to a te
 
 
 class SmootherParameters(UnscentedParameters, RegressionParameters):
-    """What goes forward, and how far estimates look ahead.
+    """States what goes forward, and how far estimates look ahead.
 
     Attributes:
         forward: the filter, perhaps with a lag, as in `ekf:lag=500ms`; without a lag every estimate uses

@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao bound over an ensemble of true trajectories, from the steps along each.
+"""Bounds the errors over an ensemble of true trajectories (posterior Cramer-Rao), step by step.
 
 With transition F, noise Q and the information H' R^-1 H of every step at the true states, and means over
 the trajectories, of products, not products of means,
@@ -34,7 +34,7 @@ MOST_BYTES = 1 << 28  # of the sums
 
 
 class Products(NamedTuple):
-    """F'Q^-1F, F'Q^-1, Q^-1 and H'R^-1H of steps, or their means: (steps, t, t) each."""
+    """Holds F'Q^-1F, F'Q^-1, Q^-1 and H'R^-1H of steps, or their means: (steps, t, t) each."""
 
     before: Floats
     across: Floats
@@ -44,7 +44,7 @@ class Products(NamedTuple):
 
 @dataclass
 class Bounds:
-    """Sums over the runs of one stream of steps.
+    """Sums what the bound is made of over the runs of one stream of steps.
 
     Attributes:
         components: names and kinds of the tangent space.
@@ -123,7 +123,7 @@ class Bounds:
 
     @property
     def complaint(self) -> str:
-        """Why there is no mean over the ensemble; empty where there is."""
+        """Say why there is no mean over the ensemble; empty where there is."""
         if self.reason or self.sums is None:
             return self.reason
         if self.sums.width > 1:

@@ -19,7 +19,7 @@ EACH, FEWEST, MOST = 64, 8, 256
 
 
 class Conditioning(NamedTuple):
-    """What samples of a topic's covariances are like.
+    """States what samples of a topic's covariances are like.
 
     Attributes:
         sampled: how many were looked at.
@@ -38,7 +38,7 @@ class Conditioning(NamedTuple):
     elapsed_s: float = 0.0
 
     def plus(self, other: "Conditioning") -> "Conditioning":
-        """Both together."""
+        """Return both together."""
         worst = other if other.least < self.least else self
         return worst._replace(
             sampled=self.sampled + other.sampled,
@@ -75,7 +75,7 @@ def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int =
 
 
 def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The least pivot (count,) of covariances (count, n, n), as shares of variances.
+    """Return the least pivot (count,) of covariances (count, n, n), as shares of variances.
 
     A component without variance is known, and one that is not finite is none: both are left out. Where
     a pivot is not positive there is no factor, and it is the least one.

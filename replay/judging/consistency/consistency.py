@@ -1,4 +1,4 @@
-"""Errors against the covariance that was promised: by component, ellipses, dilution of precision.
+"""Compares errors with the covariance promised: by component, ellipses, dilution of precision.
 
 NEES itself is `replay.engine.vectors.covariances.normalized_error_squared`. Bar-Shalom, Li and
 Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 5.4.
@@ -14,7 +14,7 @@ CONSISTENT = 0.999  # of the logs of a consistent filter, where NIS or NEES is w
 
 
 def component_error_squared(error: Array, covariance: Array) -> Array:
-    """Each component's own normalized squared error, (..., n)."""
+    """Return each component's own normalized squared error, (..., n)."""
     return error**2 / np.diagonal(covariance, axis1=-2, axis2=-1)
 
 
@@ -28,5 +28,14 @@ def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
 
 
 def dilution_of_precision(position_error_m: ArrayLike, range_m: ArrayLike, sigma_rad: Array) -> Array:
-    """GDOP, position error by range and noise of both angles (..., 2); Belfadel et al. 2014, eq (32)."""
+    """Compute GDOP: position error by range and noise of both angles; Belfadel et al. 2014, eq (32).
+
+    Args:
+        position_error_m: (...,).
+        range_m: (...,), the distance to the target.
+        sigma_rad: (..., 2), standard deviations of azimuth and elevation.
+
+    Returns:
+        (...,).
+    """
     return np.asarray(position_error_m) / (range_m * np.linalg.norm(sigma_rad, axis=-1))

@@ -15,7 +15,7 @@ AVERAGED_NS = 1_000_000_000
 
 
 class Disturbances(NamedTuple):
-    """Spans (n,) in which the field differs from that of the place: from, to, by how much at most."""
+    """Holds spans (n,) in which the field differs from the place's: from, to, by how much at most."""
 
     begin_ns: Integers
     end_ns: Integers

@@ -1,4 +1,4 @@
-"""Sequential tests of log-likelihood ratios: Wald's of two hypotheses, Page's of a change.
+"""Tests log-likelihood ratios in sequence: Wald's of two hypotheses, Page's of a change.
 
 Wald, "Sequential Tests of Statistical Hypotheses", Annals of Mathematical Statistics 16(2), 1945; Page,
 "Continuous Inspection Schemes", Biometrika 41, 1954. What they promise holds for ratios that are
@@ -19,7 +19,7 @@ Booleans = NDArray[np.bool_]
 
 
 class Rates(NamedTuple):
-    """Rates of error of a test: of accepting an impostor, and of rejecting the person."""
+    """States a test's rates of error: of accepting an impostor, and of rejecting the person."""
 
     false_accept: float
     false_reject: float
@@ -70,9 +70,18 @@ def wald_probes(rates: Rates, mean_ratio: float, *, genuine: bool) -> float:
 
 
 def decide(ratio_of: Callable[[Integers], Floats], count: int, rates: Rates, most: int) -> Decisions:
-    """Wald's test of `count` sequences of at most so many probes.
+    """Test `count` sequences of at most so many probes by Wald's test.
 
     `ratio_of(sequences)` gives the next probe's log-likelihood ratio of each of these sequences.
+
+    Args:
+        ratio_of: sequences (k,) -> the next probe's log-likelihood ratio (k,) of each.
+        count: how many sequences there are.
+        rates: the stated rates of error.
+        most: a sequence ends undecided after so many probes.
+
+    Returns:
+        (count,), which were accepted, and after how many probes each was decided; 0 for never.
     """
     low, high = thresholds(rates)
     total, probes = np.zeros(count), np.zeros(count, np.int64)
@@ -88,17 +97,25 @@ def decide(ratio_of: Callable[[Integers], Floats], count: int, rates: Rates, mos
 
 
 def page_sums(ratios: Floats) -> Floats:
-    """Page's cumulative sums (..., n) of ratios (..., n) of a change: begun anew where below zero."""
+    """Compute Page's cumulative sums (..., n) of ratios (..., n) of a change: anew where below zero."""
     total = np.cumsum(ratios, axis=-1)
     return total - np.minimum(np.minimum.accumulate(total, axis=-1), 0.0)
 
 
 def first_alarm(sums: Floats, run_length: float, together: int = 1) -> Integers:
-    """After how many probes (...,) one of the sums (..., n) is over its threshold; 0 for never.
+    """Count probes (...,) until one of the sums (..., n) is over its threshold; 0 for never.
 
     The threshold is log(together * run_length), where each probe adds to so many sums: by the
     martingale of Shiryaev and Roberts the mean number of probes until a false alarm is then no less than
     `run_length` (Pollak, Annals of Statistics 13(1), 1985).
+
+    Args:
+        sums: (..., n), as of `page_sums`.
+        run_length: stated mean number of probes until a false alarm.
+        together: to how many sums each probe adds.
+
+    Returns:
+        (...,), from 1 on.
     """
     over = sums >= np.log(together * run_length)
     return np.where(over.any(axis=-1), np.argmax(over, axis=-1) + 1, 0)

@@ -20,7 +20,7 @@ FALSE_ACCEPT_RATES = (1e-4, 1e-3, 1e-2)
 
 
 class Roc(NamedTuple):
-    """Rates (n,) at falling thresholds, from nothing accepted to everything."""
+    """Holds rates (n,) at falling thresholds, from nothing accepted to everything."""
 
     threshold: Floats
     false_accept: Floats
@@ -28,7 +28,7 @@ class Roc(NamedTuple):
 
 
 class Fused(NamedTuple):
-    """Fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
+    """Holds fused scores (n,) of one run, and the users (n,) of probe and gallery entry.
 
     `fold` (users,) is that of the cross validation, `threshold` what the fusion decides by; None where
     it has none. `is_ratio`: the scores are log-likelihood ratios.
@@ -67,7 +67,16 @@ def fused_of(stream: Stream) -> Fused:
 
 
 def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None) -> Roc:
-    """The rates at every distinct score; `weight` (n,) counts comparisons more than once."""
+    """Return the rates at every distinct score; `weight` (n,) counts comparisons more than once.
+
+    Args:
+        score: (n,), greater for more alike.
+        genuine: (n,), whether both are of one person.
+        weight: (n,), how often each comparison counts; once by default.
+
+    Returns:
+        Rates from nothing accepted to everything.
+    """
     order = np.argsort(-score, kind="stable")
     falling = score[order]
     counts = np.ones(len(score)) if weight is None else weight[order]
@@ -78,20 +87,28 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
 
 
 def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
-    """The greatest genuine accept rate whose false accept rate is not above that given."""
+    """Return the greatest genuine accept rate whose false accept rate is not above that given."""
     last = np.searchsorted(curve.false_accept, false_accept, side="right") - 1
     return curve.genuine_accept[last]
 
 
 def equal_error_rate(curve: Roc) -> float:
-    """The mean of false accepts and false rejects where they are closest: scores may be tied."""
+    """Return the mean of false accepts and false rejects where they are closest: scores may be tied."""
     reject = 1 - curve.genuine_accept
     closest = int(np.argmin(np.abs(curve.false_accept - reject)))
     return float(curve.false_accept[closest] + reject[closest]) / 2
 
 
 def cost_of_ratio(ratio: Floats, genuine: NDArray[np.bool_]) -> float:
-    """Cllr in bits: 0 for perfect log-likelihood ratios, 1 for ones that tell nothing."""
+    """Compute Cllr in bits: 0 for perfect log-likelihood ratios, 1 for ones that tell nothing.
+
+    Args:
+        ratio: (n,), log-likelihood ratios.
+        genuine: (n,), whether both are of one person.
+
+    Returns:
+        Bits, at least 0.
+    """
     same = np.logaddexp(0, -ratio[genuine]).mean()
     other = np.logaddexp(0, ratio[~genuine]).mean()
     return float((same + other) / (2 * np.log(2)))
@@ -117,7 +134,7 @@ def verification_rate(fused: Fused) -> float:
 
 
 def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, float]:
-    """Absolute and relative increase of a rate over the mean of the single matchers' (eq. 3)."""
+    """Compute how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3)."""
     mean = float(np.mean(np.asarray(rates, float)))
     increase = fused_rate - mean
     return increase, increase / (1 - mean)

@@ -1,1 +1,1 @@
-"""Errors of estimates against the truth at their stamps; begin with `evaluation`."""
+"""Computes errors of estimates against the truth at their stamps; begin with `evaluation`."""

@@ -1,4 +1,4 @@
-"""Alignment of estimates with truth: the least-squares transform of their positions.
+"""Aligns estimates with truth by the least-squares transform of their positions.
 
 Umeyama, "Least-squares estimation of transformation parameters between two point patterns", IEEE
 Transactions on Pattern Analysis and Machine Intelligence 13(4), 1991; about the vertical alone: Zhang,
@@ -31,11 +31,11 @@ LEAST_COSINE = 1 - 1e-12
 
 
 class Alignment(Movement):
-    """The transform p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
+    """Holds p -> scale rotation p + translation_m from the estimate's frame to the truth's."""
 
 
 def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) -> Alignment:
-    """The transform that brings positions (n, 3) of an estimate nearest to the truth's (n, 3).
+    """Return the transform that brings positions (n, 3) of an estimate nearest to the truth's (n, 3).
 
     Args:
         estimate_m: positions of the estimate.
@@ -54,14 +54,14 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
     if align in ("yaw", "se2"):
         cosine, sine = cross[0, 0] + cross[1, 1], cross[1, 0] - cross[0, 1]
         extent = np.linalg.norm(of_estimate[:, :2]) * np.linalg.norm(of_truth[:, :2])
-        is_told = np.hypot(cosine, sine) > LEAST_WIDTH * extent
+        is_determined = np.hypot(cosine, sine) > LEAST_WIDTH * extent
         rotation = Rotation.from_rotvec([0.0, 0.0, np.arctan2(sine, cosine)]).as_matrix()
     else:
         left, widths, right = np.linalg.svd(cross)
-        is_told = widths[1] > LEAST_WIDTH * widths[0]
+        is_determined = widths[1] > LEAST_WIDTH * widths[0]
         proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
         rotation = left * [1.0, 1.0, proper] @ right  # (40), (43)
-    if not is_told:
+    if not is_determined:
         needed = (
             "two apart in the plane" if align in ("yaw", "se2") else "three that are not in one line"
         )
@@ -80,7 +80,7 @@ def alignment_of(estimate_m: Floats, truth_m: Floats, align: Align, where: str) 
 
 
 def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
-    """The trajectory in the truth's frame."""
+    """Return the trajectory in the truth's frame."""
     turned = alignment.scale * trajectory.position_m @ alignment.rotation.T
     rotation = trajectory.rotation
     return replace(
@@ -117,7 +117,7 @@ def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
 
 @dataclass(frozen=True, repr=False)
 class AlignedEstimates(LogSource):
-    """A log whose estimates of some topics are in the truth's frame."""
+    """Represents a log whose estimates of some topics are in the truth's frame."""
 
     alignments: Mapping[str, Alignment] = field(default_factory=dict)
 

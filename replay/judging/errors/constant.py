@@ -18,7 +18,7 @@ DRIFTS = 0.5  # share of the rest that a line in time takes away: the error grow
 
 
 class Constant(NamedTuple):
-    """An error that stays.
+    """Describes an error that stays.
 
     Attributes:
         turns: whether it turns with the body: ahead, to the left and up, in place of x, y and z.
@@ -36,7 +36,7 @@ class Constant(NamedTuple):
 
 @dataclass
 class FrameSums:
-    """Sums of errors e (axes, n) with weights W = P^-1 (axes, axes, n) and times t (n,) in one frame.
+    """Sums errors e (axes, n) with weights W = P^-1 (axes, axes, n) and times t (n,) in one frame.
 
     Attributes:
         count: n.
@@ -95,7 +95,7 @@ class FrameSums:
 
 @dataclass
 class ConstantSums:
-    """Sums of one estimate stream's errors of position, as they stand and as seen from the body."""
+    """Sums one estimate stream's errors of position, as they stand and as seen from the body."""
 
     fixed: FrameSums = field(default_factory=FrameSums)
     turned: FrameSums = field(default_factory=FrameSums)

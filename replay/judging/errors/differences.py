@@ -1,4 +1,4 @@
-"""Paired differences of a metric: what one estimator gave of every run against what another gave.
+"""Pairs differences of a metric: what one estimator gave of every run against another's.
 
 The run is the unit: errors within a run are correlated, runs are independent. Intervals are those of the
 percentile bootstrap over runs. BCa is no better here: paired differences of two alike are symmetric,
@@ -60,7 +60,7 @@ TARGETS: dict[str, Target] = {
 
 
 class Difference(NamedTuple):
-    """A metric of two estimators over the same runs.
+    """States the difference of a metric of two estimators over the same runs.
 
     Attributes:
         first, second: the means over the runs.
@@ -91,7 +91,7 @@ def target_of(quantity: str) -> Target:
 def paired_difference(
     first: Floats, second: Floats, target: Target, margin: float, scale: float | None = None
 ) -> Difference:
-    """The second's difference to the first.
+    """Return the second's difference to the first.
 
     Args:
         first: (n,) the metric in every run.
@@ -162,7 +162,7 @@ def _direction(first: Floats, second: Floats, target: Target, difference: float)
 
 
 def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Where the mean of runs (n,) lies with 95 %, by Student's distribution; NaN of few runs."""
+    """Return where the mean of runs (n,) lies with 95 %, by Student's distribution; NaN of few runs."""
     from scipy.special import stdtrit
 
     runs = len(values)

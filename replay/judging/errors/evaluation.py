@@ -1,4 +1,4 @@
-"""Estimates against truth: alignment, errors, and whether the filter's own covariance can be believed.
+"""Evaluates estimates against truth: alignment, errors, and whether the covariance is believable.
 
 An estimate stream names its components, their kinds and its truth topic in the channel's metadata. The
 truth is interpolated at the estimate's stamps, never over a gap; errors are those of the tangent space
@@ -59,8 +59,8 @@ class Errors:
     Attributes:
         estimator: the estimator's label, such as `ekf`.
         case: what it estimates, such as `robot1`; may be empty.
-        components: names of the d components of the tangent space; kinds: "linear", "angle" or
-            "rotation" (about an axis of the body) each.
+        components: names of the d components of the tangent space.
+        kinds: "linear", "angle" or "rotation" (about an axis of the body) each.
         run, step, time_ns: (n,); step counts the distinct estimate times of a run, from zero.
         elapsed_s: (n,) time since the run's epoch.
         error: (n, d) estimate - truth.
@@ -93,7 +93,7 @@ class Errors:
 
     @property
     def squared(self) -> Floats:
-        """(n, d) the squares of the errors, of a bound what they are at least; infinite if too large."""
+        """Return (n, d) squares of the errors, of a bound what they are at least; infinite if large."""
         with np.errstate(over="ignore"):
             return np.diagonal(self.covariance, axis1=1, axis2=2) if self.is_bound else self.error**2
 
@@ -122,7 +122,7 @@ PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
-    """Some rows of errors."""
+    """Select some rows of errors."""
     columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
     heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
     return replace(errors, **columns, heading_rad=heading_rad)
@@ -285,7 +285,7 @@ def _heading_of(state: Floats, components: Components) -> Floats | None:
 
 
 def components_without_truth(estimates: Ragged, sources: Sequence[Source]) -> tuple[str, ...]:
-    """The components of a Gaussian estimate stream that the truth of some run lacks.
+    """Return the components of a Gaussian estimate stream that the truth of some run lacks.
 
     All of an axis or a quaternion where it lacks one of theirs; none where a run has no truth topic at
     all. Raises BadInput where the stream does not say what its components are.
@@ -350,7 +350,7 @@ def reference(
     gap_limit_s: float,
     plane: Origin | None = None,
 ) -> Floats:
-    """The truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
+    """Return the truth's state (n, components) at the stamps of a run's estimates; see `truth_at`.
 
     Where it states the origin of another plane than that of the estimates, it is taken into theirs.
 
@@ -368,7 +368,7 @@ def reference(
 
 
 def innovations_of(stream: Ragged, first_run: int = 0) -> Innovations:
-    """The innovations of an ensemble whose first run has this number."""
+    """Return the innovations of an ensemble whose first run has this number."""
     estimator, case = split_topic(stream.stream.topic)
     return Innovations(
         estimator,

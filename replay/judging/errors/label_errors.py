@@ -1,4 +1,4 @@
-"""Errors of several things at once, with the estimators' labels or with the best ones of each step.
+"""Computes errors of several things at once, with the estimators' labels or each step's best.
 
 Source of the total error: Zhang et al., "Cooperative vehicle-infrastructure localization based on the
 symmetric measurement equation filter", 2016, (20). Estimates and truths are (..., things, axes).
@@ -24,15 +24,25 @@ def total_error(squared: Floats) -> Floats:
 
 
 def fixed_squared_error(estimates: Floats, truths: Floats) -> Floats:
-    """The summed squared errors (...,) where every estimate keeps its label."""
+    """Return the summed squared errors (...,) where every estimate keeps its label.
+
+    Args:
+        estimates: (..., things, axes).
+        truths: likewise.
+    """
     return np.asarray(np.sum((estimates - truths) ** 2, axis=(-2, -1)))
 
 
 def assigned_squared_error(estimates: Floats, truths: Floats, cutoff_m: float = np.inf) -> Floats:
-    """The least summed squared errors (...,) that any labelling of the estimates gives.
+    """Return the least summed squared errors (...,) that any labelling of the estimates gives.
 
     None counts for more than the squared cutoff: then it is GOSPA (alpha = 2, order 2) squared, since
     there are as many estimates as truths.
+
+    Args:
+        estimates: (..., things, axes).
+        truths: likewise, as many.
+        cutoff_m: no distance counts as longer.
     """
     count = estimates.shape[-2]
     distance = np.sum((estimates[..., :, None, :] - truths[..., None, :, :]) ** 2, axis=-1)

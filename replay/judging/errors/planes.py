@@ -30,7 +30,7 @@ def first_fixes(outputs: Mapping[str, Ragged]) -> dict[str, list[Origin | None]]
 
 
 def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | None]:
-    """The origins of the plane of estimates, of every run; None where it is not known."""
+    """Return the origins of the plane of estimates, of every run; None where it is not known."""
     stated = stated_in(stream.topic, stream.metadata)
     if stated is None:
         return list(first.get(stream.topic.rpartition("/")[0], [None] * runs))
@@ -38,7 +38,7 @@ def planes_of(stream: Stream, runs: int, first: FirstFixes) -> list[Origin | Non
 
 
 def unlike(stream: Stream, sources: Sequence[Source], first: FirstFixes) -> str:
-    """Why estimates cannot be compared with the truth of some run, in words; empty where they can.
+    """Say why estimates cannot be compared with the truth of some run, in words; empty where they can.
 
     Two planes whose origins are known can be. A truth that states none is in the plane of its log, where
     that has one, unless it is in a frame of its own; estimates of a filter that found its plane at the

@@ -1,4 +1,4 @@
-"""Trajectories against truth: absolute and relative pose errors, APE and RPE.
+"""Compares trajectories with truth: absolute and relative pose errors, APE and RPE.
 
 Sturm, Engelhard, Endres, Burgard, Cremers, "A benchmark for the evaluation of RGB-D SLAM systems",
 IROS 2012; conventions and names are those of evo (https://github.com/MichaelGrupp/evo): figures agree.
@@ -75,7 +75,7 @@ class Comparison:
 
 
 class Compared(NamedTuple):
-    """An estimated trajectory against the true one, pose by pose.
+    """Holds an estimated trajectory against the true one, pose by pose.
 
     Attributes:
         estimate: the poses that have truth, aligned with it.
@@ -144,7 +144,7 @@ def compare(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> 
 def associate(
     estimate: Trajectory, truth: Trajectory, comparison: Comparison
 ) -> tuple[Trajectory, Trajectory]:
-    """The poses of both that belong together; by their places where one has no stamps."""
+    """Return the poses of both that belong together; by their places where one has no stamps."""
     times, true_times = estimate.time_ns, truth.time_ns
     if times is None or true_times is None:
         if len(estimate) != len(truth):

@@ -53,7 +53,7 @@ def _of_poses(stream: Stream) -> Trajectory:
 
 
 def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
-    """A trajectory as an estimate stream, in those of the truth's components that it states.
+    """Return a trajectory as an estimate stream, in those of the truth's components that it states.
 
     It states no covariance: that is zero, of which there is no NEES.
 
@@ -88,7 +88,7 @@ def estimates_of(trajectory: Trajectory, topic: str, truth: Stream) -> Stream:
 
 
 def truth_of(trajectory: Trajectory, topic: str) -> Stream:
-    """A trajectory as a truth stream; raises BadInput where it has no stamps."""
+    """Return a trajectory as a truth stream; raises BadInput where it has no stamps."""
     if trajectory.time_ns is None:
         raise BadInput(f"{trajectory.name}: its poses have no stamps; give a trajectory as TUM or EuRoC")
     names, state = [*POSITION], trajectory.position_m

@@ -1,4 +1,4 @@
-"""The truth at the stamps of estimates, read along with them: memory holds what they are at.
+"""Reads the truth at the stamps of estimates along with them: memory holds what they are at.
 
 A truth that is stated twice, by one topic or by two, is doubtful; what is read is looked at for that.
 """
@@ -27,7 +27,7 @@ class Doubt(NamedTuple):
 
 
 class Truths:
-    """The truths of one run, for readers that each go through it in time."""
+    """Reads the truths of one run, for readers that each go through it in time."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -52,7 +52,7 @@ class Truths:
         self._reached: dict[tuple[str, str], int] = {}
 
     def around(self, topic: str, time_ns: Integers, gap_limit_s: float, reader: str = "") -> Stream:
-        """The messages of a topic about some stamps: no later ones would change the truth there.
+        """Return the messages of a topic about some stamps: no later ones would change the truth there.
 
         `reader` is who asks; what all readers have passed is forgotten, and read anew where one that was
         not there yet asks for it.
@@ -89,7 +89,7 @@ class Truths:
                 continue
             found.setdefault(topic, []).append(f"{what}: {name} differs by up to {apart[name]:.3g}")
         topics = self.source.topics
-        return {topic: Doubt(topics[topic].messages, "; ".join(said)) for topic, said in found.items()}
+        return {topic: Doubt(topics[topic].messages, "; ".join(why)) for topic, why in found.items()}
 
     def _note_twice(self, block: dict[str, Stream]) -> None:
         """Note how far truths of one thing are apart in a block, by linear component."""

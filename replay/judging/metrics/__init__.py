@@ -1,1 +1,1 @@
-"""Metrics: how errors become the numbers of all that is judged; begin with `measuring`."""
+"""Makes metrics of errors: the numbers of all that is judged; begin with `measuring`."""

@@ -72,7 +72,7 @@ def _late_s(stream: Stream) -> Floats:
 
 @dataclass
 class Means:
-    """Sums over the runs of what one stream tells.
+    """Sums over the runs what one stream tells.
 
     Attributes:
         estimator, case: whose it is.
@@ -109,7 +109,7 @@ class Means:
 
 
 class MeansOfAll:
-    """The means of all streams of a replay."""
+    """Holds the means of all streams of a replay."""
 
     def __init__(self) -> None:
         self._of: dict[str, Means] = {}

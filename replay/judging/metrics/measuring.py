@@ -65,7 +65,7 @@ class Metric(Generic[Judged, State]):
     finish: Callable[[State], Mapping[str, float]]
 
     def of(self, judged: Judged) -> Mapping[str, float]:
-        """Return the numbers of something that is judged whole."""
+        """Return the numbers of `judged` alone, as one block."""
         return self.finish(self.add(self.start(), judged))
 
 
@@ -85,6 +85,9 @@ def metric_of_sums(
         judges: what it judges.
         sums: of one block: numbers and arrays, which add up, and sets, which unite.
         finish: the numbers that follow from the sums over all blocks; {} stands for no block at all.
+
+    Returns:
+        The metric, for registration under a name.
 
     >>> from replay.judging.errors.evaluation import Errors
     >>> def counted(errors):
@@ -159,7 +162,7 @@ class Measurement:
                     ours[name] = self._metrics[name].merge(ours[name], state) if name in ours else state
 
     def finish(self, of: Callable[[str], bool] | None = None) -> dict[str, float]:
-        """The numbers, as `estimator.quantity[.case]`, of all keys or of some.
+        """Return the numbers, as `estimator.quantity[.case]`, of all keys or of some.
 
         Errors come first, then innovations. Raises BadInput where a metric raises.
         """

@@ -1,4 +1,4 @@
-"""The metrics of any estimator: errors, consistency, innovations, failures, coverage, solutions.
+"""Defines the metrics of any estimator: errors, consistency, innovations, failures, coverage.
 
 NEES and NIS: Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4.
 """
@@ -23,7 +23,13 @@ def squares(errors: Errors) -> Sums:
 
 
 def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[str]) -> Sums:
-    """Sums of squares (n, d) by the name of their RMSE, see `squares`."""
+    """Sum squares (n, d) by the name of their RMSE, see `squares`.
+
+    Args:
+        squared: (n, d), in the squares of the components' units.
+        components: the names of the d components.
+        kinds: their kinds.
+    """
     found: Sums = {}
     totals = np.sum(squared, axis=0)
     position = [index for index, name in enumerate(components) if name in POSITION]
@@ -62,7 +68,7 @@ def rmse_of(component: str) -> str:
 
 @dataclass
 class Consistent:
-    """Sums of NEES: over all, and by step over the runs.
+    """Sums NEES: over all, and by step over the runs.
 
     Attributes:
         count, total: of finite NEES of the state.
@@ -216,7 +222,7 @@ def coverage(sums: Sums) -> dict[str, float]:
 
 
 def estimated_share(sums: Sums) -> float | None:
-    """The share of the runs' spans for which there are estimates; None where there is no span."""
+    """Return the share of the runs' spans for which there are estimates; None where there is no span."""
     return min(sums["estimated_s"] / sums["span_s"], 1.0) if sums.get("span_s") else None
 
 

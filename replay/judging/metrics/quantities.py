@@ -12,7 +12,7 @@ from replay.judging.metrics.sums import BinnedSums, Integers
 
 @dataclass
 class Quantities:
-    """Sums of one estimate stream: what tables and figures are made of.
+    """Sums one estimate stream: what tables and figures are made of.
 
     The columns of both sums are elapsed time, squared error of the position, of the rotation and of
     each component, trace of the main quantity's covariance and of its square, and NEES. `constant` tells
@@ -50,7 +50,7 @@ def columns_of(errors: Errors) -> Floats:
 
 
 class OfRuns(NamedTuple):
-    """Numbers of innovations, of each run (runs,) or of all.
+    """Holds numbers of innovations, of each run (runs,) or of all.
 
     Attributes:
         messages, accepted: how many there are, and how many a gate let in.
@@ -68,7 +68,7 @@ class OfRuns(NamedTuple):
 
 
 class InnovationSums:
-    """Sums of one innovation stream by run, from a first one on."""
+    """Sums one innovation stream by run, from a first one on."""
 
     def __init__(self, first_run: int) -> None:
         self.first_run = first_run

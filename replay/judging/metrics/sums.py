@@ -1,4 +1,4 @@
-"""Sums in bins: what is kept of errors whose number nobody knows beforehand."""
+"""Sums in bins what is kept of errors whose number nobody knows beforehand."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ Integers = NDArray[np.int64]
 
 
 class BinnedSums:
-    """Sums of rows of numbers (n, columns) by group and by bin of a position, a whole number from 0 on.
+    """Sums rows of numbers (n, columns) by group and by bin of a position, a whole number from 0 on.
 
     Bin b holds the positions from b width to (b + 1) width. Where there is a limit, the width doubles
     as often as needed, so that the sums never take more than `limit` bins a group; where there are very

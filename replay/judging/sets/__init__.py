@@ -1,1 +1,1 @@
-"""Sets of points and regions against the truth; begin with `distances`."""
+"""Judges sets of points and regions against the truth; begin with `distances`."""

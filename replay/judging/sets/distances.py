@@ -1,4 +1,4 @@
-"""Distances between sets of points: OSPA and GOSPA with its parts.
+"""Measures distances between sets of points: OSPA and GOSPA with its parts.
 
 Sources: Schuhmacher, Vo, Vo, "A consistent metric for performance evaluation of multi-object filters",
 IEEE TSP 56(8), 2008 (OSPA); Rahmathullah, Garcia-Fernandez, Svensson, "Generalized optimal sub-pattern
@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 
 
 class Gospa(NamedTuple):
-    """GOSPA and what it is made of: total**order = localisation + missed + false."""
+    """Holds GOSPA and what it is made of: total**order = localisation + missed + false."""
 
     total: float
     localisation: float
@@ -26,9 +26,15 @@ class Gospa(NamedTuple):
 
 
 def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 1.0) -> float:
-    """OSPA of point sets (n, d) and (m, d); between 0 and the cutoff, in the unit of the points.
+    """Compute OSPA of point sets (n, d) and (m, d); between 0 and the cutoff, in the points' unit.
 
     Raises BadInput as `gospa` does.
+
+    Args:
+        estimates: (n, d).
+        truths: (m, d).
+        cutoff: no distance counts as longer.
+        order: of the mean, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
     most = max(costs.estimates, costs.truths)
@@ -41,13 +47,20 @@ def ospa(estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 
 def gospa(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0, alpha: float = 2.0
 ) -> Gospa:
-    """GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
+    """Compute GOSPA of point sets (n, d) and (m, d), and its parts as powers of the order.
 
     With alpha = 2 a pair as far apart as the cutoff is no pair: it counts as one missed and one false.
     With another alpha only what exceeds the other set in number is missed or false.
 
     Raises BadInput where the points are not finite or have different dimensions, the cutoff is not
     positive, the order is below 1, or alpha is not in (0, 2].
+
+    Args:
+        estimates: (n, d).
+        truths: (m, d).
+        cutoff: no distance counts as longer, in the unit of the points.
+        order: of the sum, at least 1.
+        alpha: by which a surplus point costs cutoff^order / alpha.
     """
     if not 0.0 < alpha <= 2.0:
         raise BadInput(f"alpha {alpha:g}: give one above 0 and up to 2")
@@ -68,9 +81,15 @@ def gospa(
 def gospa_pairs(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, order: float = 2.0
 ) -> tuple[Integers, Integers]:
-    """The pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
+    """Return the pairs of GOSPA with alpha = 2: the indices (m,) of their estimates and of their truths.
 
     Raises BadInput as `gospa` does.
+
+    Args:
+        estimates: (n, d).
+        truths: (m, d).
+        cutoff: no pair is farther apart.
+        order: of the sum, at least 1.
     """
     costs = _assigned_costs(estimates, truths, cutoff, order)
     near = costs.pairs < cutoff**order
@@ -78,7 +97,7 @@ def gospa_pairs(
 
 
 class _Costs(NamedTuple):
-    """Sizes of the sets, and the best pairs: cut-off distances to the power of the order, and who."""
+    """Holds the sizes of the sets, and the best pairs: who, and distances to the power of the order."""
 
     estimates: int
     truths: int

@@ -1,4 +1,4 @@
-"""Estimated sets against the true ones, step by step: OSPA and GOSPA with its parts.
+"""Compares estimated sets with true ones, step by step: OSPA and GOSPA with its parts.
 
 A set estimate is a pair of streams: its size, and its elements (see `schemas.ESTIMATE_SIZE`). The true
 set at a time are all targets whose truth has the estimate's components and is known then.

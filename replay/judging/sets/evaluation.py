@@ -1,4 +1,4 @@
-"""Sets against truth: area, whether the true position is inside, and how often there is no set."""
+"""Judges sets by truth: area, whether the true position is inside, how often there is no set."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ PLACE: Components = {"x_m": "linear", "y_m": "linear"}
 
 @dataclass(frozen=True)
 class JudgedSets:
-    """The sets of one estimator and case, a row per frame.
+    """Holds the sets of one estimator and case, a row per frame.
 
     `inside` says whether the truth is in the set, where it is `known`, `in_arena` whether it is where
     the robot was taken to be, and `bound_holds` whether all relative bearings of the frame keep their
@@ -53,7 +53,7 @@ class JudgedSets:
 
 
 def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
-    """The rings (n, 2) of every frame; none where its set is empty."""
+    """Return the rings (n, 2) of every frame; none where its set is empty."""
     ends = np.cumsum(sizes["elements"].astype(np.int64))
     ring, vertex = sets["ring_id"].astype(np.int64), sets["vertex"]
     frames = []
@@ -64,14 +64,14 @@ def frames_of(sizes: Stream, sets: Stream) -> list[list[Floats]]:
 
 
 def areas_of(frames: Sequence[Sequence[Floats]]) -> Floats:
-    """The area (n,) inside the rings of every frame; holes run the other way round."""
+    """Return the area (n,) inside the rings of every frame; holes run the other way round."""
     return np.array([abs(sum(map(signed_area, rings))) for rings in frames])
 
 
 def judge_sets(
     outputs: dict[str, Ragged], sources: Sequence[Source], gap_limit_s: float
 ) -> list[JudgedSets]:
-    """Every set estimate of a replay against the truth that its channel names."""
+    """Judge every set estimate of a replay against the truth that its channel names."""
     found = []
     for topic, sizes in outputs.items():
         if sizes.stream.schema.full_name == schemas.ESTIMATE_SIZE.full_name and topic.endswith("/size"):
@@ -120,7 +120,13 @@ def _judge(
 
 
 def premises_hold(sizes: Stream, source: Source, places: Floats) -> NDArray[np.bool_]:
-    """Tell whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames)."""
+    """Tell whether the places (frames, 2) are in each frame's arena, and keep its bound: (2, frames).
+
+    Args:
+        sizes: the sets of one run, a message per frame.
+        source: the run.
+        places: (frames, 2), true positions in m.
+    """
     measured = sizes.metadata["measured"]
     streams = source.read(["/landmarks", measured])
     hold = np.zeros((2, len(places)), bool)

@@ -1,4 +1,4 @@
-"""Guaranteed sets over time against truth: where what they rest on holds, they must hold the robot."""
+"""Judges guaranteed sets over time: where their premises hold, they must hold the robot."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ POSE: Components = {"x_m": "linear", "y_m": "linear", "heading_rad": "angle"}
 
 @dataclass(frozen=True)
 class JudgedFilter:
-    """The sets of one robot over time, a row per frame of all runs.
+    """Holds the sets of one robot over time, a row per frame of all runs.
 
     Attributes:
         sets: area, and whether the truth is inside.
@@ -56,7 +56,7 @@ class JudgedFilter:
 def judge_filter(
     outputs: Mapping[str, Ragged], sources: Sequence[Source], gap_limit_s: float
 ) -> list[JudgedFilter]:
-    """All outputs of set filters against the truth that their channels name."""
+    """Judge all outputs of set filters against the truth that their channels name."""
     found = []
     for topic in outputs:
         base = topic.removesuffix("step")
@@ -124,7 +124,15 @@ def _judge(
 def odometry_error(
     odometry: Odometry, first_ns: Integers, last_ns: Integers, first: Floats, last: Floats
 ) -> Floats:
-    """Errors (n, 2) of displacements (m) and turns (rad) between true poses (n, 3)."""
+    """Compute errors (n, 2) of displacements (m) and turns (rad) between true poses (n, 3).
+
+    Args:
+        odometry: of the robot.
+        first_ns: (n,), when each span begins.
+        last_ns: (n,), when it ends.
+        first: (n, 3), the true pose then.
+        last: (n, 3), the true pose at the end.
+    """
     true = relative_pose(first, last)
     stated = relative_pose(odometry.pose_at(first_ns), odometry.pose_at(last_ns))
     away = np.hypot(*(true - stated)[:, :2].T)

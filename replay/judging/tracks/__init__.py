@@ -1,1 +1,1 @@
-"""Tracks against the targets that they should follow; begin with `tracks`."""
+"""Judges tracks by the targets that they should follow; begin with `tracks`."""

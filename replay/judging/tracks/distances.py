@@ -26,7 +26,7 @@ THRESHOLDS = np.arange(1, 20) / 20.0
 
 
 class TrajectoryGospa(NamedTuple):
-    """Trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
+    """Holds trajectory GOSPA and its parts: total**order = localisation + missed + false + switching."""
 
     total: float
     localisation: float
@@ -36,7 +36,7 @@ class TrajectoryGospa(NamedTuple):
 
 
 class Hota(NamedTuple):
-    """HOTA and what it is made of, (thresholds,): hota**2 = detection * association."""
+    """Holds HOTA and what it is made of, (thresholds,): hota**2 = detection * association."""
 
     hota: Floats
     detection: Floats
@@ -52,7 +52,7 @@ def trajectory_gospa(
     *,
     exactly: bool = False,
 ) -> TrajectoryGospa:
-    """Trajectory GOSPA of tracks (n, steps, axes) and trajectories (m, steps, axes), and its parts.
+    """Compute trajectory GOSPA of tracks and trajectories, and its parts.
 
     Two estimates that swap their truths cost the switch penalty to the power of the order each, one that
     begins or ceases to be paired half of that. By default it is the metric's linear programme, in which
@@ -61,6 +61,14 @@ def trajectory_gospa(
 
     Raises BadInput where the shapes do not agree, a cutoff or penalty is not positive, the order is
     below 1, or there are more than MOST_ASSIGNMENTS to go through.
+
+    Args:
+        estimates: (n, steps, axes), NaN where a track is not there.
+        truths: (m, steps, axes), NaN where a target is not there.
+        cutoff: no distance counts as longer, in the unit of the points.
+        switch_penalty: in the same unit.
+        order: of the sum, at least 1.
+        exactly: whether all assignments are gone through.
     """
     if not (0.0 < cutoff < np.inf and 0.0 < switch_penalty < np.inf and 1.0 <= order < np.inf):
         raise BadInput(
@@ -151,12 +159,18 @@ def _assignments(n: int, m: int) -> Floats:
 def hota(
     estimates: ArrayLike, truths: ArrayLike, cutoff: float, thresholds: ArrayLike = THRESHOLDS
 ) -> Hota:
-    """HOTA of tracks (n, steps, axes) and trajectories (m, steps, axes), at every threshold.
+    """Compute HOTA of tracks and trajectories, at every threshold.
 
     Two points are similar by 1 - distance / cutoff, and at least by 0; they match from the threshold on.
     Of a step, those pairs match that are best over the whole span. The usual single figure is the mean
     over the thresholds .05, .10, ..., .95. Raises BadInput where the shapes do not agree or the cutoff
     is not positive.
+
+    Args:
+        estimates: (n, steps, axes), NaN where a track is not there.
+        truths: (m, steps, axes), NaN where a target is not there.
+        cutoff: points as far apart are not similar, in their unit.
+        thresholds: of the similarity, 0 to 1.
     """
     if not 0.0 < cutoff < np.inf:
         raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")
@@ -180,10 +194,15 @@ def hota(
 
 
 def idf1(estimates: ArrayLike, truths: ArrayLike, cutoff: float) -> float:
-    """IDF1 of tracks (n, steps, axes) and trajectories (m, steps, axes): 2 IDTP / (all points of both).
+    """Compute IDF1 of tracks and trajectories: 2 IDTP / (all points of both).
 
     IDTP is how many points of the trajectories are nearer than the cutoff to the one track that each is
     assigned to, so that they are most; NaN where there is no point. Raises BadInput as `hota`.
+
+    Args:
+        estimates: (n, steps, axes), NaN where a track is not there.
+        truths: (m, steps, axes), NaN where a target is not there.
+        cutoff: no pair is farther apart, in the unit of the points.
     """
     if not 0.0 < cutoff < np.inf:
         raise BadInput(f"cutoff {cutoff:g}: give a positive cutoff")

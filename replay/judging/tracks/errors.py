@@ -1,4 +1,4 @@
-"""Tracks against the trajectories of targets, judged at instants that no sensor sets.
+"""Compares tracks with the trajectories of targets, at instants that no sensor sets.
 
 At every instant the tracks, predicted to it, are paired with the targets that are there (GOSPA with
 alpha 2). The pairs say how far a track is from its target, for how much of the time a target is
@@ -29,14 +29,14 @@ NONE = -1
 
 
 class TracksAt(NamedTuple):
-    """The tracks at one instant: their numbers (n,), and where they are (n, 2)."""
+    """Holds the tracks at one instant: their numbers (n,), and where they are (n, 2)."""
 
     number: Integers
     place: Floats
 
 
 class TrackErrors(NamedTuple):
-    """Tracks of one run, judged at k instants; distances in m, GOSPA's parts in m^2.
+    """Holds tracks of one run, judged at k instants; distances in m, GOSPA's parts in m^2.
 
     Attributes:
         gospa_all: (k,), of all tracks.
@@ -59,7 +59,7 @@ class TrackErrors(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The instants (k,) at which the tracks of a run are judged, and the truths (targets, k, 2) then."""
+    """Holds the instants (k,) at which a run's tracks are judged, and the truths (targets, k, 2)."""
 
     time_ns: Integers
     truths: Floats
@@ -99,10 +99,16 @@ def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = 
 
 
 def tracks_at(sizes: Stream, tracks: Stream, at_ns: Integers, delay_ns: int = 0) -> list[TracksAt]:
-    """The tracks of one run at instants: the last ones told until then, moved on by their velocities.
+    """Return a run's tracks at instants: the last told until then, moved on by their velocities.
 
     `sizes` says how many messages of `tracks` each scan has. A tracker that waits for late scans tells
     of each one `delay_ns` after its stamp.
+
+    Args:
+        sizes: of the sets of tracks, a message per scan.
+        tracks: all tracks after each scan.
+        at_ns: (k,), the instants.
+        delay_ns: how long after its stamp a scan is told of.
     """
     names = tracks.components
     place, velocity = ([names.index(each) for each in of] for of in (PLANE, ("vx_mps", "vy_mps")))
@@ -125,7 +131,14 @@ def track_errors(
     cutoff_m: float = CUTOFF_M,
     unreferenced_m: float = UNREFERENCED_M,
 ) -> TrackErrors:
-    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there."""
+    """Judge the tracks at k instants by the truths (targets, k, 2), NaN where a target is not there.
+
+    Args:
+        tracks: those at each of the k instants.
+        truths: (targets, k, 2), in m.
+        cutoff_m: of GOSPA.
+        unreferenced_m: a track farther from all targets is of none that has a truth.
+    """
     targets_in_all, instants, _ = truths.shape
     present = np.asarray(np.isfinite(truths).all(axis=2))
     found = TrackErrors(
@@ -157,7 +170,7 @@ def track_errors(
 
 
 def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, float]:
-    """The means over the instants, and of each target, from 1 on, RMSE and coverage.
+    """Return the means over the instants, and of each target, from 1 on, RMSE and coverage.
 
     Missed and false are numbers of targets. NaN is the RMSE of a target that is never followed.
     """

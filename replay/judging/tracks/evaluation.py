@@ -1,4 +1,4 @@
-"""The tracks of a replay against the targets that its log has truths of, block by block.
+"""Evaluates the tracks of a replay by the targets that its log has truths of, block by block.
 
 Instants, pairs and distances are those of `errors`, by which experiments judge trackers, too. A target
 is there from the first to the last stamp of its truth. Judged is what the tracker tells of: from a while
@@ -37,7 +37,7 @@ VELOCITY = ("vx_mps", "vy_mps")
 
 
 class TrackBlock(NamedTuple):
-    """A block of a tracker's sets of tracks: their sizes, the tracks, and the targets of every run."""
+    """Holds a block of a tracker's sets of tracks: their sizes, the tracks, and each run's targets."""
 
     estimator: str
     case: str
@@ -92,7 +92,7 @@ def track_blocks(
 
 @dataclass
 class Followed:
-    """The tracks of one run as they were told at its instants.
+    """Holds the tracks of one run as they were told at its instants.
 
     Attributes:
         targets: the instants, and where the targets are then.

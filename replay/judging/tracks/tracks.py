@@ -1,4 +1,4 @@
-"""Tracks against the targets they should follow: which reports of a target went to one track.
+"""Judges tracks by the targets they should follow: which reports of a target went to one track.
 
 A target's own track is found by assigning tracks to targets one to one, so that as many reports as can
 be are in the track of their target: a track that swallows two targets counts for one of them.
@@ -82,6 +82,11 @@ def live_counts(time_ns: Integers, numbers: Integers, live_s: float) -> tuple[In
     """Count the numbers that spoke within the last `live_s`: times (m,) of changes, counts (m,).
 
     Times (n,) are sorted.
+
+    Args:
+        time_ns: (n,), sorted.
+        numbers: (n,), who spoke.
+        live_s: how long one counts after it spoke.
     """
     order = np.lexsort((time_ns, numbers))
     sorted_ns, sorted_numbers = time_ns[order], numbers[order]
@@ -129,7 +134,7 @@ def reports_of(output: Output) -> Reports:
 
 
 def track_tables(reports: Reports) -> "list[pd.DataFrame]":
-    """A table per run; none where a run has no reports."""
+    """Return a table per run; none where a run has no reports."""
     if not all(reports.values()):
         return []
     return [

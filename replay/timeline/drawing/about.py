@@ -19,7 +19,7 @@ CORNERS = 49
 
 
 def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DView]:
-    """A view of what a sensor sees about itself: none where that has no place in its plane."""
+    """Return a view of what a sensor sees about itself: none where that has no place in its plane."""
     if stream.schema.full_name == schemas.DETECTION.full_name:
         seen = stream["position_m"][:, :2]
         if seen.shape[1] == 2:

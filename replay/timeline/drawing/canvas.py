@@ -76,11 +76,11 @@ class Scene:
         return sorted(found, key=_natural) or [""]
 
     def colour(self, estimator: str) -> Colour:
-        """Return the one colour of an estimator, everywhere."""
+        """Return the one colour that `estimator` has everywhere."""
         return PALETTE[self.estimators.index(estimator) % len(PALETTE)]
 
     def outputs_of(self, case: str, schema: Schema) -> list[tuple[str, Stream]]:
-        """Return the non-empty output streams of a case that have this schema, with their estimators."""
+        """Return the non-empty output streams of `case` with this `schema`, and their estimators."""
         return [
             (split_topic(topic)[0], stream)
             for topic, stream in self.outputs.items()
@@ -90,16 +90,16 @@ class Scene:
         ]
 
     def errors_of(self, case: str) -> list[Errors]:
-        """Return the non-empty errors of a case."""
+        """Return the non-empty errors of `case`."""
         return [errors for errors in self.errors if errors.case == case and len(errors.error)]
 
     def truths_of(self, case: str) -> list[Stream]:
-        """Return the non-empty truth streams of a case."""
+        """Return the non-empty truth streams of `case`."""
         truths = (self.read(topic) for topic in self._truths if _prefix(topic) == case)
         return [truth for truth in truths if len(truth)]
 
     def topics_near(self, case: str) -> list[str]:
-        """Return the run's sensor topics below a case, and those that are below none; see `unread`."""
+        """Return the run's sensor topics below `case`, and those below none; see `unread`."""
         others = [f"/{other}/" for other in self.cases if other != case and other]
         elsewhere = ("/estimates/", *others)
         return [
@@ -120,7 +120,7 @@ class Scene:
         return found
 
     def read(self, topic: str) -> Stream:
-        """Read one of the run's topics, whole."""
+        """Read all of the run's topic `topic`."""
         return self.source.read([topic])[topic]
 
     @property
@@ -146,7 +146,7 @@ def _natural(name: str) -> list[tuple[str, int]]:
 
 @dataclass(frozen=True)
 class Dates:
-    """Two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
+    """Holds two clocks side by side: stamps (k,), and by how many ns the dates are later (k,).
 
     Between two stamps the difference is linear, and before the first and after the last it stays.
     """
@@ -155,7 +155,7 @@ class Dates:
     later_ns: Times
 
     def of(self, time_ns: Times) -> Times:
-        """The dates of stamps (n,)."""
+        """Return the dates of stamps (n,)."""
         first_ns = self.later_ns[0]
         drift_ns = np.interp(time_ns, self.stamps_ns, self.later_ns - first_ns)
         found: Times = time_ns + first_ns + np.rint(drift_ns).astype(np.int64)
@@ -163,7 +163,7 @@ class Dates:
 
 
 def dates_of(stream: Stream) -> Dates | None:
-    """The dates of a stream's stamps, when they were logged; None where the stamps are dates."""
+    """Return the dates of a stream's stamps, when they were logged; None where the stamps are dates."""
     stamps_ns, logged_ns = stream.publish_time_ns, stream.log_time_ns
     if not len(stream) or stamps_ns[0] >= DATES_FROM_NS or logged_ns[0] < DATES_FROM_NS:
         return None
@@ -191,7 +191,13 @@ class Canvas:
     dates: Dates | None = None
 
     def send(self, entity: str, time_ns: Times, columns: rr.ComponentColumnList) -> None:
-        """Send the rows of one entity, all at once."""
+        """Send all rows of an entity at once.
+
+        Args:
+            entity: the path.
+            time_ns: (n,), the stamps.
+            columns: of Rerun, with n rows.
+        """
         if len(time_ns) == 0 or self.is_still:
             return
         step = np.searchsorted(self.steps_ns, time_ns, side="right") - 1
@@ -204,7 +210,7 @@ class Canvas:
         self.recording.send_columns(escaped(entity), index, columns, strict=True)
 
     def fix(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log what holds at all times, such as a style."""
+        """Log `what` holds of `entity` at all times, such as a style."""
         self.recording.log(escaped(entity), *what, static=True, strict=True)
 
 
@@ -222,7 +228,7 @@ class Timeline:
 def draw_cases(
     scene: Scene, draw_case: Callable[[str], rrb.Container | rrb.View]
 ) -> rrb.Container | rrb.View:
-    """The layouts of all cases, in tabs where there are several."""
+    """Return the layouts of all cases, in tabs where there are several."""
     layouts = [draw_case(case) for case in scene.cases]
     if len(layouts) == 1:
         return layouts[0]
@@ -230,13 +236,13 @@ def draw_cases(
 
 
 def beside(board: rrb.Container, plots: Sequence[rrb.View | rrb.Container], case: str) -> rrb.Container:
-    """A case's board, and to its right its plots if there are any."""
+    """Return a case's board, and to its right its plots if there are any."""
     columns = [board, rrb.Vertical(*plots)] if plots else [board]
     return rrb.Horizontal(*columns, name=case or "run")
 
 
 def entity_path(*parts: str) -> str:
-    """An entity from its parts; empty ones, such as the case of a log with one, are left out."""
+    """Return an entity from its parts; empty ones, such as the case of a log with one, are left out."""
     return "/".join(part for part in parts if part)
 
 
@@ -246,7 +252,7 @@ def escaped(entity: str) -> str:
 
 
 def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """The rows to draw: all, or the last of each of `rows` equal spans of time."""
+    """Return the rows to draw: all, or the last of each of `rows` equal spans of time."""
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     of_span = _spans(time_ns, rows)
@@ -254,14 +260,14 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """The rows of a curve to draw: all, or the least and the greatest of each span of time."""
+    """Return the rows of a curve to draw: all, or the least and the greatest of each span of time."""
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     return extremes(_spans(time_ns, rows // 2), values)
 
 
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
-    """The rows of the least and of the greatest value of every span, the first where several are.
+    """Return the rows of the least and of the greatest value of every span, the first where several are.
 
     `of_span` (n,) is the number of each value's span, from zero on and sorted; NaN is no extreme.
     """
@@ -286,12 +292,12 @@ def gap_limit_ns(time_ns: Times) -> int:
 
 
 def usual_interval_ns(time_ns: Times) -> float:
-    """The median between distinct times, sorted; zero where there is only one."""
+    """Return the median between distinct times, sorted; zero where there is only one."""
     intervals = np.diff(np.unique(time_ns))
     return float(np.median(intervals)) if len(intervals) else 0.0
 
 
 def nice(value: float) -> float:
-    """The smallest of 1, 2 and 5 times a power of ten that is not below a positive value."""
+    """Return the smallest of 1, 2 and 5 times a power of ten that is not below a positive value."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= value))

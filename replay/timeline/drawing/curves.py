@@ -1,4 +1,4 @@
-"""Curves over logarithms, a view for each panel: Rerun's own plots have time on their axis."""
+"""Draws curves over logarithms, a view for each panel: Rerun's own plots have time on their axis."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product

@@ -51,7 +51,7 @@ class Happened(NamedTuple):
 def above_events(
     board: rrb.View | rrb.Container, events: Sequence[rrb.View], share: float = 3.0
 ) -> rrb.Container:
-    """A board so many times as high as the events below it, if there are any."""
+    """Return a board so many times as high as the events below it, if there are any."""
     return rrb.Vertical(board, *events, row_shares=[share, 1.0][: 1 + len(events)])
 
 
@@ -62,7 +62,7 @@ def draw_events(
     not_drawn: Mapping[str, str] | None = None,
     also: Iterable[Happened] = (),
 ) -> list[rrb.TextLogView]:
-    """The events of a case, one entity per estimator and sensor: no view where nothing happened.
+    """Draw the events of a case, one entity per estimator and sensor: no view where nothing happened.
 
     `not_drawn` says of topics that have no drawing why, beside those that cannot be read; `also` is what
     happened that only a scenario family knows of.
@@ -87,7 +87,7 @@ def stamped(canvas: Canvas, time_ns: Times, texts: Sequence[str]) -> list[str]:
 
 
 def events_view(root: str) -> rrb.TextLogView:
-    """All events below an entity."""
+    """Return all events below an entity."""
     shown = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=escaped(root), name="Events", columns=shown)
 

@@ -1,4 +1,4 @@
-"""Places on the earth: points by latitude and longitude on a map.
+"""Draws places on the earth: points by latitude and longitude on a map.
 
 The map's tiles come from the network; without it the points are still in their places.
 """
@@ -71,7 +71,7 @@ def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
 def map_view(
     canvas: Canvas, root: str, degrees: Floats, paths: Sequence[str] = (), trail_s: float = TRAIL_S
 ) -> rrb.MapView:
-    """A map of all below `root` that shows at least the places (n, 2) that are not far off.
+    """Return a map of all below `root` that shows at least the places (n, 2) that are not far off.
 
     Of the `paths` it shows what lies up to `trail_s` before the cursor.
     """
@@ -87,7 +87,7 @@ def map_view(
 
 
 def usual(places: Floats) -> Floats:
-    """The corners (2, d) of what holds most places: a wrong one does not shrink the picture."""
+    """Return the corners (2, d) of what holds most places: a wrong one does not shrink the picture."""
     tail = 0.5 * (1.0 - SHOWN_SHARE)
     return np.nanquantile(places, [tail, 1.0 - tail], axis=0)
 

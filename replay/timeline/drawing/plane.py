@@ -1,4 +1,4 @@
-"""Drawing a scene in the plane: paths, poses, covariance ellipses, numbered points, sight lines.
+"""Draws a scene in the plane: paths, poses, covariance ellipses, numbered points, sight lines.
 
 What is sent are the true coordinates. Rerun's 2-D views have y pointing down, so everything below `map`
 hangs on one transform that turns it up. What moves sits at its time and vanishes when it is no longer
@@ -55,7 +55,7 @@ class Stroke(NamedTuple):
     radius_px: float = 1.0
 
     def fields(self, widen: float = 1.0) -> dict[str, Any]:
-        """The fields of Rerun's archetypes."""
+        """Return the fields of Rerun's archetypes."""
         radius_px = self.radius_px * widen
         radii = rr.Radius.ui_points(radius_px)
         return {"colors": [self.colour], "radii": radii, "draw_order": 20.0 - radius_px}
@@ -111,7 +111,7 @@ def draw_scans(
 
 
 class Cloud(NamedTuple):
-    """The particles of an estimator that are drawn.
+    """Holds the particles of an estimator that are drawn.
 
     Attributes:
         estimator: whose they are.
@@ -129,7 +129,7 @@ class Cloud(NamedTuple):
 
 
 def clouds_of(scene: Scene, case: str) -> Iterator[Cloud]:
-    """The particles of all estimators that say where they are."""
+    """Yield the particles of all estimators that say where they are."""
     for name, stream in scene.outputs_of(case, schemas.DENSITY_ESTIMATE):
         if not set(PLANE) <= set(stream.components):
             continue
@@ -213,7 +213,7 @@ def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats,
 
 
 def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> Floats:
-    """The closed outlines (n, vertices + 1, 2) that hold Gaussians (n, 2), (n, 2, 2) so probably.
+    """Return the closed outlines (n, vertices + 1, 2) that hold Gaussians (n, 2), (n, 2, 2) so probably.
 
     NaN where a covariance is not positive definite.
     """
@@ -266,7 +266,7 @@ def plane_view(
     *,
     name: str = "Map",
 ) -> rrb.Spatial2DView:
-    """A view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
+    """Return a view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
 
     Of the `paths` it shows what lies up to `trail_s` before the cursor.
     """
@@ -286,7 +286,7 @@ def plane_view(
 
 
 def bounds_of(places: Floats) -> tuple[Floats, Floats]:
-    """The lower left and the upper right corner (2,) of a view of places (n, 2)."""
+    """Return the lower left and the upper right corner (2,) of a view of places (n, 2)."""
     low, high = (places.min(axis=0), places.max(axis=0)) if len(places) else (np.zeros(2), np.zeros(2))
     margin = MARGIN * np.maximum(high - low, LEAST_SIDE * extent_of(places))
     return low - margin, high + margin
@@ -320,7 +320,7 @@ def trail_of(canvas: Canvas, trail_s: float) -> rrb.VisibleTimeRanges:
 
 
 def extent_of(places: Floats) -> float:
-    """The larger side of the box around places (n, 2); one where they have no extent."""
+    """Return the larger side of the box around places (n, 2); one where they have no extent."""
     return float(np.ptp(places, axis=0).max()) or 1.0 if len(places) else 1.0
 
 

@@ -1,4 +1,4 @@
-"""Plots that every family uses: components, errors with bands, NEES and NIS with chi-square bounds.
+"""Plots what every family uses: components, errors with bands, NEES and NIS with bounds.
 
 Every function sends its columns and returns the views that show them. A band is Rerun's `Measurements`,
 which draws one standard deviation: a band of k sigma is sent with k^2 times the variance.
@@ -48,7 +48,7 @@ POINTS: Style = partial(rr.SeriesPoints, marker_sizes=[1.5])
 
 
 class Squares(NamedTuple):
-    """Chi-square values of an estimator and their degrees of freedom; `of` is what they are of.
+    """Holds chi-square values of an estimator, degrees of freedom; `of` is what they are of.
 
     It is empty where the degrees tell.
     """
@@ -207,7 +207,7 @@ def _mark_above(
 
 
 def draw_modes(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """The probabilities of all modes, a plot for each estimator and for those given all data."""
+    """Draw the probabilities of all modes, a plot for each estimator and for those given all data."""
     views = []
     for estimator, stream in scene.outputs_of(case, schemas.MODE_PROBABILITIES):
         name = stream.topic.rpartition("/")[2]

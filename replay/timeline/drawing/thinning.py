@@ -41,7 +41,7 @@ Rows = TypeVar("Rows", Stream, Errors)
 
 
 class Thinned(Generic[Rows]):
-    """The rows of a stream as they come, about `limit` after a while and at most twice as many.
+    """Keeps rows of a stream as they come, about `limit` after a while and at most twice as many.
 
     Time is cut into cells of a power of two of nanoseconds. Of each, what is kept are the rows of the
     last stamp, and of those where one of the curves has its least and its greatest value there, so that
@@ -160,7 +160,7 @@ def _joined_errors(parts: Sequence[Errors]) -> Errors:
 
 
 class Thin:
-    """The outputs of a run and the errors of its estimates, thinned; the last stamp of an output."""
+    """Thins the outputs of a run and the errors of its estimates; keeps the last stamp of an output."""
 
     def __init__(self, rows: int, errors: int) -> None:
         self._rows, self._errors_rows = rows, errors
@@ -197,34 +197,34 @@ class Thin:
 
 @dataclass(frozen=True)
 class Held:
-    """A source of which some topics are held in memory already, thinned or in part."""
+    """Represents a source of which some topics are held in memory already, thinned or in part."""
 
     of: Source
     streams: Mapping[str, Stream]
 
     @property
     def name(self) -> str:
-        """The source's."""
+        """Return the source's."""
         return self.of.name
 
     @property
     def run(self) -> RunMetadata | None:
-        """The source's."""
+        """Return the source's."""
         return self.of.run
 
     @property
     def epoch_ns(self) -> int:
-        """The source's."""
+        """Return the source's."""
         return self.of.epoch_ns
 
     @property
     def start_ns(self) -> int | None:
-        """The source's."""
+        """Return the source's."""
         return self.of.start_ns
 
     @property
     def topics(self) -> Mapping[str, Topic]:
-        """The source's, held or not."""
+        """Return the source's, held or not."""
         return self.of.topics
 
     def read(self, topics: Sequence[str]) -> dict[str, Stream]:
@@ -235,7 +235,7 @@ class Held:
         }
 
     def empty(self, topic: str) -> Stream:
-        """The topic without its messages."""
+        """Return the topic without its messages."""
         return self.of.empty(topic)
 
     def blocks(
@@ -250,7 +250,7 @@ class Held:
 
 
 class Sensed:
-    """The sensor streams and truths of a source, read along with a replay of it.
+    """Reads the sensor streams and truths of a source along with a replay of it.
 
     Maps, and what is said but once, such as where a sensor is mounted, hold for every span of the run.
     """
@@ -293,7 +293,7 @@ class Sensed:
         return stated.schema_name == schemas.LANDMARK.full_name or stated.messages == 1
 
     def all(self) -> Held:
-        """All of it, thinned."""
+        """Return all of it, thinned."""
         self.advance(np.iinfo(np.int64).max)
         kept = {topic: kept.rows for topic, kept in self._kept.items()}
         return Held(self.source, {**self._lasting, **kept})

@@ -1,4 +1,4 @@
-"""The shooter's timeline: a map of sensors, what they heard as rays, the shot's ellipses; NEES."""
+"""Draws shots: a map of sensors, what they heard as rays, the shot's ellipses; NEES."""
 
 from typing import NamedTuple
 
@@ -40,7 +40,7 @@ class Cone(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The map and events beside errors and NEES."""
+    """Return the map and events beside errors and NEES."""
     turn_up(canvas)
     numbers = list(numbered(scene.source.topics, "sensor", "detections", schemas.SHOT_DETECTION))
     sensors = [s for s in numbers if f"/sensor{s}/position" in scene.source.topics]

@@ -1,4 +1,4 @@
-"""The vessels' timeline: reports in the colours of their tracks, on a map and in the tangent plane.
+"""Draws vessels: reports in the colours of their tracks, on a map and in the tangent plane.
 
 The map's tiles come from the network; without it the reports are still in their places. Beside it:
 how many tracks and vessels are live, and the share of each vessel's reports that its own track has.
@@ -67,7 +67,7 @@ def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) 
 
 
 def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """A colour (n, 3) for every track number; neighbours in number are far apart in hue."""
+    """Return a colour (n, 3) for every track number; neighbours in number are far apart in hue."""
     hue = numbers * GOLDEN % 1.0
     value = np.where(numbers % 2 == 0, 1.0, 0.75)
     colours = hsv_to_rgb(np.stack([hue, np.full(len(hue), 0.7), value], axis=1))

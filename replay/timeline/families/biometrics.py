@@ -1,4 +1,4 @@
-"""The timeline of score fusion: probes as they come, their scores, and wrong decisions so far."""
+"""Draws score fusion: probes as they come, their scores, and wrong decisions so far."""
 
 from functools import partial
 

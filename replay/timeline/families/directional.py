@@ -1,4 +1,4 @@
-"""The timelines of directions: the density of two headings on the torus, of an axis, orientation triads.
+"""Draws directions: the density of two headings on the torus, of an axis, orientation triads.
 
 To the right of each are the errors in degrees with their bands, as everywhere.
 """
@@ -45,7 +45,7 @@ AXES: tuple[Colour, Colour, Colour] = ((230, 60, 60), (80, 200, 80), (80, 120, 2
 
 
 class Track(NamedTuple):
-    """States (n, d) of truth or an estimator, with covariances (n, t, t) where it has them."""
+    """Holds states (n, d) of truth or an estimator, with covariances (n, t, t) where it has them."""
 
     name: str
     colour: Colour
@@ -138,7 +138,7 @@ def draw_triads(
 
 
 def space_view(root: str, name: str) -> rrb.Spatial3DView:
-    """A view of triads about one origin, x towards the eye."""
+    """Return a view of triads about one origin, x towards the eye."""
     return rrb.Spatial3DView(
         origin=escaped(root),
         name=name,

@@ -1,4 +1,4 @@
-"""The extended target's timeline: true and estimated rectangles, and the points that are seen."""
+"""Draws the extended target: true and estimated rectangles, and the points that are seen."""
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -15,7 +15,7 @@ CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The plane beside sizes, errors and consistency."""
+    """Return the plane beside sizes, errors and consistency."""
     turn_up(canvas)
     shown = [np.empty((0, 2))]
     points = f"{ROOT}/points"

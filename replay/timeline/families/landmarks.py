@@ -1,4 +1,4 @@
-"""The robots' timeline: each robot on its map of landmarks, its errors, NEES, NIS and events."""
+"""Draws robots: each on its map of landmarks, its errors, NEES, NIS and events."""
 
 from functools import partial
 from typing import NamedTuple
@@ -50,7 +50,7 @@ FRESH_NS = 500_000_000
 
 
 class Track(NamedTuple):
-    """Poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
+    """Holds poses (n, 3) of a robot, x, y, heading, as the truth or an estimator has them.
 
     A heading that is not stated is NaN.
     """
@@ -63,7 +63,7 @@ class Track(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A map and plots for each robot."""
+    """Return a map and plots for each robot."""
     landmarks = landmarks_of(scene)
     turn_up(canvas)
     draw_points(canvas, f"{ROOT}/landmarks", landmarks.index.to_numpy(), landmarks.to_numpy())
@@ -96,7 +96,7 @@ def _draw_robot(
 
 
 def tracks_of(scene: Scene, robot: str) -> list[Track]:
-    """The truth and every estimate that says where the robot is, thinned to what is drawn."""
+    """Return the truth and every estimate that says where the robot is, thinned to what is drawn."""
     found = [("truth", Stroke(TRUTH, 2.0), each, each["state"]) for each in scene.truths_of(robot)]
     for estimator, stream in scene.outputs_of(robot, schemas.GAUSSIAN_ESTIMATE):
         found.append((estimator, Stroke(scene.colour(estimator)), stream, stream["mean"]))

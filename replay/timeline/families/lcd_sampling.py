@@ -1,4 +1,4 @@
-"""The timeline of sample sets: every sampling's points in the plane, with the circle that holds 95 %."""
+"""Draws sample sets: every sampling's points in the plane, with the circle that holds 95 %."""
 
 import numpy as np
 import rerun as rr
@@ -12,7 +12,7 @@ PIXELS = 14.0  # the radius of a sample that has all the weight
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A view for each set; the area of a point is its weight, a red one has a negative weight."""
+    """Return a view for each set; the area of a point is its weight, a red one has a negative weight."""
     turn_up(canvas)
     views = [
         _draw_set(canvas, scene, name, stream)

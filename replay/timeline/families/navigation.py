@@ -1,4 +1,4 @@
-"""A body that moves and turns in space: its path, its axes, and how well both are known.
+"""Draws a body that moves and turns in space: its path, its axes, and how well both are known.
 
 Drawn for every estimate of a position in space with an orientation, whatever made the log. Where fixes
 are silent for long, the path is marked, and the plots are shaded.
@@ -68,7 +68,7 @@ class Body(NamedTuple):
     covariance: Floats | None
 
     def columns(self, names: Sequence[str]) -> Floats:
-        """The columns (n, k) of components."""
+        """Return the columns (n, k) of components."""
         return self.values[:, [self.names.index(name) for name in names]]
 
 

@@ -1,4 +1,4 @@
-"""A sensor network's timeline: its graph with the messages, the nodes' estimates, NEES node by node.
+"""Draws a sensor network: its graph with the messages, the nodes' estimates, NEES by node.
 
 A message runs from its sender towards its receiver when it is sent; one that is lost is red and ends
 half way. Each fusion rule has maps of its own: the ways, and every node's error with its 95 % ellipse.
@@ -51,7 +51,7 @@ APART = 0.05
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The graph, the maps of all rules and the events beside NEES and errors of the nodes."""
+    """Return the graph, the maps of all rules and the events beside NEES and errors of the nodes."""
     turn_up(canvas)
     links = scene.read("/links")
     nodes = _nodes(scene, links)
@@ -168,14 +168,14 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLo
     """What happened to estimators, sensors and messages, in one list."""
     happened = [draw_events(canvas, scene, case) for case in scene.cases[: PLOTTED_NODES + 1]]
     times, first = np.unique(links.publish_time_ns, return_index=True)
-    texts = [_told(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
+    texts = [_line_of(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
     levels = ["WARN" if "lost" in text else "INFO" for text in texts]
     lines = stamped(canvas, times, texts)
     canvas.send("events/links", times, rr.TextLog.columns(text=lines, level=levels))
     return [events_view("events")] if texts or any(happened) else []
 
 
-def _told(sent: Stream) -> str:
+def _line_of(sent: Stream) -> str:
     """The messages that are sent at one time, as a line."""
     ways = [f"{a}>{b}" for a, b in zip(sent["sender_id"], sent["receiver_id"], strict=True)]
     late_s = (sent["arrival_time_ns"] - sent.publish_time_ns) * 1e-9

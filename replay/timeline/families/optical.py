@@ -1,4 +1,4 @@
-"""The optical sensors' timeline: sensors, targets and lines of sight in space, NEES, errors, events.
+"""Draws optical sensors, targets and lines of sight in space, with NEES, errors, events.
 
 Lines of sight are drawn twice: as measured, with the nominal attitudes, when they come in; and corrected
 by the estimated biases when these are there.
@@ -50,7 +50,7 @@ class Sensor(NamedTuple):
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The scene in space beside NEES and the errors of all components."""
+    """Return the scene in space beside NEES and the errors of all components."""
     canvas.fix(ROOT, rr.ViewCoordinates.RIGHT_HAND_Y_UP)
     sensors = list(_sensors(scene))
     targets = _targets(scene)

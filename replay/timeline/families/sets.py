@@ -1,4 +1,4 @@
-"""The timeline of set-valued fixes: every estimator's set as polygons around the truth, and its area.
+"""Draws set-valued fixes: every estimator's set as polygons around the truth, and its area.
 
 A frame whose set is empty shows none; the relative bearing to blame is among the events.
 """
@@ -39,7 +39,7 @@ SHOWN_SHARE = 0.9
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The plane and events beside the areas, for each robot."""
+    """Return the plane and events beside the areas, for each robot."""
     turn_up(canvas)
     landmarks = scene.read("/landmarks") if "/landmarks" in scene.source.topics else None
     if landmarks is not None:

@@ -1,4 +1,4 @@
-"""The timeline of tracks of many targets: what each sensor scans, the tracks in colours of their own.
+"""Draws tracks of many targets: what each sensor scans, the tracks in colours of their own.
 
 The map has x east and y north. Detections stay until the sensor's next scan, so that an empty scan shows
 nothing; bearings are rays from where the sensor is. Lines lead from a track to the detections of places
@@ -47,7 +47,7 @@ SCANS = "scans"
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A map for each tracker, in tabs, with all sensors; plots of all trackers beside them."""
+    """Return a map for each tracker, in tabs, with all sensors; plots of all trackers beside them."""
     turn_up(canvas)
     ground, paths, places = f"{ROOT}/ground", [], []
     for topic, place, stroke in _ways(scene):

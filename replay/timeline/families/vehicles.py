@@ -1,4 +1,4 @@
-"""The vehicles' timeline: a map, the same close up, and errors and GOSPA over time.
+"""Draws vehicles: a map, the same close up, and errors and GOSPA over time.
 
 Errors are a metre where paths are hundreds, so everything is drawn once more close up: about each
 vehicle's true place, side by side. Detections of the infrastructure sensor are shown raw, in its own
@@ -64,7 +64,7 @@ CELL_M, SHOWN_M = 8.0, 3.8
 
 
 class Vehicles(NamedTuple):
-    """The true places (steps, vehicles, 2) of all vehicles at their common stamps (steps,)."""
+    """Holds the true places (steps, vehicles, 2) of all vehicles at their common stamps (steps,)."""
 
     time_ns: Times
     places: Floats
@@ -75,19 +75,19 @@ class Vehicles(NamedTuple):
         return self.places.shape[1]
 
     def rows(self, time_ns: Times) -> NDArray[np.int64]:
-        """The steps of stamps; the next one where a stamp lies between."""
+        """Return the steps of stamps; the next one where a stamp lies between."""
         return np.searchsorted(self.time_ns, time_ns).clip(0, len(self.time_ns) - 1)
 
 
 class Points(NamedTuple):
-    """Places (n, 2) at stamps (n,), sorted."""
+    """Holds places (n, 2) at stamps (n,), sorted."""
 
     time_ns: Times
     places: Floats
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """The map above the close-up, beside errors, GOSPA and NEES."""
+    """Return the map above the close-up, beside errors, GOSPA and NEES."""
     turn_up(canvas)
     vehicles = _truths(scene)
     tracks = {name: _tracks(scene, name, vehicles) for name in scene.estimators}

@@ -1,1 +1,1 @@
-"""The files of ROS bags, record by record: bag, db3 and MCAP; begin with `bags`."""
+"""Reads the files of ROS bags record by record: bag, db3 and MCAP; begin with `bags`."""

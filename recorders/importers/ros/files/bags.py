@@ -21,7 +21,7 @@ _ZSTD = ".zstd"
 
 @dataclass
 class Bag:
-    """The files of one bag, in the order of their splits, and what is known to be missing.
+    """Holds the files of one bag, in the order of their splits, and what is known to be missing.
 
     `stated` is how many messages metadata.yaml says that each topic has; where `is_packed`, every
     message is compressed by itself.
@@ -34,7 +34,7 @@ class Bag:
     is_packed: bool = False
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, file by file."""
+        """Yield the messages of the wanted connections, file by file."""
         for file in self.files:
             for batch in file.batches(wanted):
                 yield _unpacked(batch) if self.is_packed else batch

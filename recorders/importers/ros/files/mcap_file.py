@@ -1,4 +1,4 @@
-"""MCAP files of ROS, read by the log's own container, a chunk at a time."""
+"""Reads MCAP files of ROS by the log's own container, a chunk at a time."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,7 +20,7 @@ _LOG_TIME = HEAD_BYTES + 6
 
 
 class McapFile:
-    """An MCAP file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """Reads an MCAP file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -48,7 +48,7 @@ class McapFile:
         return Connection(channel.topic, name, channel.message_encoding, definition, count)
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, a chunk of the file at a time."""
+        """Yield the messages of the wanted connections, a chunk of the file at a time."""
         chosen = {number: each for number, each in self._by_id.items() if wanted(each)}
         regions = [
             region

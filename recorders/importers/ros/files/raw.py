@@ -1,4 +1,4 @@
-"""Messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
+"""Holds messages as a file of a bag keeps them: bytes, and the stamps of the recorder."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -33,7 +33,7 @@ class Connection(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Some messages (n,) of a connection, in file order: where in `data` they are, and their stamps."""
+    """Holds some messages (n,) of a connection, in file order: their place in `data`, and stamps."""
 
     connection: Connection
     data: NDArray[np.uint8]
@@ -55,7 +55,7 @@ class BagFile(Protocol):
     losses: list[str]
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, a chunk of the file at a time."""
+        """Return the messages of the wanted connections, a chunk of the file at a time."""
 
 
 def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[np.int64]) -> Batch:
@@ -66,5 +66,5 @@ def joined(connection: Connection, parts: Sequence[bytes], log_time_ns: NDArray[
 
 
 def words(data: NDArray[np.uint8], places: NDArray[np.int64], dtype: str) -> NDArray:
-    """The numbers (n,) of a type that stand at `places` (n,) of `data`."""
+    """Return the numbers (n,) of a type that stand at `places` (n,) of `data`."""
     return windows(data, np.dtype(dtype).itemsize)[places].view(dtype)

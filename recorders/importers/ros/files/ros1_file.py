@@ -1,4 +1,4 @@
-"""The bags of ROS 1 (.bag), walked record by record: an index is of use, and not needed.
+"""Reads the bags of ROS 1 (.bag) record by record: an index is of use, and not needed.
 
 Source: wiki.ros.org/Bags/Format/2.0.
 """
@@ -33,7 +33,7 @@ _DECOMPRESS: dict[bytes, Callable[[bytes], bytes]] = {
 
 
 class _Record(NamedTuple):
-    """A record of the file: its header, and where its data is."""
+    """Holds a record of the file: its header, and where its data is."""
 
     header: dict[str, bytes]
     begin: int
@@ -41,12 +41,12 @@ class _Record(NamedTuple):
 
     @property
     def kind(self) -> int:
-        """What it is; 0 where it does not say."""
+        """Return what it is; 0 where it does not say."""
         return int.from_bytes(self.header.get("op", b""), "little")
 
 
 class _Scanned(NamedTuple):
-    """The records of a chunk (n,): what they are, of which connection, when, and where their data is.
+    """Holds the records of a chunk (n,): what they are, which connection's, when, where their data is.
 
     `end` is where the walk stopped: the chunk's length, or the first record that is not whole.
     """
@@ -61,7 +61,7 @@ class _Scanned(NamedTuple):
 
 
 class Ros1File:
-    """A .bag file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """Reads a .bag file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -140,7 +140,7 @@ class Ros1File:
         )
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, a chunk of the file at a time."""
+        """Yield the messages of the wanted connections, a chunk of the file at a time."""
         chosen = {number: each for number, each in self._by_id.items() if wanted(each)}
         with self.path.open("rb") as file:
             reads = ((record, _read(file, record)) for record in self._chunks)

@@ -1,4 +1,4 @@
-"""The sqlite3 files of ROS 2 (.db3), opened so that nothing beside them is made or changed.
+"""Reads the sqlite3 files of ROS 2 (.db3) so that nothing beside them is made or changed.
 
 Source: rosbag2_storage_sqlite3; definitions of the types are in it since version 4 of its tables.
 """
@@ -23,7 +23,7 @@ _Row = tuple[int, int, bytes]
 
 
 class SqliteFile:
-    """A .db3 file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
+    """Reads a .db3 file; see `BagFile`. Raises BadInput where it is none, or cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -66,7 +66,7 @@ class SqliteFile:
         return database
 
     def batches(self, wanted: Callable[[Connection], bool]) -> Iterator[Batch]:
-        """The messages of the wanted connections, some thousand rows at a time."""
+        """Yield the messages of the wanted connections, some thousand rows at a time."""
         chosen = [number for number, each in self._by_id.items() if wanted(each)]
         with closing(self._open()) as database:
             for found in _some_at_a_time(self._rows(database, chosen)):

@@ -1,4 +1,4 @@
-"""The messages of a sqlite3 bag that was cut off, from its pages: the tree that leads to them has gaps.
+"""Reads messages of a cut-off sqlite3 bag from its pages: the tree that leads to them has gaps.
 
 Source: sqlite.org/fileformat2.html, sections 1.5, 1.6 and 2.1.
 """

@@ -22,7 +22,7 @@ from replay.engine.compiling.kernels.variables import placed_names
 
 
 class Wider(Exception):
-    """Raised where a variable has to hold numbers of another kind than its first value."""
+    """Says that a variable has to hold numbers of another kind than its first value."""
 
 
 class Frame(Expressions):

@@ -60,6 +60,8 @@ def lower(program: Program, function: FunctionType, arguments: list[Any]) -> tup
 
 
 class _Lowering(Frame):
+    """Lowers the body of one function, for arguments of these kinds."""
+
     def __init__(
         self, program: Program, function: FunctionType, arguments: list[Any], kinds: dict[str, str]
     ) -> None:

@@ -129,8 +129,8 @@ def function_of(function: Callable[..., Any]) -> Callable[..., Any]:
 
     It returns nothing, or a number of the kind that its annotation says.
     """
-    said = function.__annotations__.get("return", "")
-    returned = said if isinstance(said, str) else getattr(said, "__name__", str(said))
+    stated = function.__annotations__.get("return", "")
+    returned = stated if isinstance(stated, str) else getattr(stated, "__name__", str(stated))
     if returned not in ("float", "int", "bool", "None"):
         raise BadInput(
             f"{function.__qualname__} does not say what it returns; annotate it with '-> float', "

@@ -1,0 +1,157 @@
+"""Docstrings open with a sentence, and those of public names say what is taken and returned.
+
+Public is what `fuselog/__init__.pyi` lists. Whether a sentence is a good one, no test can say.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.house.sources import PATHS, ROOT, nodes_of, tree_of
+
+STUB = ast.parse((ROOT / "fuselog" / "__init__.pyi").read_text(encoding="utf-8"))
+ENTRY = re.compile(r"^    (\*{0,2}\w+(?:, \w+)*): \S", re.MULTILINE)
+Documented = ast.Module | ast.ClassDef | ast.FunctionDef
+
+
+def section_of(node: Documented, head: str) -> str:
+    """What stands under a heading of a docstring, such as `Args`; empty where there is none."""
+    _, _, after = f"\n{ast.get_docstring(node) or ''}".partition(f"\n{head}:\n")
+    return re.split(r"\n(?=\S)", after)[0]
+
+
+def entries_of(node: Documented, head: str) -> set[str]:
+    return {name for names in ENTRY.findall(section_of(node, head)) for name in names.split(", ")}
+
+
+def parameters_of(function: ast.FunctionDef) -> set[str]:
+    given = function.args
+    named = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
+    return {each.arg for each in named if each} - {"self", "cls"}
+
+
+def fields_of(node: ast.ClassDef) -> set[str]:
+    """The public fields of a dataclass, a named tuple or a type of parameters."""
+    return {
+        each.target.id
+        for each in node.body
+        if isinstance(each, ast.AnnAssign)
+        and isinstance(each.target, ast.Name)
+        and not each.target.id.startswith("_")
+        and "ClassVar" not in ast.unparse(each.annotation)
+    }
+
+
+def faults_of_opening(node: Documented) -> Iterator[str]:
+    """What keeps the first line of a docstring from being a sentence."""
+    first, *more = (ast.get_docstring(node) or "").split("\n")
+    if not first:
+        yield "has no docstring"
+    elif not first.endswith("."):
+        yield "opens without a full stop"
+    elif first[0].islower():
+        yield "opens in lower case"
+    elif more and more[0]:
+        yield "opens with more than a line"
+
+
+def faults_of_function(node: ast.FunctionDef) -> Iterator[str]:
+    """What the docstring of a public function lacks."""
+    yield from faults_of_opening(node)
+    if missing := parameters_of(node) - entries_of(node, "Args"):
+        yield f"has no Args of {sorted(missing)}"
+    if node.returns and ast.unparse(node.returns) != "None" and not section_of(node, "Returns"):
+        yield "has no Returns"
+
+
+def faults_of_class(node: ast.ClassDef) -> Iterator[str]:
+    """What the docstring of a public class lacks, or one of its public methods."""
+    yield from faults_of_opening(node)
+    if missing := fields_of(node) - entries_of(node, "Attributes"):
+        yield f"has no Attributes of {sorted(missing)}"
+    for each in node.body:
+        if isinstance(each, ast.FunctionDef) and not each.name.startswith("_"):
+            for fault in faults_of_opening(each):
+                yield f"{each.name} {fault}"
+            text = ast.get_docstring(each) or ""
+            for name in parameters_of(each) - entries_of(each, "Args"):
+                if f"`{name}`" not in text:
+                    yield f"{each.name} does not say what {name} is"
+
+
+def faults_of(node: ast.stmt) -> Iterator[str]:
+    if isinstance(node, ast.FunctionDef):
+        yield from faults_of_function(node)
+    elif isinstance(node, ast.ClassDef):
+        yield from faults_of_class(node)
+
+
+def definition(module: str, name: str) -> ast.stmt:
+    """The statement that defines a name of a module, also where it imports that from another one."""
+    place = Path(*module.split("."))
+    tree = tree_of(place / "__init__.py" if (ROOT / place).is_dir() else place.with_suffix(".py"))
+    for each in tree.body:
+        if isinstance(each, ast.FunctionDef | ast.ClassDef) and each.name == name:
+            return each
+        if isinstance(each, ast.ImportFrom):
+            for alias in each.names:
+                if name == (alias.asname or alias.name):
+                    return definition(each.module or "", alias.name)
+    return ast.Pass()  # a value, or a module
+
+
+def test_public_names_say_what_they_take_and_return() -> None:
+    faults = [
+        f"{alias.name} {fault}"
+        for node in STUB.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        for fault in faults_of(definition(node.module or "", alias.name))
+    ]
+    assert not faults, "\n".join(faults)
+
+
+def test_modules_and_classes_open_with_a_sentence() -> None:
+    faults = [
+        f"{path}: {getattr(node, 'name', 'the module')} {fault}"
+        for path in PATHS
+        for node in nodes_of(path)
+        if isinstance(node, ast.Module | ast.ClassDef)
+        for fault in faults_of_opening(node)
+    ]
+    assert not faults, "\n".join(faults)
+
+
+def test_every_argument_that_is_described_is_one() -> None:
+    for path in PATHS:
+        for node in nodes_of(path):
+            if isinstance(node, ast.FunctionDef):
+                described = {name.lstrip("*") for name in entries_of(node, "Args")}
+                assert described <= parameters_of(node), f"{path}: {node.name} {described}"
+
+
+@pytest.mark.parametrize(
+    ("source", "fault"),
+    [
+        ('"""A function"""', "opens without a full stop"),
+        ('"""does."""', "opens in lower case"),
+        ('"""Does\nthis."""', "opens without a full stop"),
+        ('"""Does.\nMuch."""', "opens with more than a line"),
+        ("pass", "has no docstring"),
+        ('"""Does.\n\nArgs:\n    first: a number.\n"""', "has no Args of ['second']"),
+        ('"""Does.\n\nArgs:\n    first, second: numbers.\n"""', "has no Returns"),
+    ],
+)
+def test_what_lacks_something_is_found(source: str, fault: str) -> None:
+    body = source.replace("\n", "\n    ")
+    [function] = ast.parse(f"def made(first: int, second: int) -> int:\n    {body}").body
+    assert fault in list(faults_of(function))
+
+
+def test_a_field_without_a_meaning_is_found() -> None:
+    source = 'class Made(NamedTuple):\n    """Holds two.\n\n    Attributes:\n        one: 1.\n    """\n'
+    [made] = ast.parse(f"{source}    one: int\n    two: int\n").body
+    assert list(faults_of(made)) == ["has no Attributes of ['two']"]
