@@ -1,4 +1,4 @@
-"""Faults of three more draws: at lines that seeds chose, made by operators and not by hand.
+"""Faults of four more draws: at lines that seeds chose, made by operators or, in pipeline, by hand.
 
 Signs, comparisons, limits off by one, exchanged arguments and titles, constants, keys, conditions that
 are dropped, the least for the greatest, units. What changes nothing that is seen was left out. The tests
@@ -764,5 +764,161 @@ REDRAWN = [
         "len(no.returned) or",
         "len(no.is_number) or",
         "tests/replay/tracing/test_functions.py tests/replay/tracing/test_formulas.py",
+    ),
+    Fault(
+        "pipeline/studies/vehicles/scaling.py",
+        "square = (-0.5 * side, 0.5 * side) * 2",
+        "square = (-1.0 * side, 1.0 * side) * 2",
+        "tests/pipeline/test_made_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/optical/los.py",
+        '"{scheme}.position_rmse_m.{name}"] = case.position_rmse_m(scheme).tolist()',
+        '"{scheme}.position_rmse_m.{name}"] = case.position_rmse_m(JOINT).tolist()',
+        "tests/pipeline/test_made_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/sampling/torus_real.py",
+        "half = len(wind) // 2",
+        "half = len(wind) // 3",
+        "tests/pipeline/test_made_filter_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/biometrics/biometrics.py",
+        "(label, case, name, low, high) for name, (low, high) in",
+        "(label, case, name, low, high) for name, (high, low) in",
+        "tests/pipeline/test_made_filter_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/ranging/ranging.py",
+        "inside = (stamps >= begin_ns) & (stamps <= end_ns)",
+        "inside = (stamps >= begin_ns) | (stamps <= end_ns)",
+        "tests/pipeline/test_made_filter_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/sampling/torus.py",
+        '"mean_error_rad": mean,',
+        '"mean_error_rad": covariance,',
+        "tests/pipeline/test_made_filter_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/sampling/torus.py",
+        "errors.covariance.mean())",
+        "errors.mean.mean())",
+        "tests/pipeline/test_made_filter_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/navigation/outages.py",
+        'for name in ("start_s", "length_s")',
+        'for name in ("length_s", "start_s")',
+        "tests/pipeline/test_made_filter_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/sets/set_membership.py",
+        'runner.obtain({"error_share": 0.0})',
+        'runner.obtain({"error_share": 1.0})',
+        "tests/pipeline/test_made_studies.py",
+    ),
+    Fault(
+        "pipeline/studies/vehicles/vehicles.py",
+        '_total_error_m.{case}"] = row["median_m"]',
+        '_total_error_m.{case}"] = row["mean_m"]',
+        "tests/pipeline/test_made_studies.py",
+    ),
+    Fault(
+        "pipeline/exploring/plots.py",
+        '"NIS per component, by second"',
+        '"NEES per component, by second"',
+        "tests/pipeline/test_exploring.py",
+    ),
+    Fault(
+        "pipeline/exploring/sliders.py",
+        "self.is_logarithmic else there:.4g}",
+        "self.is_logarithmic else there:.2g}",
+        "tests/pipeline/test_exploring_numbers.py",
+    ),
+    Fault(
+        "pipeline/exploring/page.py",
+        "if played.seconds > SLOW_S:",
+        "if played.seconds < SLOW_S:",
+        "tests/pipeline/test_exploring.py",
+    ),
+    Fault(
+        "pipeline/output/report/kinds.py",
+        'quantities.setdefault(str(row["case"]), {}).setdefault(str(row["quantity"])',
+        'quantities.setdefault(str(row["quantity"]), {}).setdefault(str(row["case"])',
+        "tests/pipeline/test_report_stories.py",
+    ),
+    Fault(
+        "pipeline/output/report/scene.py",
+        "np.concatenate([nis, low, high]) for _, _, nis",
+        "np.concatenate([nis, low, low]) for _, _, nis",
+        "tests/pipeline/test_charts.py",
+    ),
+    Fault(
+        "pipeline/output/report/sweeps.py",
+        'return ", ".join(dict.fromkeys(map(str, values)))',
+        'return ", ".join(map(str, values))',
+        "tests/pipeline/test_report_stories.py",
+    ),
+    Fault(
+        "pipeline/logs/foxglove.py",
+        ".FromNanoseconds(int(stream.publish_time_ns[rows[0]]))\n        for row"
+        " in rows:\n            _set_pose",
+        ".FromNanoseconds(int(stream.publish_time_ns[0]))\n        for row in ro"
+        "ws:\n            _set_pose",
+        "tests/pipeline/test_foxglove.py",
+    ),
+    Fault(
+        "pipeline/diagnosing/battery/battery.py",
+        "rows += [tried(cell, seed) for seed in progress(seeds, cell.name",
+        "rows = [tried(cell, seed) for seed in progress(seeds, cell.name",
+        "tests/pipeline/test_battery.py",
+    ),
+    Fault(
+        "pipeline/diagnosing/battery/car.py",
+        "remapped((0, -1), (1, -1), (2, 1))",
+        "remapped((0, -1), (1, 1), (2, 1))",
+        "tests/pipeline/test_battery.py",
+    ),
+    Fault(
+        "pipeline/diagnosing/likelihood.py",
+        "begin_ns = max(begin_ns, int(stamps_ns.min()))",
+        "begin_ns = min(begin_ns, int(stamps_ns.min()))",
+        "tests/pipeline/test_diagnosing_without_prior.py",
+    ),
+    Fault(
+        "pipeline/diagnosing/portion.py",
+        "judge_logs([estimates], [source], find_metrics(), gap_limit_s=gap_limit_s)",
+        "judge_logs([estimates], [source], find_metrics(), gap_limit_s=0.2)",
+        "tests/pipeline/test_recorded_estimates.py",
+    ),
+    Fault(
+        "pipeline/comparing/candidates.py",
+        "again = replace(again, coverage=kept.coverage)",
+        "again = replace(again, notes=kept.notes)",
+        "tests/pipeline/test_comparing.py",
+    ),
+    Fault(
+        "pipeline/runs/experiment.py",
+        "{label: {key: value} for label in takers}",
+        "{label: {key: value} for label in takers[:1]}",
+        "tests/pipeline/test_experiments.py",
+    ),
+    Fault(
+        "pipeline/tuning/objective.py",
+        "self.best.evaluations + len(points)",
+        "self.best.evaluations + 1",
+        "tests/pipeline/test_tuning.py",
+    ),
+    Fault(
+        "pipeline/stressing/changes.py",
+        "rng, streams = np.random.default_rng(seed), {}\n        for topic in in"
+        "puts.sensed:\n            stream = source.streams[topic]\n            co"
+        "lumns",
+        "rng, streams = np.random.default_rng(0), {}\n        for topic in input"
+        "s.sensed:\n            stream = source.streams[topic]\n            colum"
+        "ns",
+        "tests/pipeline/test_stressing.py",
     ),
 ]

@@ -340,6 +340,11 @@ def test_nis_over_time_is_of_all_runs_and_says_how_often_it_is_outside(
     shown = [each for own in wanted.values() for each in own.values()]
     values = np.concatenate([np.concatenate(each[1:]) for each in shown])
     assert least < values[values > 0].min() < values.max() < most
+    calm = nis_chart(tmp_path, ["calm"])  # whose band reaches higher than its curve
+    assert calm is not None
+    [panel] = calm.panels
+    assert panel.y.limits is not None
+    assert panel.y.limits[1] > np.max(panel.bands[0].high) > np.max(panel.series[0].y)
     assert "of a, 2 runs together;" in chart.title
     assert nis_chart(tmp_path, ["unknown"]) is None
 

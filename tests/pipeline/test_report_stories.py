@@ -534,7 +534,10 @@ def test_a_comparison_is_judged_case_by_case_by_the_means_of_both_sides() -> Non
 def test_who_is_best_is_marked_in_the_row(values: dict[str, float], looks: list[str]) -> None:
     table = MetricTable("", ["a", "b"], {"position_rmse_m": {k: Measured(v) for k, v in values.items()}})
     spreads = {"position_rmse_m": dict.fromkeys(values, (0.5, 4.0))}
-    row = sheet._row(SimpleNamespace(of={}), table, "position_rmse_m", ["a", "b"], spreads)  # type: ignore[arg-type]
+    found: Any = SimpleNamespace(of={})
+    [alone] = sheet._row(found, table, "position_rmse_m", ["a"], spreads).cells
+    assert alone.look == ""  # nobody to be better than
+    row = sheet._row(found, table, "position_rmse_m", ["a", "b"], spreads)
     assert [each.look for each in row.cells] == looks
     assert [each.text == sheet.MISSING for each in row.cells] == [label not in values for label in "ab"]
     assert [each.small for each in row.cells] == [
