@@ -326,9 +326,15 @@ class Page:
                 points.append(point)
             now = values.get(active.name, active.own)
             self._later(lambda: show_likelihood(self.plots["likelihood"], active, points, now))
-            self._later(self.plots["likelihood"].show_if_drawn)
+            self._later(self._rest)
 
         self._work.ask(work)
+
+    def _rest(self) -> None:
+        """Once a slider rests: the likelihood is seen, and plots have the names of what they show."""
+        self.plots["likelihood"].show_if_drawn()
+        for plot in self.plots.values():
+            plot.name()
 
     def _take_and_show(self, played: Mapping[int | str, Played]) -> None:
         self._take(played)

@@ -41,6 +41,7 @@ HEIGHT, HEIGHT_OVER_TIME = 220, 235
 LEAST_DROP = 10.0  # of log-likelihood, that its plot shows at least
 ABOUT_PEAK = 3  # values to either side of it that are seen
 LEAST_CORRELATION = 0.25
+TICKS = [0.0, 0.25, 0.5, 0.75, 1.0]  # places of a slider
 Data = Mapping[str, Any]
 
 
@@ -63,15 +64,16 @@ class Plot:
         return made
 
     def say(self, title: str) -> None:
-        """Give it a title, which is also what a screen reader has of it."""
-        if title != self.figure.title.text:
-            self.figure.title.text = title
-            self.figure.html_attributes = {"role": "img", "aria-label": title}
+        """Give it a title."""
+        self.figure.title.text = title
+
+    def name(self) -> None:
+        """Tell a screen reader the title; this is slow, and so done once a slider rests."""
+        self.figure.html_attributes = {"role": "img", "aria-label": self.figure.title.text}
 
     def show_if_drawn(self) -> None:
         """Show it only where something is drawn of a filter."""
-        sources = self.sources.values()
-        self.figure.visible = any(len(each) for of in sources for each in of.data.values())
+        self.figure.visible = any(len(x) for of in self.sources.values() for x in of.data.values())
 
     def clear(self, of: int | str) -> None:
         """Draw nothing of a filter."""
@@ -93,7 +95,7 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
     ranges = {} if over_time is None else {"x_range": over_time}
     made = figure(
         name=name,
-        title="",
+        title=title,
         height=HEIGHT if over_time is None else HEIGHT_OVER_TIME,
         sizing_mode="stretch_width",
         toolbar_location=None,
@@ -118,13 +120,14 @@ def blank(name: str, title: str, *, over_time: Range1d | None = None, **options:
     if over_time is not None:
         made.xaxis.axis_label = over_time.name
     plot = Plot(made)
-    plot.say(title)
+    plot.name()
     return plot
 
 
 def error_plot(over_time: Range1d, cursor: Span) -> Plot:
     """Errors of one component, tinted where the filter says that 95 % of them lie."""
     plot = blank("error", "Error", over_time=over_time, y_range=Range1d(-1.0, 1.0))
+    plot.figure.yaxis.ticker = FixedTicker(ticks=[])
     for of in (1, 0):
         plot.figure.varea("t", "low", "high", source=plot.source(of, "band", "t", "low", "high"),
                           fill_color=COLOURS[of], fill_alpha=0.16)  # fmt: skip
@@ -199,6 +202,7 @@ def likelihood_plot() -> Plot:
     """The log-likelihood of all measurements over the parameter that is dragged."""
     plot = blank("likelihood", "Likelihood", x_range=Range1d(-0.05, 1.05), y_range=Range1d(0.0, 1.0))
     plot.figure.yaxis.formatter = NumeralTickFormatter(format="0,0")
+    plot.figure.xaxis.ticker = FixedTicker(ticks=TICKS)
     source = plot.source(0, "line", "x", "y")
     plot.figure.line("x", "y", source=source, line_color=QUIET, line_width=1.5)
     plot.figure.scatter("x", "y", source=plot.source(0, "peak", "x", "y"), marker="diamond", size=9,
@@ -211,8 +215,7 @@ def show_played(
     plots: Mapping[str, Plot], of: int | str, played: Played, case: str, component: str
 ) -> None:
     """Draw one replay: errors, NEES, NIS, whiteness, path."""
-    one = played.cases.get(case)
-    if one is None:
+    if (one := played.cases.get(case)) is None:
         for plot in plots.values():
             plot.clear(of)
         return
@@ -345,9 +348,7 @@ def show_likelihood(
     below = 1.3 * max(likelihoods[best] - min(there, *near), LEAST_DROP)
     plot.figure.y_range.update(start=likelihoods[best] - below, end=likelihoods[best] + 0.15 * below)
     plot.say(f"Likelihood over {slider.title}; greatest near {slider.words(points[best][0])}")
-    ticks = [0.0, 0.25, 0.5, 0.75, 1.0]
-    plot.figure.xaxis.ticker = FixedTicker(ticks=ticks)
-    plot.figure.xaxis.major_label_overrides = {each: slider.words(slider.value(each)) for each in ticks}
+    plot.figure.xaxis.major_label_overrides = {each: slider.words(slider.value(each)) for each in TICKS}
 
 
 def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, component: str) -> None:
@@ -368,7 +369,7 @@ def fit_errors(plot: Plot, played: Mapping[int | str, Played], case: str, compon
         low, high = min(ends) - 1.1 * most, max(ends) + 1.1 * most
         plot.figure.y_range.update(start=low, end=high)
         ticks = ticks_between(low, high, unit_of(component))
-        plot.figure.yaxis.ticker = FixedTicker(ticks=list(ticks))
+        plot.figure.yaxis[0].ticker.ticks = list(ticks)  # a new ticker has Bokeh look through all models
         plot.figure.yaxis.major_label_overrides = ticks
 
 

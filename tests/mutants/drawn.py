@@ -766,8 +766,8 @@ DRAWN = [
     ),
     Fault(
         "pipeline/exploring/sliders.py",
-        "if 0.0 < abs(value) < most:",
-        "if 0.0 < value < most:",
+        "if 0.0 < abs(value) < most or",
+        "if 0.0 < value < most or",
         "tests/pipeline/test_exploring.py tests/words/test_words.py",
     ),
     Fault(
