@@ -52,6 +52,9 @@ def stress(
         gap_limit_s: the truth is not interpolated over longer gaps.
         set: parameters of estimators, and how topics are altered first, as for `replay`.
 
+    Returns:
+        What each change does to the estimates of each run and estimator, and a verdict.
+
     Raises BadInput where an estimator cannot replay a run, or fails in all of them before it has an
     estimate.
 
