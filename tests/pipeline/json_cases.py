@@ -246,6 +246,10 @@ def of_deployment() -> Any:
 def of_noise(found: Any) -> Any:
     white = found.columns[0].numbers["white"]
     assert white.low < np.sqrt(0.05) < white.high  # of unit samples, 20 a second
+    known = found.curves.dropna()
+    assert len(known) > 10
+    assert (known["low"] < known["deviation"]).all()
+    assert (known["deviation"] < known["high"]).all()
     return {
         "log": "rest.mcap",
         "numbers": found.table,
