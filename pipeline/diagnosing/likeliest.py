@@ -16,6 +16,9 @@ from recorders.errors import BadInput
 from recorders.parameters import merge, parse_settings
 
 MENDED = "mended"
+STILL_WRONG = (
+    1.5  # times the aim of NEES or NIS: what is left of a fault when its likeliest cause is undone
+)
 
 
 def likeliest_causes(folder: Path, result: Result) -> list[Cause]:
@@ -66,13 +69,19 @@ def _mended(logs: list[Path], label: str, own: dict[str, Any], sentence: Sentenc
         return ""
     mend = merge(own, parse_settings([sentence.setting]))
     table = compare(*logs, estimators=[{label: own}, {MENDED: mend}]).table
-    effects = []
+    effects, left = [], []
     for key in (main, "nees", "nis_per_component"):
         rows = table[table["quantity"] == key].to_dict("records")[:1]
-        effects += [_change(key, row) for row in rows if math.isfinite(row["second_mean"])]
+        known = [row for row in rows if math.isfinite(row["second_mean"])]
+        effects += [_change(key, row) for row in known]
+        if key != main:
+            left += [row["second_mean"] / float(row["aim"]) for row in known]
     if not effects:
         return ""
-    return f"With that, over {count(len(logs), 'run')}: {'; '.join(effects)}."
+    told = f"With that, over {count(len(logs), 'run')}: {'; '.join(effects)}."
+    if max(left, default=0.0) > STILL_WRONG:
+        told += f" That is still {number(max(left), 2)} times what is right: it is not the only cause."
+    return told
 
 
 def _change(key: str, row: Mapping[Any, Any]) -> str:

@@ -827,8 +827,8 @@ REDRAWN = [
     ),
     Fault(
         "pipeline/exploring/plots.py",
-        '"NIS per component, by second"',
-        '"NEES per component, by second"',
+        'of, "NIS per component", nis',
+        'of, "NEES per component", nis',
         "tests/pipeline/test_exploring.py",
     ),
     Fault(
@@ -838,9 +838,9 @@ REDRAWN = [
         "tests/pipeline/test_exploring_numbers.py",
     ),
     Fault(
-        "pipeline/exploring/page.py",
-        "if played.seconds > SLOW_S:",
-        "if played.seconds < SLOW_S:",
+        "pipeline/exploring/markup.py",
+        "if one.seconds > SLOW_S:",
+        "if one.seconds < SLOW_S:",
         "tests/pipeline/test_exploring.py",
     ),
     Fault(

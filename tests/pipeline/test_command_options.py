@@ -65,7 +65,6 @@ MOVES = [
         Moves(each, {"--gap-limit": "--gap-limit 0.001"})
         for each in (
             f"replay sparse.mcap -e ekf {OUT}",
-            "stress sparse.mcap -e ekf",
             "diagnose sparse.mcap -e ekf",
             "tune sparse.mcap -e ekf --free sigma_range_m --by rmse --out out",
         )
@@ -230,6 +229,7 @@ UNMOVED = {
     "evaluate --format": "it is found from the content, and another than that is refused",
     "evaluate --truth-format": "it is found from the content, and another than that is refused",
     "explore --gap-limit": "no test moves it yet",
+    "stress --gap-limit": "tests/pipeline/test_stressing.py: of which errors a change counts",
     "report --viewer": "tests/pipeline/test_report.py asks for it in Python",
     "view --gap-limit": "no two timelines have the same bytes",
 }

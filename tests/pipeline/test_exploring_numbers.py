@@ -145,5 +145,5 @@ def test_a_verdict_goes_by_what_is_farther_from_one() -> None:
     assert said("errors", "innovations") == said("errors")
     assert said("unused") == "doubtful: Doubtful. unused!"
     good = "good: Nothing speaks against it. NIS is 4.00 per component and NEES is 0.22 for 2"
-    assert said("errors", of="robot2") == said() == f"{good} within their intervals."
+    assert said("errors", of="robot2") == said() == f"{good}, within their intervals."
     assert verdict_of(case, [], ["it stopped at 3 s"])[0::2] == ("failed", "it stopped at 3 s")

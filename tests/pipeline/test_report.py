@@ -200,16 +200,17 @@ def test_sections_are_named_by_what_differs_in_their_settings(tmp_path: Path) ->
         {"seed": 1, "record": {"scenario": "s", "parameters": {"rate_hz": 5}}},
         {"seed": 1, "record": {"scenario": "s", "parameters": {"rate_hz": 10}}},
         {"seed": 1, "record": {"scenario": "s"}},
-        {"seed": 1, "record": {"scenario": "s"}},
+        {"seed": 1, "record": {"scenario": "s"}, "estimators": {"ekf": {}}},
     ]
+    settings[1] |= {part: {"ekf": {"sigma_m": 0.1}} for part in ("estimators", "parameters")}
     folders = [_written(tmp_path / f"{place}", each, Outcome()) for place, each in enumerate(settings)]
     write_report(folders, tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     assert page.texts["h2"] == [
-        "sweep: rate_hz 5",
-        "sweep: rate_hz 10",
-        f"sweep: rate_hz default ({folders[2]})",
-        f"sweep: rate_hz default ({folders[3]})",
+        "sweep: rate_hz 5, sigma_m default",
+        "sweep: rate_hz 10, sigma_m 0.1",
+        f"sweep: rate_hz default, sigma_m default ({folders[2]})",
+        f"sweep: rate_hz default, sigma_m default ({folders[3]})",
     ]
 
 
@@ -254,6 +255,7 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     """A range noise stated four times too small; kept in the result by `run`, found anew by `report`."""
     folder = tmp_path / "broken"
     broken = ["--set", "ekf.sigma_range_m=0.025", "--set", "duration_s=5", "--runs", "2"]
+    broken += ["--set", "ekf.turn_noise_density=0.001"]  # a second one, which stays
     done = fuselog("run", "landmarks", *broken, "--diagnose", "--out", folder)
     assert "likeliest cause of ekf: sigma_range_m (standard deviation of a range) is" in done.out
     [cause] = read_result(folder).causes
@@ -261,6 +263,12 @@ def test_a_diagnosis_names_the_likeliest_cause_and_what_the_runs_give_without_it
     assert (cause.estimator, key) == ("ekf", "ekf.sigma_range_m")
     assert float(value) == pytest.approx(0.1, rel=0.15)
     assert cause.mended.startswith("With that, over 2 runs: position error, RMS ")
+    left = re.search(
+        r"NEES ([\d.]+), 3 is right; .* still ([\d.]+) times what is right: it is not the o",
+        cause.mended,
+    )
+    assert left is not None
+    assert float(left[2]) == pytest.approx(float(left[1]) / 3.0, rel=0.06)
     assert f"The likeliest cause: {cause.short}." in run_sentences(read_result(folder), folder)[1]
     write_report([folder], tmp_path / "page.html")
     assert f"<code>--set {cause.setting}</code>" in (tmp_path / "page.html").read_text(encoding="utf-8")

@@ -596,3 +596,17 @@ def test_a_change_follows_from_its_seed_and_touches_inputs_alone(name: str) -> N
     assert any(first != told(seed) for seed in (2, 3, 4, 5)) == is_drawn
     for topic in ("/robot1/truth", "/landmarks"):
         assert first[topic] == told(2)[topic]
+
+
+def test_errors_over_longer_gaps_of_the_truth_do_not_count() -> None:
+    """Of a truth every .15 s the RMSE is known at its own stamps alone where gaps may be no longer."""
+    log = fl.record("landmarks", seed=2, duration_s=3.0)
+    truth = log.streams["/robot1/truth"]
+    sparse = replace(log, streams={**log.streams, truth.topic: truth.take(slice(None, None, 3))})
+    errors = [
+        copies.replayed([sparse], "ekf", {"kind": "ekf"}, copies.How(gap_limit_s=gap_s)).metrics(0)
+        for gap_s in (0.2, 0.001)
+    ]
+    near, none = (each.get(("robot1", "position_rmse_m")) for each in errors)
+    assert near is not None
+    assert none != near

@@ -37,7 +37,14 @@ def distinct_names(results: Sequence[Result], folders: Sequence[Path]) -> list[s
 def _name(result: Result, alike: Sequence[Result]) -> str:
     settings = [dict(_flat(each.settings)) for each in alike]
     own = dict(_flat(result.settings))
-    keys = dict.fromkeys(key for each in settings for key in each if key != ("title",))
+    # what an estimator is given stands among the parameters that it has as well
+    given = {key[1:] for each in settings for key in each if key[0] == "estimators"}
+    keys = dict.fromkeys(
+        key
+        for each in settings
+        for key in each
+        if key != ("title",) and not (key[0] == "parameters" and key[1:] in given)
+    )
     differing = [key for key in keys if any(each.get(key) != own.get(key) for each in settings)]
     lasts = [key[-1] for key in differing]
     differences = [
@@ -51,9 +58,9 @@ def _name(result: Result, alike: Sequence[Result]) -> str:
 def _flat(
     values: Mapping[str, Any], path: tuple[str, ...] = ()
 ) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """All settings by the names that lead to them."""
+    """Yield all settings by the names that lead to them."""
     for name, value in values.items():
-        if isinstance(value, Mapping) and value:
+        if isinstance(value, Mapping):
             yield from _flat(value, (*path, name))
         else:
             yield (*path, name), value
