@@ -16,6 +16,7 @@ from pipeline.output.claims import Claim
 from pipeline.output.report import _named, kinds, sheet, sweeps
 from pipeline.output.report.evidence import findings
 from pipeline.output.report.kinds import how_many_differ, opening
+from pipeline.output.report.naming import title_of
 from pipeline.output.report.sheet import table_of_pairs
 from pipeline.output.report.story import Story, story
 from pipeline.output.results import Measured, MetricTable, Result
@@ -444,7 +445,7 @@ def test_a_sweep_says_whom_to_take_at_which_point_with_an_interval_over_runs() -
     assert found
     low, high = map(float, found.groups())
     assert low < float(ekf.value) < high < low + 4.0
-    assert re.fullmatch(r"As good, but for chance or 2 %: 0\.[12] m\.", ekf.notes[1])
+    assert re.fullmatch(r"0\.[12] m is as good, within chance or 2 %\.", ekf.notes[1])
     [doubt] = begun.story.doubts
     assert re.fullmatch(r"which point is best for ekf, as 0\.[12] m may be as good", doubt)
 
@@ -457,6 +458,18 @@ def test_a_sweep_takes_no_point_at_which_the_estimator_is_overconfident() -> Non
         "ekf at 0.05 m, where it is overconfident",
         "whether ekf errs less beyond 0.4 m, where the range ends",
     ]
+
+
+def test_a_sweep_of_estimators_that_are_all_too_sure_says_where_none_is_believed() -> None:
+    """As they are set is what the sweep changes; and its title says that it is one."""
+    result, tables = _swept([0.3, 0.9, 0.8, 0.5])
+    table = tables["sweep"]
+    table.loc[table["quantity"] == "nees", "value"] = 27.0
+    verdict = opening(result, tables).story.verdict
+    assert verdict[0] == "Where each errs least, none of them can be believed."
+    assert title_of(result, ["ekf", "ukf"], 20) == "x, swept"
+    of_logs = result.model_copy(update={"settings": {**result.settings, "logs": {"files": []}}})
+    assert title_of(of_logs, ["ekf", "ukf"], 20) == "x: ekf and ukf, swept"
 
 
 def test_where_the_scenario_is_swept_no_point_is_advised() -> None:

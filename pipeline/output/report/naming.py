@@ -73,7 +73,7 @@ def title_of(result: Result, labels: Sequence[str], runs: int) -> str:
     if "sides" in settings:
         return f"{listed(list(labels))}, compared"
     if isinstance(settings.get("logs"), Mapping):
-        return f"{title}: {listed(list(labels)) or count(runs, 'run')}"
+        title = f"{title}: {listed(list(labels)) or count(runs, 'run')}"
     return f"{title}, swept" if "sweep" in settings else title
 
 

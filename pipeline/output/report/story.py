@@ -29,6 +29,7 @@ CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
 
 Look = Literal["broken", "careful", "best", "fair", "claims"]
+NONE_SOUND = "Believe none of them as they are set."
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def _verdict(
             f" The least error has {least.estimator}, {_value(least.error, own)}." if least.error else ""
         )
         return [
-            "Believe none of them as they are set.",
+            NONE_SOUND,
             *named,
             *([least_is.strip()] if least_is else []),
         ]

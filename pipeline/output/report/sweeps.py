@@ -13,7 +13,7 @@ from typing import Any
 import pandas as pd
 
 from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, relation, runs_of
-from pipeline.output.report.story import Card, Story, story
+from pipeline.output.report.story import NONE_SOUND, Card, Story, story
 from pipeline.output.results import Result
 from pipeline.output.words import count, is_error, listed, quantity, scale, stated
 from recorders.parameters import unit_of
@@ -208,6 +208,8 @@ def _with_points(
         else:
             cards.append(replace(card, notes=["Its errors are the same at all points.", *card.notes]))
     first, *further = base.verdict or [""]
+    if first == NONE_SOUND:  # as they are set is what the sweep changes
+        first = "Where each errs least, none of them can be believed."
     verdict = [*filter(None, [first]), *sentences, *further]
     at_best = ", each where it errs least" if len(base.cards) > 1 else ", where it errs least"
     others = [f"{each}{at_best if each.startswith('the covariances') else ''}" for each in base.doubts]
@@ -229,7 +231,8 @@ def _at_its_best(sweep: Sweep, card: Card, own: "pd.Series[float]", best: int, a
     ends = f"{unit.text(float(own.min()))} to {unit.with_unit(float(own.max()))}"
     notes = [f"With {sweep.where(best)}; from {ends} over all points."]
     if alike:
-        notes.append(f"As good, but for chance or 2 %: {_named(sweep, alike)}.")
+        are = "is" if len(alike) == 1 else "are"
+        notes.append(f"{_named(sweep, alike)} {are} as good, within chance or 2 %.")
     there = f"{card.consistency} there" if card.consistency else ""
     return replace(card, consistency=there, notes=[*notes, *card.notes])
 
