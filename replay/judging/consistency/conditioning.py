@@ -6,6 +6,8 @@ below 1e-12 has four of a double's sixteen digits left (Higham, Accuracy and Sta
 Algorithms, 2nd edition, theorem 10.7).
 """
 
+import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +28,7 @@ class Conditioning(NamedTuple):
         lost: in how many a pivot has lost its digits.
         failed: how many are not positive definite, beyond rounding.
         least: the least pivot.
-        run: that of which run, by its number in the ensemble.
+        run: where that has lost its digits: of which run, by its number in the ensemble.
         elapsed_s: and when, since the run's epoch.
     """
 
@@ -58,20 +60,27 @@ def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int =
     count = len(rows)
     if not count:
         return Conditioning()
-    most = min(count, max(FEWEST, min(count // EACH, MOST)))
-    at = np.arange(most) * (count - 1) // max(1, most - 1)
+    at = _sampled(count)
     flat = rows["covariance"][at]
     size = round(flat.shape[1] ** 0.5)
     if size < 2 or size * size != flat.shape[1]:
         return Conditioning()
     least = least_pivots(flat.reshape(-1, size, size))
     worst = int(least.argmin())
+    smallest = float(least[worst])
+    if smallest >= LOST:
+        return Conditioning(len(at), least=smallest)
     run = int(rows.offsets.searchsorted(at[worst], side="right")) - 1
     elapsed_s = (int(rows.stream.publish_time_ns[at[worst]]) - int(epochs_ns[run])) * 1e-9
-    smallest, lost, failed = float(least[worst]), 0, 0
-    if smallest < LOST:
-        lost, failed = (int(np.count_nonzero(least < limit)) for limit in (LOST, -LOST))
-    return Conditioning(most, lost, failed, smallest, first_run + run, elapsed_s)
+    lost, failed = (int(np.count_nonzero(least < limit)) for limit in (LOST, -LOST))
+    return Conditioning(len(at), lost, failed, smallest, first_run + run, elapsed_s)
+
+
+@lru_cache(maxsize=64)
+def _sampled(count: int) -> NDArray[np.int64]:
+    """The rows that are looked at, of so many."""
+    most = min(count, max(FEWEST, min(count // EACH, MOST)))
+    return np.arange(most) * (count - 1) // max(1, most - 1)
 
 
 def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -83,11 +92,11 @@ def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
     variances = np.einsum("rii->ri", covariances)
     try:  # as nearly always all are positive
         factors = np.einsum("rii->ri", np.linalg.cholesky(covariances))
-        least = np.asarray((factors * factors / variances).min(axis=1, initial=1.0), np.float64)
+        least = np.asarray((factors * factors / variances).min(axis=1), np.float64)
+        if not math.isnan(least.min(initial=1.0)):
+            return least
     except np.linalg.LinAlgError:  # which one is not remains to be found
-        least = np.full(1, np.nan)
-    if np.isfinite(least).all():
-        return least
+        pass
     is_in = np.isfinite(variances) & (variances != 0.0)
     scale = np.where(is_in, 1.0 / np.sqrt(np.where(is_in, np.abs(variances), 1.0)), 0.0)
     known = np.nan_to_num(covariances, posinf=0.0, neginf=0.0)
