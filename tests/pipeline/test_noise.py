@@ -18,7 +18,8 @@ from pipeline.sensing import study
 from pipeline.sensing.allan import allan_deviation, degrees_of_freedom
 from pipeline.sensing.fitting import choose, fit, profile_interval, walk_below
 from pipeline.sensing.likelihood import Samples, likelihood
-from pipeline.sensing.preparing import find_drift, find_vibration, samples_of, white_block
+from pipeline.sensing.noise import _drifts
+from pipeline.sensing.preparing import Drift, find_drift, find_vibration, samples_of, white_block
 from pipeline.sensing.terms import Terms
 from pipeline.sensing.units import UNITS, parse_sheet
 from tests.claims.pages import stored
@@ -305,3 +306,12 @@ def test_of_a_hundred_intervals_ninety_to_ninety_nine_hold_the_truth(name: str) 
     covered = {key: each for key, each in stored()[name].metrics.items() if ".covered." in key}
     assert len(covered) == {"sensor-noise": 10, "calibration": 14, "ellipsoid": 36}[name]
     assert {key: each for key, each in covered.items() if not 90 <= each <= 99} == {}
+
+
+def test_a_drift_is_said_with_what_decays_if_something_does() -> None:
+    drift = Drift(2e-6, 1e-7, 0.0, 1.0, 40.0)
+    taken = "taken out of all numbers (log-likelihood +40)"
+    assert _drifts(drift, "rad/s") == f"drifts by 2e-06 rad/s/s; {taken}"
+    warm = drift._replace(offset=0.01, time_s=30.0)
+    decays = "warms up: 0.01 rad/s that decays in 30 s, and 2e-06 rad/s/s"
+    assert _drifts(warm, "rad/s") == f"{decays}; {taken}"

@@ -610,3 +610,9 @@ def test_errors_over_longer_gaps_of_the_truth_do_not_count() -> None:
     near, none = (each.get(("robot1", "position_rmse_m")) for each in errors)
     assert near is not None
     assert none != near
+
+
+def test_of_which_changes_a_half_is_defined() -> None:
+    """Of the order of messages, an ulp, a lost message and one more prediction there is none."""
+    scaled = {name for name, change in CHANGES.items() if change.is_scaled}
+    assert CHANGES.keys() - scaled == {"order", "ulp", DROPPED, "zero duration"}
