@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from pipeline.output.alarms import Alarm, Cause, Stressing
-from pipeline.output.report.choosing import MOST_CARDS, broken_of, choice_of, in_order, of_the_tied
+from pipeline.output.report import choosing
 from pipeline.output.report.doubts import doubts_of
 from pipeline.output.report.evidence import (
     MARGIN,
@@ -29,7 +29,6 @@ CHEAPER = 0.9  # a time that is less than this of another's is worth a word,
 TIMED_S = 0.02  # if it was measured for so long
 
 Look = Literal["broken", "careful", "best", "fair", "claims"]
-NONE_SOUND = "Believe none of them as they are set."
 
 
 @dataclass(frozen=True)
@@ -86,19 +85,19 @@ def story(
     Causes, what each cost, and alarms are told where they are known.
     """
     known = [each for each in found.of.values() if each.error is not None]
-    broken = broken_of(found)
+    broken = choosing.broken_of(found)
     own = scale(quantity(found.main).unit, *(each.error.value for each in known if each.error))
-    take, equal = choice_of(found)
-    ordered = in_order(found, broken, take, equal)
+    take, equal = choosing.choice_of(found)
+    ordered = choosing.in_order(found, broken, take, equal)
     by_label = {each.estimator: each for each in causes}
     cards = [
         _card(found, found.of[label], take, equal, own, by_label.get(label), timings or {})
-        for label in ordered[:MOST_CARDS]
+        for label in ordered[: choosing.MOST_CARDS]
     ]
-    draws, differences = _pairs(found, take, ordered[:MOST_CARDS], own)
+    draws, differences = _pairs(found, take, ordered[: choosing.MOST_CARDS], own)
     verdict = _verdict(found, broken, take, equal, own, by_label, timings or {})
     doubts = doubts_of(found, alarms, take, equal)
-    return Story(verdict, cards, draws, differences, ordered[MOST_CARDS:], doubts)
+    return Story(verdict, cards, draws, differences, ordered[choosing.MOST_CARDS :], doubts)
 
 
 def _verdict(
@@ -125,7 +124,7 @@ def _verdict(
             f" The least error has {least.estimator}, {_value(least.error, own)}." if least.error else ""
         )
         return [
-            NONE_SOUND,
+            choosing.NONE_SOUND,
             *named,
             *([least_is.strip()] if least_is else []),
         ]
@@ -162,8 +161,8 @@ def _advice(
     of_cases = f" ({how} of {cases} cases)" if cases > 1 else ""
     if equal:
         tied = [take, *equal]
-        both = listed(tied) if len(tied) <= MOST_CARDS else f"{take} and {len(equal)} others"
-        whom, left = of_the_tied(found, tied)
+        both = listed(tied) if len(tied) <= choosing.MOST_CARDS else f"{take} and {len(equal)} others"
+        whom, left = choosing.of_the_tied(found, tied)
         if all(relation(found, take, each) == "draw" for each in equal):
             return f"{both} tie in {main}: {whom}{_cheapest(left, timings)}."
         if any(relation(found, take, each) == "withheld" for each in equal):
@@ -285,7 +284,7 @@ def _chip(found: Findings, each: Evidence, take: str, equal: list[str]) -> tuple
         return ("broken", "✕", "Overconfident") if is_far else ("careful", "✕", "Slightly overconfident")
     if each.estimator in (take, *equal) and len(found.labels) > 1:
         others = [label for label in (take, *equal) if label != each.estimator]
-        as_who = listed(others) if len(others) < MOST_CARDS else f"{len(others)} others"
+        as_who = listed(others) if len(others) < choosing.MOST_CARDS else f"{len(others)} others"
         if others and state == "too careful":
             return "careful", "○", f"As accurate as {as_who}, but too careful"
         return "best", "✓", f"As good as {as_who}" if others else "Take this one"

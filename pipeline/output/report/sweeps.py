@@ -12,8 +12,9 @@ from typing import Any
 
 import pandas as pd
 
+from pipeline.output.report.choosing import NONE_SOUND
 from pipeline.output.report.evidence import Consistency, Findings, Spread, findings, relation, runs_of
-from pipeline.output.report.story import NONE_SOUND, Card, Story, story
+from pipeline.output.report.story import Card, Story, story
 from pipeline.output.results import Result
 from pipeline.output.words import count, is_error, listed, quantity, scale, stated
 from recorders.parameters import unit_of
