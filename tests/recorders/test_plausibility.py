@@ -159,9 +159,12 @@ def test_quaternions_in_another_order_are_told_by_turn_rates() -> None:
         streams["/inertial"], columns={**streams["/inertial"].columns, "turn_rate_radps": rate}
     )
     stamps_ns = np.rint(1e9 * step_s * np.arange(n)).astype(np.int64)
+    opposite = np.array([1.0, -1.0, -1.0, -1.0])
     for order, factor, told in (
         ([0, 1, 2, 3], 1.0, []),
         ([1, 2, 3, 0], 1.0, ["are x, y, z, w,"]),
+        ([0, 1, 2, 3], opposite, ["are w, x, y, z of the opposite rotation,"]),
+        ([1, 2, 3, 0], opposite[[1, 2, 3, 0]], ["are x, y, z, w of the opposite rotation,"]),
         ([0, 1, 2, 3], 1.01, ["no unit ones"]),
     ):
         streams["/orientation"] = make_stream(
