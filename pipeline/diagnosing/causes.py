@@ -83,7 +83,7 @@ class Cause(NamedTuple):
         first, second = self.of_halves
         half, worst = ("first", first) if first < second else ("second", second)
         but = f"; but over the {half} half of the log it loses {number(-worst, 4)}: there it is not so"
-        gained = f"; without this the log-likelihood gains {number(self.gain, 4)}"
+        gained = f"; with this undone the log-likelihood gains {number(self.gain, 4)}"
         return f"{self.statement}{or_else}{gained}{but if worst < -DROP_95 else ''}"
 
 
