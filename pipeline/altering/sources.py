@@ -51,7 +51,7 @@ def alter(source: LogSource | MemorySource, settings: Settings) -> LogSource | M
     else:
         of_log = source.alterations if isinstance(source, AlteredLog) else {}
         made = AlteredLog(source.log, source.start_ns, source.end_ns, {**of_log, **settings})
-    for topic, (lost, count) in _before_1970(made).items():
+    for topic, (lost, count) in made.left_out.items():
         if lost == count:
             raise BadInput(
                 f"{source.name}: all {count} messages of {topic} would be before 1970; set a smaller "
@@ -70,7 +70,7 @@ def alter_all(
     made = [alter(source, settings) for source in sources]
     for source in made:
         if settings and isinstance(source, AlteredLog | AlteredRecording):
-            for topic, (lost, count) in _before_1970(source).items():
+            for topic, (lost, count) in source.left_out.items():
                 logging.getLogger("fuselog").warning(
                     f"{source.name}: {lost} of {count} messages of {topic} would be before 1970 and "
                     "are left out"
@@ -78,11 +78,12 @@ def alter_all(
     return made
 
 
-def _before_1970(source: "AlteredLog | AlteredRecording") -> dict[str, tuple[int, int]]:
-    """How many messages of which topics would be before 1970, and of how many."""
+def _before_1970(
+    stored: LogSource | MemorySource, changes: Mapping[str, Change]
+) -> dict[str, tuple[int, int]]:
+    """How many messages of which topics changes put before 1970, and of how many."""
     found = {}
-    stored = LogSource(source.log) if isinstance(source, AlteredLog) else source.before
-    for topic, change in source.changes.items():
+    for topic, change in changes.items():
         if change.is_moving and change.moved(np.array(stored.extent("publish_time")))[0] < 0:
             stamps_ns = stored.read([change.stored])[change.stored].publish_time_ns
             lost = int(np.count_nonzero(change.moved(stamps_ns) < 0))
@@ -139,6 +140,11 @@ class AlteredRecording(MemorySource):
     alterations: Settings = field(kw_only=True)
     changes: Mapping[str, Change] = field(kw_only=True)
 
+    @cached_property
+    def left_out(self) -> dict[str, tuple[int, int]]:
+        """How many messages of which topics would be before 1970, and of how many."""
+        return _before_1970(self.before, self.changes)
+
 
 def _altered(source: MemorySource, settings: Settings) -> AlteredRecording:
     changes = in_one_plane(source.name, source.topics, changes_of(source, settings))
@@ -169,6 +175,11 @@ class AlteredLog(LogSource):
         """Return what is done to topics."""
         changes = changes_of(LogSource(self.log), self.alterations)
         return in_one_plane(self.name, self.log.topics, changes)
+
+    @cached_property
+    def left_out(self) -> dict[str, tuple[int, int]]:
+        """How many messages of which topics would be before 1970, and of how many."""
+        return _before_1970(LogSource(self.log), self.changes)
 
     @cached_property
     def topics(self) -> Mapping[str, Topic]:

@@ -63,13 +63,12 @@ class _Guard:
                         alone = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
                     self._process = start_module(__name__, stdout=subprocess.DEVNULL, **alone)
                     self._of = os.getpid()
-                    atexit.register(self._end)
                 assert self._process.stdin is not None
                 with suppress(OSError):
                     self._process.stdin.write(line.encode())
                     self._process.stdin.flush()
 
-    def _end(self) -> None:
+    def end(self) -> None:
         """End the guard where we end as usual: what it was told of has ended."""
         with self._lock:
             if self._process is not None and self._of == os.getpid():
@@ -79,6 +78,7 @@ class _Guard:
 
 
 GUARD = _Guard()
+atexit.register(GUARD.end)
 
 
 def main() -> None:

@@ -327,7 +327,9 @@ class Initializer:
         streams = {name: first[name] for name in names}
         block = Block(streams, merge_events(streams, clock))
         events, _ = filter_events(stage, found, block, Context({}, origins), settings)
-        events, _ = compensate_delays(stage, events, delays_of(stage, settings), is_end=True)
+        delays_ns = delays_of(stage, settings)
+        if delays_ns.any():
+            events, _ = compensate_delays(stage, events, delays_ns, is_end=True)
         is_aligned = np.zeros(len(begun.time_ns), bool)
         for run in range(len(is_aligned)):
             solved = self._align(events, run, stage, settings)
