@@ -5,6 +5,12 @@ from numpy.typing import NDArray
 
 
 def flatten(array: NDArray, batch: tuple[int, ...], *core: int) -> NDArray[np.float64]:
-    """`array` (..., *core) broadcast to the batch axes and laid out as (n, *core), contiguous."""
+    """Lay an array out as (n, *core), contiguous, broadcast to its batch axes.
+
+    Args:
+        array: (..., *core).
+        batch: the axes (...) that it gets; n is their product.
+        core: the sizes of its last axes.
+    """
     flat = np.broadcast_to(array, (*batch, *core)).reshape(-1, *core)
     return np.ascontiguousarray(flat, dtype=np.float64)

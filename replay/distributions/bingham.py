@@ -86,12 +86,12 @@ def from_parameter_matrix(matrix: ArrayLike) -> Bingham:
 
 
 def parameter_matrix(bingham: Bingham) -> NDArray[np.float64]:
-    """M Z M^T (..., d, d)."""
+    """Return M Z M^T (..., d, d)."""
     return _spectral(bingham.axes, bingham.concentrations)
 
 
 def log_normaliser(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """The logarithm of F (...), concentrations (..., d) of any offset: (5); (6), (14) misprint d / 2."""
+    """Compute ln F (...) for concentrations (..., d) of any offset: (5); (6), (14) misprint d / 2."""
     z = np.asarray(concentrations, float)
     top = z.max(axis=-1)
     integrand, _ = _on_contour(z - top[..., None])
@@ -99,14 +99,14 @@ def log_normaliser(concentrations: ArrayLike) -> NDArray[np.float64]:
 
 
 def square_moments(concentrations: ArrayLike) -> NDArray[np.float64]:
-    """E(x_i^2) = dF/dz_i / F along the principal axes (..., d); they sum to 1."""
+    """Compute E(x_i^2) = dF/dz_i / F along the principal axes (..., d); they sum to 1."""
     z = np.asarray(concentrations, float)
     integrand, factors = _on_contour(z - z.max(axis=-1, keepdims=True))
     return 0.5 * _sum(integrand[..., None, :] * factors) / _sum(integrand)[..., None]
 
 
 def covariance(bingham: Bingham) -> NDArray[np.float64]:
-    """E(x x^T), (..., d, d), (16); with the density even, the mean is 0."""
+    """Compute E(x x^T), (..., d, d), by (16); with the density even, the mean is 0."""
     return _spectral(bingham.axes, square_moments(bingham.concentrations))
 
 
@@ -123,7 +123,7 @@ def log_density(bingham: Bingham, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def fit(second_moment: ArrayLike) -> Bingham:
-    """The distributions with E(x x^T) = `second_moment` (..., d, d): the most likely ones, (13)-(14).
+    """Fit the distributions with E(x x^T) = `second_moment` (..., d, d): the most likely, (13)-(14).
 
     Raises BadInput where a matrix has not trace 1 or is not positive definite: its concentration would
     diverge.
@@ -190,16 +190,17 @@ def compose(first: Bingham, second: Bingham) -> Bingham:
 
 
 def sample(bingham: Bingham, count: int, generator: np.random.Generator) -> NDArray[np.float64]:
-    """`count` exact samples (..., count, d) of every distribution."""
+    """Draw `count` exact samples (..., count, d) of every distribution."""
     axes, z = bingham
     wide = (*z.shape[:-1], count, z.shape[-1])
     return sample_bingham(axes[..., None, :, :], np.broadcast_to(z[..., None, :], wide), generator)
 
 
 def hemisphere_covariance(bingham: Bingham) -> NDArray[np.float64]:
-    """E((x - m)(x - m)^T), (..., d, d), over the half sphere about the mode m: a Gaussian for one mode.
+    """Compute E((x - m)(x - m)^T), (..., d, d), over the half sphere about the mode m: for one mode.
 
-    (57), which lacks a factor 2. E|x_d| is exact too: it takes one more factor (s - z_d)^(-1/2).
+    It is the covariance of a Gaussian there: (57), which lacks a factor 2. E|x_d| is exact too: it takes
+    one more factor (s - z_d)^(-1/2).
     """
     integrand, factors = _on_contour(bingham.concentrations)
     absolute = _sum(integrand * np.sqrt(factors[..., -1, :])) / (np.sqrt(np.pi) * _sum(integrand))
@@ -233,7 +234,7 @@ def fit_projected_gaussian(mean: ArrayLike, gaussian_covariance: ArrayLike) -> B
 
 
 def _on_contour(z: NDArray) -> tuple[NDArray, NDArray]:
-    """The integrand (..., nodes) of F / (2 pi^(d/2)), and 1 / (s - z_k) (..., d, nodes); see kernels."""
+    """Return the integrand (..., nodes) of F / (2 pi^(d/2)), and 1 / (s - z_k) (..., d, nodes)."""
     factors = 1.0 / (kernels.CONTOUR - z[..., None])
     return kernels.WEIGHTS * np.sqrt(factors).prod(-2), factors
 
@@ -247,7 +248,7 @@ def _spectral(axes: NDArray, values: NDArray) -> NDArray[np.float64]:
 
 
 def _symmetric(matrix: ArrayLike, what: str) -> NDArray[np.float64]:
-    """`matrix` made exactly symmetric; BadInput where it is not finite, square or nearly symmetric."""
+    """Make `matrix` exactly symmetric; BadInput where it is not finite, square or nearly symmetric."""
     matrix = np.asarray(matrix, float)
     if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2] or matrix.shape[-1] not in (2, 4):
         raise BadInput(f"{what} has shape {matrix.shape}; give (..., d, d) with d = 2 or 4")

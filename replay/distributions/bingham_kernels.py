@@ -53,7 +53,7 @@ def times(x: Complex, y: Complex) -> Complex:
 
 
 def reciprocal(x: Complex) -> Complex:
-    """1 / x, scaled by its larger part, as C divides."""
+    """Compute 1 / x, scaled by its larger part, as C divides."""
     if abs(x[0]) >= abs(x[1]):
         ratio = x[1] / x[0]
         size = x[0] + x[1] * ratio
@@ -111,11 +111,15 @@ def integrate(z: NDArray, mean: NDArray, covariance: NDArray) -> float:
 
 
 def fit_concentrations(target: NDArray, z: NDArray) -> bool:
-    """Concentrations (d,) under which E(x_i^2) is `target`, ascending, sum 1: Newton's method on (14).
+    """Find the concentrations under which E(x_i^2) is `target`: Newton's method on (14).
 
     The start is the fit of the first-order saddlepoint approximation. The residuals are weighted by
     E(x_i^2) / target_i, which makes them nearly linear in z where z is large, so that five steps do
     from 0 to beyond -1e6. Pairs are never sorted: z[i] stays with target[i].
+
+    Args:
+        target: moments (d,), ascending, of sum 1.
+        z: concentrations (d,), overwritten; the last is 0.
 
     Returns:
         Whether it converged; False for a target that is not positive, as a moment that diverges.
@@ -144,9 +148,13 @@ def fit_concentrations(target: NDArray, z: NDArray) -> bool:
 
 
 def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
-    """Eigenvalues, ascending, and eigenvectors (columns) of a symmetric (d, d), which is destroyed.
+    """Find eigenvalues, ascending, and eigenvectors of a symmetric matrix.
 
     Cyclic Jacobi rotations: for d <= 4 faster than LAPACK, and small eigenvalues keep their digits.
+
+    Args:
+        matrix: (d, d), destroyed.
+        values, vectors: (d,) and, in columns, (d, d); both overwritten.
     """
     d = len(values)
     for i in range(d):
@@ -191,7 +199,11 @@ def eigen_ascending(matrix: NDArray, values: NDArray, vectors: NDArray) -> None:
 
 
 def compose(left: Vector, right: Vector, out: NDArray) -> None:
-    """Write left (+) right to `out`, all (d,); `out` is neither of the others."""
+    """Write left (+) right to `out`.
+
+    Args:
+        left, right, out: complex numbers or quaternions (d,); `out` is neither of the others.
+    """
     for i in range(len(out)):
         out[i] = 0.0
         for j in range(len(out)):
@@ -199,27 +211,47 @@ def compose(left: Vector, right: Vector, out: NDArray) -> None:
 
 
 def compose_columns(left: Vector, columns: NDArray, out: NDArray) -> None:
-    """Write left (+) columns[:, k] to out[:, k]."""
+    """Write left (+) columns[:, k] to out[:, k].
+
+    Args:
+        left: (d,).
+        columns, out: (d, k), not the same.
+    """
     for k in range(out.shape[1]):
         compose(left, columns[:, k], out[:, k])
 
 
 def turn_columns(columns: NDArray, increment: NDArray) -> None:
-    """Make columns[:, k] (+) increment of the columns, in place: axes after a known increment (d,)."""
+    """Make columns[:, k] (+) increment of the columns, in place.
+
+    Args:
+        columns: (d, k), such as principal axes.
+        increment: a known turn, a unit vector (d,).
+    """
     before = columns.copy()
     for k in range(columns.shape[1]):
         compose(before[:, k], increment, columns[:, k])
 
 
 def framed(matrix: NDArray, frame: Vector, out: NDArray) -> None:
-    """Fill L matrix L^T, L y = frame (+) y: a moment or parameter matrix in another frame (d,)."""
+    """Fill L matrix L^T, L y = frame (+) y: a moment or parameter matrix in another frame.
+
+    Args:
+        matrix, out: (d, d), not the same.
+        frame: a unit vector (d,).
+    """
     half = np.empty(out.shape)
     compose_columns(frame, matrix, half)
     compose_columns(frame, half.T, out)
 
 
 def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
-    """Write columns diag(weights) columns^T to `out`."""
+    """Write columns diag(weights) columns^T to `out`.
+
+    Args:
+        columns, out: (d, d), not the same.
+        weights: (d,).
+    """
     d = len(weights)
     for i in range(d):
         for j in range(i + 1):
@@ -230,9 +262,12 @@ def weighted_outer(columns: NDArray, weights: NDArray, out: NDArray) -> None:
 
 
 def compose_covariances(left: NDArray, right: NDArray, out: NDArray) -> None:
-    """Write the second moment of x (+) y to `out`, from those of independent x and y: lemmas 2 and 4.
+    """Write the second moment of x (+) y to `out`, for independent x and y: lemmas 2 and 4.
 
     Lemma 2 stands as printed; its proof, (111)-(115), has wrong signs.
+
+    Args:
+        left, right, out: E(x x^T), E(y y^T) and that of x (+) y, (d, d); `out` is neither of the others.
     """
     d = len(out)
     for i in range(d):
@@ -269,15 +304,23 @@ def predict(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> bool:
 
 
 def inverse(x: NDArray, out: NDArray) -> None:
-    """Fill the inverse of a unit complex number or quaternion (d,)."""
+    """Fill the inverse of a unit complex number or quaternion.
+
+    Args:
+        x, out: (d,).
+    """
     for i in range(len(x)):
         out[i] = x[i] if i == 0 else -x[i]
 
 
 def local_moments(axes: NDArray, z: NDArray, moments: NDArray, out: NDArray) -> None:
-    """Fill E(x_i^2) along the axes (d,), and the second moment (d, d) in the frame of the mode.
+    """Fill the moments along the axes, and the second moment in the frame of the mode.
 
     There small moments keep their digits next to large ones.
+
+    Args:
+        axes, z: as for `predict`.
+        moments, out: E(x_i^2), (d,), and the second moment (d, d); both overwritten.
     """
     d = len(z)
     local, back = np.empty((d, d)), np.empty(d)
@@ -321,7 +364,12 @@ def _predict_one(
 
 
 def predict_each(axes: NDArray, z: NDArray, noise_covariance: NDArray) -> NDArray:
-    """`predict` for every distribution (n, ...) and its noise; returns which converged."""
+    """Apply `predict` to every distribution and its noise; return which (n,) converged.
+
+    Args:
+        axes, z: (n, d, d) and (n, d), changed in place.
+        noise_covariance: (n, d, d).
+    """
     converged = np.empty(len(z), np.bool_)
     _over_all(_predict_one)(len(z), axes, z, noise_covariance, converged)
     return converged
@@ -334,7 +382,12 @@ def _fit_one(n: int, covariance: NDArray, axes: NDArray, z: NDArray, converged: 
 
 
 def fit_each(covariance: NDArray, axes: NDArray, z: NDArray) -> NDArray:
-    """Fit every covariance (n, d, d), destroying it, into axes and z; returns which converged."""
+    """Fit a distribution to every second moment; return which (n,) converged.
+
+    Args:
+        covariance: second moments (n, d, d), destroyed.
+        axes, z: (n, d, d) and (n, d), overwritten.
+    """
     converged = np.empty(len(z), np.bool_)
     _over_all(_fit_one)(len(z), covariance, axes, z, converged)
     return converged

@@ -6,9 +6,13 @@ from numpy.typing import NDArray
 
 
 def solve_in_place(matrix: NDArray, right: NDArray) -> None:
-    """Right = matrix^-1 right, (n, m), by the Cholesky factor of the leading (n, n) block, overwritten.
+    """Solve matrix x = right by the Cholesky factor of the leading (n, n) block.
 
     A block that is not positive definite gives NaN.
+
+    Args:
+        matrix: n or more rows and columns; its block is overwritten by the factor.
+        right: (n, m), overwritten by the solution.
     """
     n, columns = right.shape
     for i in range(n):
@@ -30,7 +34,7 @@ def solve_in_place(matrix: NDArray, right: NDArray) -> None:
 
 
 def condition(mean: NDArray, covariance: NDArray, innovation: NDArray, noise: NDArray) -> None:
-    """Kalman's update in place for a measurement of the state itself, z = x + v.
+    """Apply Kalman's update in place for a measurement of the state itself, z = x + v.
 
     Args:
         mean: (d,).

@@ -33,7 +33,7 @@ class WrappedMixture(NamedTuple):
     covariance: Floats
 
     def log_density(self, angles: Floats) -> Floats:
-        """At every angle, (n,)."""
+        """Return the logarithm of the density (n,) at every angle."""
         return np.asarray(logsumexp(_log_parts(self, angles)[0], axis=(1, 2)))
 
 
@@ -58,7 +58,7 @@ class VonMisesMixture(NamedTuple):
     interaction: Interaction
 
     def log_density(self, angles: Floats) -> Floats:
-        """At every angle, (n,)."""
+        """Return the logarithm of the density (n,) at every angle."""
         log_norm, _ = _normalisation(self.concentration, self.interaction)
         features = _features(angles, self.mean, self.interaction)[0]
         parts = np.log(self.weights) + (features * self.concentration).sum(axis=2) - log_norm
@@ -109,7 +109,7 @@ def fit_wrapped_mixture(angles: Floats, components: int, iterations: int = 300) 
 
 
 def _log_parts(mixture: WrappedMixture, angles: Floats) -> tuple[Floats, tuple[Floats, Floats]]:
-    """Logarithms of weighted densities (n, k, turns), and both deviations from the means, as many."""
+    """Return logarithms of weighted densities (n, k, turns), and as many deviations from both means."""
     (c11, c12), (_, c22) = np.moveaxis(mixture.covariance, 0, 2)[..., None]
     determinant = c11 * c22 - c12**2
     most = int(_REACH * np.sqrt(max(c11.max(), c22.max())) / (2.0 * np.pi) + 0.5)
@@ -177,7 +177,7 @@ def fit_von_mises_mixture(
 
 
 def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
-    """What concentrations weigh (n, k, 3), and its slopes (n, k, 3, 2) in the deviations."""
+    """Return what concentrations weigh (n, k, 3), and its slopes (n, k, 3, 2) in the deviations."""
     a, b = np.moveaxis(angles[:, None] - mean, -1, 0)
     none = np.zeros_like(a)
     if interaction == "sine":
@@ -190,7 +190,7 @@ def _features(angles: Floats, mean: Floats, interaction: Interaction) -> tuple[F
 
 
 def _normalisation(kappa: Floats, interaction: Interaction) -> tuple[Floats, Floats]:
-    """Logarithms (k,) of the integrals, and their slopes in the concentrations (k, 3).
+    """Return logarithms (k,) of the integrals, and their slopes in the concentrations (k, 3).
 
     Over the second angle the integral is a Bessel function; over the first, a sum over equal steps,
     which for a smooth periodic function is exact to rounding.

@@ -50,7 +50,14 @@ class Samples(NamedTuple):
 
 
 def make_wrapped_normal(mean: ArrayLike, covariance: ArrayLike) -> WrappedNormal:
-    """Make a checked distribution; BadInput where the covariance is not finite, positive definite."""
+    """Make a checked distribution.
+
+    Args:
+        mean: (..., 2), in rad; it is wrapped.
+        covariance: (..., 2, 2), in rad^2.
+
+    Raises BadInput where a number is not finite, or the covariance not symmetric and positive definite.
+    """
     mean, covariance = np.asarray(mean, float), np.asarray(covariance, float)
     if mean.shape[-1:] != (2,) or covariance.shape[-2:] != (2, 2):
         raise BadInput(
@@ -83,20 +90,20 @@ def density(distribution: WrappedNormal, x: ArrayLike) -> NDArray[np.float64]:
 
 
 def circular_moments(distribution: WrappedNormal) -> CircularMoments:
-    """Circular moments in closed form; the mean is the distribution's and the variance its diagonal."""
+    """Return circular moments in closed form: the distribution's mean, and its variances."""
     c = distribution.covariance
     correlation = kernels.circular_correlation(c[..., 0, 0], c[..., 0, 1], c[..., 1, 1])
     return CircularMoments(distribution.mean, np.diagonal(c, axis1=-2, axis2=-1), correlation)
 
 
 def sample_moments(samples: Samples) -> CircularMoments:
-    """Circular moments of weighted samples."""
+    """Compute the circular moments of weighted samples."""
     moments = _of_samples(kernels.circular_moments_each, samples)
     return CircularMoments(moments[..., :2], moments[..., 2:4], moments[..., 4])
 
 
 def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Samples:
-    """Five samples with exactly these circular moments: algorithm 1.
+    """Make five samples with exactly these circular moments: algorithm 1.
 
     Args:
         moments: of any distribution on the torus.
@@ -117,7 +124,7 @@ def five_samples(moments: CircularMoments, central_weight: float = 0.2) -> Sampl
 
 
 def require_central_weight(central_weight: float) -> None:
-    """BadInput where w5 is not in [0, 1/2], where the five samples have real positions for every m_1."""
+    """Raise BadInput where w5 is not in [0, 1/2], where samples have real positions for every m_1."""
     if not 0.0 <= central_weight <= 0.5:
         raise BadInput(f"central weight {central_weight:g}; give 0 to 0.5, such as 0.2, the paper's")
 
@@ -143,7 +150,7 @@ def fit_moments(moments: CircularMoments) -> WrappedNormal:
 
 
 def fit_mixed_mle(samples: Samples) -> WrappedNormal:
-    """The fit of Kurz and Hanebeck, CDC 2015: moments, and the most likely C_12 (over three wraps).
+    """Fit as Kurz and Hanebeck, CDC 2015: moments, and the most likely C_12 (over three wraps).
 
     It is no inverse of `five_samples`: for sigma (.8, 1.3) and a correlation of .5 it returns .461.
     """
@@ -151,7 +158,7 @@ def fit_mixed_mle(samples: Samples) -> WrappedNormal:
 
 
 def product_mixture(first: WrappedNormal, second: WrappedNormal) -> Mixture:
-    """The normalised product of two densities, exactly; single distributions without batch axes."""
+    """Return the normalised product of two densities, exactly; both without batch axes."""
     made = kernels.blank_mixture(np.diagonal(first.covariance + second.covariance))
     count = _product_mixture(*first, *second, made)
     return Mixture(made.mean[:count], made.weights[:count], made.covariance)
@@ -172,14 +179,14 @@ def product(first: WrappedNormal, second: WrappedNormal) -> WrappedNormal:
 def sample(
     distribution: WrappedNormal, count: int, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """`count` samples (..., count, 2) of every distribution, in [-pi, pi)."""
+    """Draw `count` samples (..., count, 2) of every distribution, in [-pi, pi)."""
     root = np.linalg.cholesky(distribution.covariance)
     normal = generator.standard_normal((*distribution.mean.shape[:-1], count, 2))
     return wrap_angle(distribution.mean[..., None, :] + normal @ np.swapaxes(root, -1, -2))
 
 
 def _of_samples(kernel: Callable[[NDArray, NDArray], NDArray], samples: Samples) -> NDArray[np.float64]:
-    """What `kernel` makes of every sample set, (..., 5)."""
+    """Return what `kernel` makes of every sample set, (..., 5)."""
     n = samples.positions.shape[-2]
     batch = np.broadcast_shapes(samples.positions.shape[:-2], samples.weights.shape[:-1])
     fitted = kernel(flatten(samples.positions, batch, n, 2), flatten(samples.weights, batch, n))
@@ -187,7 +194,7 @@ def _of_samples(kernel: Callable[[NDArray, NDArray], NDArray], samples: Samples)
 
 
 def _assemble(parameters: NDArray) -> WrappedNormal:
-    """The distributions with parameters m1, m2, c11, c12, c22 on the last axis."""
+    """Return the distributions with parameters m1, m2, c11, c12, c22 on the last axis."""
     return WrappedNormal(parameters[..., :2], parameters[..., [[2, 3], [3, 4]]])
 
 

@@ -36,7 +36,7 @@ class Mixture(NamedTuple):
 
 
 def circular_correlation(c11: Component, c12: Component, c22: Component) -> Component:
-    """r_c of a wrapped normal: sinh(c12) / sqrt(sinh(c11) sinh(c22)), without overflow.
+    """Compute r_c of a wrapped normal: sinh(c12) / sqrt(sinh(c11) sinh(c22)), without overflow.
 
     The print's definition in section II lacks the square root of the denominator.
     """
@@ -50,7 +50,7 @@ def covariance_of(correlation: Component, c11: Component, c22: Component) -> Com
 
 
 def diracs(c11: Component, c22: Component, correlation: Component, w5: Component) -> Components:
-    """Algorithm 1 about the mean 0: offsets a, b in (0, pi) and weights w1 = w2, w3 = w4.
+    """Return offsets a, b in (0, pi) from the mean, and weights w1 = w2, w3 = w4, of algorithm 1.
 
     cos a = 1 - (1 - m) / (2 w~) where 1 - m = 1 - exp(-c11 / 2); the print misplaces the bracket. It is
     taken by half angles, which keeps all digits of small variances.
@@ -64,7 +64,13 @@ def diracs(c11: Component, c22: Component, correlation: Component, w5: Component
 def five_samples(
     mean: NDArray, covariance: NDArray, central_weight: float, x: NDArray, weights: NDArray
 ) -> None:
-    """Fill positions (5, 2) and weights (5,) of algorithm 1 for a wrapped normal."""
+    """Fill the samples of algorithm 1 for a wrapped normal.
+
+    Args:
+        mean, covariance: (2,), (2, 2).
+        central_weight: w5, 0 to 1/2.
+        x, weights: positions (5, 2) and weights (5,), overwritten; x is not wrapped.
+    """
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     a, b, w1, w3 = diracs(c11, c22, circular_correlation(c11, c12, c22), central_weight)
     for n, (sign1, sign2) in enumerate(DIRAC_SIGNS):
@@ -74,7 +80,7 @@ def five_samples(
 
 
 def circular_moments(x: NDArray, weights: NDArray, spread: NDArray) -> Components:
-    """Circular means, circular variances -2 ln|m|, and r_c of a wrapped Gaussian mixture.
+    """Compute circular means, circular variances -2 ln|m|, and r_c of a wrapped Gaussian mixture.
 
     Args:
         x: means of the components (n, 2), or samples.
@@ -116,10 +122,15 @@ def mixed_mle(
     c22: float,
     deviations: NDArray,
 ) -> float:
-    """The c12 that maximises the weighted likelihood of samples (n, 2), the rest given by moments.
+    """Find the c12 that maximises the weighted likelihood of samples, the rest given by moments.
 
     Kurz and Hanebeck, CDC 2015. The likelihood has several maxima, so that a grid over the whole range
-    comes first. Its wraps are cut at three, as in the source. `deviations` (n, 2) is memory.
+    comes first. Its wraps are cut at three, as in the source.
+
+    Args:
+        x, weights: samples (n, 2), weights (n,).
+        m1, m2, c11, c22: the circular means and variances.
+        deviations: (n, 2), to work in.
     """
     for n in range(len(x)):
         deviations[n, 0] = wrap_angle(x[n, 0] - m1) / math.sqrt(c11)
@@ -150,7 +161,7 @@ def mixed_mle(
 
 
 def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float, float]) -> float:
-    """Of samples (n, 2) in standard deviations, up to a constant; `turns` is 2 pi in these units."""
+    """Sum it over samples (n, 2) in standard deviations, up to a constant; `turns` is 2 pi in these."""
     scale = 0.5 / (1.0 - rho * rho)
     total = 0.5 * math.log(scale)
     for n in range(len(weights)):
@@ -168,9 +179,12 @@ def _log_likelihood(rho: float, x: NDArray, weights: NDArray, turns: tuple[float
 
 
 def fit_samples(x: NDArray, weights: NDArray) -> Components:
-    """Mean and covariance (m1, m2, c11, c12, c22) with the circular moments and r_c of samples (n, 2).
+    """Return (m1, m2, c11, c12, c22) of the wrapped normal with the circular moments and r_c of samples.
 
     Where no positive definite covariance has them, c12 is the mixed maximum-likelihood estimate.
+
+    Args:
+        x, weights: samples (n, 2), weights (n,) with sum 1.
     """
     m1, m2, c11, c22, correlation = circular_moments(x, weights, np.zeros((2, 2)))
     c12 = covariance_of(correlation, c11, c22)
@@ -180,7 +194,7 @@ def fit_samples(x: NDArray, weights: NDArray) -> Components:
 
 
 def blank_mixture(variance: NDArray) -> Mixture:
-    """Memory for the product of densities whose variances (2,) add up to these at most."""
+    """Allocate memory for the product of densities whose variances (2,) add up to these at most."""
     most = (2 * _turns(variance[0]) + 1) * (2 * _turns(variance[1]) + 1)
     return Mixture(np.empty((most, 2)), np.empty(most), np.empty((2, 2)))
 
@@ -188,10 +202,14 @@ def blank_mixture(variance: NDArray) -> Mixture:
 def product_mixture(
     mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray, mixture: Mixture
 ) -> int:
-    """Fill the product of two wrapped normal densities: exactly a wrapped Gaussian mixture.
+    """Fill the product of two wrapped normal densities, exactly a wrapped Gaussian mixture.
 
     It has a component for every number of turns between the two means, with Kalman's update each;
     returns how many.
+
+    Args:
+        mean, covariance, other_mean, other: of both densities, (2,) and (2, 2).
+        mixture: filled; large enough, see `blank_mixture`.
     """
     first, second, inverse = np.empty((2, 2)), np.empty((2, 2)), np.empty((2, 2))
     _limit(covariance, first)
@@ -248,7 +266,7 @@ def _limit(covariance: NDArray, limited: NDArray) -> None:
 
 
 def _turns(variance: float) -> int:
-    """How many turns either way a normal density reaches to the last digit of its wrapped sum."""
+    """Count the turns either way that a normal density reaches to the last digit of its wrapped sum."""
     return int((_REACH * math.sqrt(variance) + math.pi) / TURN) + 1
 
 
@@ -258,7 +276,10 @@ def fit_product(
     """Return the wrapped normal (m1, m2, c11, c12, c22) with the circular moments and r_c of a product.
 
     Where no positive definite covariance has them (modes far apart), the components' correlation stays.
-    `mixture` is memory, see `blank_mixture`.
+
+    Args:
+        mean, covariance, other_mean, other: of both densities, (2,) and (2, 2).
+        mixture: to work in, see `blank_mixture`.
     """
     count = product_mixture(mean, covariance, other_mean, other, mixture)
     means, weights, spread = mixture.mean[:count], mixture.weights[:count], mixture.covariance
@@ -270,7 +291,12 @@ def fit_product(
 
 
 def density(x1: float, x2: float, covariance: NDArray) -> float:
-    """The density at a deviation (rad) from the mean: the wrapped sum, or Fourier's where shorter."""
+    """Compute the density at a deviation from the mean: the wrapped sum, or Fourier's where shorter.
+
+    Args:
+        x1, x2: the deviation, in rad.
+        covariance: (2, 2).
+    """
     c11, c12, c22 = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     least = 0.5 * (c11 + c22) - math.hypot(0.5 * (c11 - c22), c12)
     total = 0.0
@@ -303,7 +329,11 @@ def _density_one(n: int, deviation: NDArray, covariance: NDArray, out: NDArray) 
 
 
 def density_each(deviation: NDArray, covariance: NDArray) -> NDArray:
-    """`density` (n,) at every deviation (n, 2) under its covariance (n, 2, 2)."""
+    """Compute `density` (n,) at every deviation.
+
+    Args:
+        deviation, covariance: (n, 2), (n, 2, 2).
+    """
     out = np.empty(len(deviation))
     _over_all(_density_one)(len(out), deviation, covariance, out)
     return out
@@ -315,7 +345,11 @@ def _circular_moments_one(n: int, x: NDArray, weights: NDArray, out: NDArray) ->
 
 
 def circular_moments_each(x: NDArray, weights: NDArray) -> NDArray:
-    """`circular_moments` (n, 5) of sample sets (n, samples, 2) with weights (n, samples)."""
+    """Compute `circular_moments` (n, 5) of sample sets.
+
+    Args:
+        x, weights: samples (n, samples, 2), weights (n, samples).
+    """
     out = np.empty((len(x), 5))
     _over_all(_circular_moments_one)(len(out), x, weights, out)
     return out
@@ -328,7 +362,11 @@ def _mixed_mle_one(n: int, x: NDArray, weights: NDArray, out: NDArray, deviation
 
 
 def fit_mixed_mle_each(x: NDArray, weights: NDArray) -> NDArray:
-    """Moments and `mixed_mle` (n, 5) as m1, m2, c11, c12, c22 of sample sets (n, samples, 2)."""
+    """Return m1, m2, c11, c12, c22 (n, 5) of sample sets, c12 by `mixed_mle`.
+
+    Args:
+        x, weights: samples (n, samples, 2), weights (n, samples).
+    """
     out, memory = np.empty((len(x), 5)), partial(np.empty, x.shape[1:])
     _over_all(_mixed_mle_one)(len(out), x, weights, out, scratch=memory)
     return out
@@ -348,7 +386,11 @@ def _product_one(
 
 
 def fit_product_each(mean: NDArray, covariance: NDArray, other_mean: NDArray, other: NDArray) -> NDArray:
-    """`fit_product` (n, 5) of pairs (n, ...)."""
+    """Compute `fit_product` (n, 5) of pairs of densities.
+
+    Args:
+        mean, covariance, other_mean, other: (n, 2) and (n, 2, 2) of both.
+    """
     out, variance = np.empty((len(mean), 5)), np.einsum("nkk->nk", covariance + other)
     memory = partial(blank_mixture, variance.max(axis=0, initial=0.0))
     _over_all(_product_one)(len(out), mean, covariance, other_mean, other, out, scratch=memory)
