@@ -71,7 +71,7 @@ def unit(word: np.uint64) -> float:
 
 
 def _ziggurat() -> tuple[Floats, Floats, Floats]:
-    """Right ends (layers + 1,) of layers of one area under exp(-x^2 / 2), heights there, inner shares.
+    """Find layers of one area under exp(-x^2 / 2): right ends (layers + 1,), heights, inner shares.
 
     The lowest layer, number 0, has the tail with it: its end is that of a rectangle of the same area.
     """
@@ -91,10 +91,19 @@ _ENDS, _HEIGHTS, _SHARES = _ziggurat()
 
 
 def fill_normals(numbers: Floats, words: Words, key: Words, counter: int) -> int:
-    """Fill an array, whose size is a multiple of four, with draws of N(0, 1), by way of as many words.
+    """Fill an array with draws of N(0, 1).
 
     The blocks after number `counter` are used, a word for each draw, and after these another block for
-    each of the few draws, one in 67, that a word does not settle. Returns the number of the last one.
+    each of the few draws, one in 67, that a word does not settle.
+
+    Args:
+        numbers: (n,), n a multiple of four, overwritten.
+        words: (n,), to work in.
+        key: (2,), see `run_key`.
+        counter: the number of the last block that was used before.
+
+    Returns:
+        The number of the last block that was used.
     """
     blocks = len(words) // WORDS
     for block in range(blocks):

@@ -205,7 +205,7 @@ def messages_of(
 
 
 def _side_by_side(tables: Sequence[Floats]) -> Floats:
-    """Tables one after another, NaN where one has fewer columns than the widest."""
+    """Lay tables one after another, NaN where one has fewer columns than the widest."""
     width = max(table.shape[1] for table in tables)
     found = np.full((sum(map(len, tables)), width), np.nan)
     for begin, table in zip(np.cumsum([0, *map(len, tables)]), tables, strict=False):

@@ -261,7 +261,7 @@ class Outputs:
     def _checked(
         self, part: str, arrays: Sequence[Any], shapes: Sequence[tuple[int, ...]]
     ) -> tuple[Integers, Floats, Floats]:
-        """Stamps, means and covariances as arrays; raises BadInput where a shape is wrong."""
+        """Return stamps, means and covariances as arrays; raises BadInput where a shape is wrong."""
         time_ns, mean, covariance = (np.asarray(array) for array in arrays)
         names = ("time_ns", "innovation" if part else "mean", "covariance")
         for name, array, shape in zip(names, (time_ns, mean, covariance), shapes, strict=True):
@@ -275,7 +275,7 @@ class Outputs:
 
 
 def _last_of_stamps(messages: Messages, rows: Integers) -> Integers:
-    """Of these rows, in order, the last one of every stamp of a run."""
+    """Return of these rows, in order, the last one of every stamp of a run."""
     time_ns = messages.time_ns[rows]
     is_last = np.ones(len(rows), bool)
     np.not_equal(time_ns[1:], time_ns[:-1], out=is_last[:-1])

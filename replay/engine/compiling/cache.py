@@ -90,7 +90,7 @@ def kept_files() -> Iterator[Path]:
 
 
 def read_own(path: Path) -> bytes | None:
-    """As `read_checked`, and None too where others may have written the file, whatever its folder is."""
+    """Read as `read_checked`; None too where others may have written the file, whatever its folder."""
     try:
         with path.open("rb") as file:
             return _content(file.read()) if is_own(os.fstat(file.fileno())) else None

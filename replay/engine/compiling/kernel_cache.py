@@ -62,7 +62,7 @@ def load(text: str, title: str) -> Callable[..., Any]:
 
 @cache
 def _versions() -> str:
-    """What a kernel is made with: Python, NumPy, numba, and how numba is used."""
+    """Name what a kernel is made with: Python, NumPy, numba, and how numba is used."""
     files = [Path(__file__).with_name(name) for name in ("inlining.py", "through_numba.py")]
     how = sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
     return f"{sys.implementation.cache_tag} numba {numba.__version__} {how} numpy {version('numpy')}"

@@ -15,7 +15,7 @@ _spent = local()
 
 
 def seconds_done_once() -> float:
-    """How long this thread has compiled, loaded kernels and imported until now, where that was told."""
+    """Tell how long this thread has compiled, loaded kernels and imported until now, where told."""
     return getattr(_spent, "seconds", 0.0)
 
 
@@ -47,7 +47,7 @@ def compiling(title: str) -> Iterator[None]:
 
 
 def _say(sentence: str) -> None:
-    """By the program's logging, as the command line sets it up; else on standard error, each once.
+    """Say it by the program's logging, as the command line sets it up; else on standard error, once.
 
     Not from a worker process, whose parent is what somebody watches.
     """

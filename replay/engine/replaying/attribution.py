@@ -109,7 +109,7 @@ def _joined(parts: list[_Messages]) -> _Messages:
 
 
 def _topic_of(there: _Messages, run: Integers, time_ns: Integers) -> Integers | None:
-    """The number (n,) of the topic that each innovation is of; None where that is not known of all."""
+    """Return the number (n,) of the topic that each innovation is of; None where not known of all."""
     stamps, stamp = np.unique(np.concatenate([there.time_ns, time_ns]), return_inverse=True)
     of_run = np.concatenate([there.run, run]) * len(stamps) + stamp
     moments, moment = np.unique(of_run, return_inverse=True)

@@ -61,7 +61,7 @@ class Coverage:
             self._last_block = ()
 
     def estimated_s(self) -> Floats:
-        """For how long (runs,) there were estimates, gaps left out."""
+        """Compute for how long (runs,) there were estimates, gaps left out."""
         self._count()
         is_gap = np.arange(self.BINS)[:, None] > self._longest()
         return np.where(is_gap, 0, self._sums_ns).sum(axis=0) * 1e-9

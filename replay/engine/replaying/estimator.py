@@ -267,7 +267,7 @@ def specified(label: str, settings: Mapping[str, Any]) -> tuple[Estimator[Any], 
 
 @contextmanager
 def code_of(name: str) -> Iterator[None]:
-    """Around calls of an estimator's code: what it raises, and what does not compile, names it."""
+    """Name the estimator in what its code raises, and what does not compile, while this is entered."""
     try:
         with foreign_code(f"estimator {name}"):
             yield

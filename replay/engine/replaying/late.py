@@ -210,7 +210,7 @@ def _arrivals(late: Late, streams: dict[str, Ragged], waiting: Mapping[str, Ragg
 
 
 def _reached(streams: dict[str, Ragged]) -> Integers:
-    """When the last message of every run (runs,) arrived; zero where there is none."""
+    """Return when the last message of every run (runs,) arrived; zero where there is none."""
     reached = []
     for ragged in streams.values():
         last = np.maximum(ragged.offsets[1:], 1) - 1

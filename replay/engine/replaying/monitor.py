@@ -90,7 +90,7 @@ class RunMonitor:
         self._speaks = False
 
     def exclude(self, reasons: Mapping[int, str]) -> None:
-        """These runs cannot start, for a reason each."""
+        """Take out runs that cannot start, for a reason each."""
         self._unable |= reasons
         for run in reasons:
             self._end(run, 0)
@@ -168,7 +168,7 @@ class RunMonitor:
         return list(failures.values())
 
     def coverage(self) -> list[Ragged]:
-        """For each case, how much of every run's span was estimated; none of a run without messages.
+        """Return by case how much of every run's span was estimated; none of a run without messages.
 
         There is none for outputs that are no estimates of a state, such as fused scores.
         """

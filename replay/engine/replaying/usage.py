@@ -201,13 +201,13 @@ class Usage:
 
     @property
     def _is_by_topic(self) -> bool:
-        """Whether it is known of every topic what became of it, or there is nothing to know."""
+        """Tell whether it is known of every topic what became of it, or there is nothing to know."""
         named = all(_topic_in(why, self.measured) for why in self.skipped)
         return not self.measured or (named and (self.shares.is_known or not self.speaks))
 
 
 def _topic_in(why: str, topics: Iterable[str]) -> bool:
-    """Whether a reason is of one of these topics, which such reasons begin with."""
+    """Tell whether a reason is of one of these topics, which such reasons begin with."""
     return any(why.startswith(f"topic {topic}:") for topic in topics)
 
 

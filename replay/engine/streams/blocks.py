@@ -155,7 +155,15 @@ def ragged_rows(chosen: NDArray[np.bool_], offsets: NDArray[np.int64]) -> NDArra
 def filled_rows(
     offsets: NDArray[np.int64], end: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64]]:
-    """Find the filled rows of ragged columns whose run r goes from offsets[r] to end[r], and offsets."""
+    """Find the filled rows of ragged columns.
+
+    Args:
+        offsets: (runs + 1,), where the rows of each run begin.
+        end: (runs,), where its filled ones end.
+
+    Returns:
+        The filled rows (n,), or a slice of all, and the offsets (runs + 1,) that these have end to end.
+    """
     if (end == offsets[1:]).all():
         return slice(None), offsets
     run = np.repeat(np.arange(len(end)), np.diff(offsets))
@@ -255,7 +263,15 @@ def merge_run(
     events: Events,
     heads: NDArray[np.int64],
 ) -> None:
-    """Merge the sorted topics of one run: topic k has the messages bounds[k, run]:bounds[k, run + 1]."""
+    """Merge the sorted topics of one run in time order; equal stamps keep the file's order.
+
+    Args:
+        run: which.
+        bounds: (topics, runs + 1), where the messages of each topic begin in each run, and the last end.
+        times_ns, positions: (n,) of the messages of all topics end to end: stamp, and place in the file.
+        events: of all runs, filled for this one.
+        heads: (topics,), to work in.
+    """
     for k in range(len(heads)):
         heads[k] = bounds[k, run]
     for event in range(events.offsets[run], events.offsets[run + 1]):

@@ -21,7 +21,7 @@ GEODETIC = schemas.GEODETIC_FIX.full_name
 
 
 def stated_origin(topics: Mapping[str, Topic]) -> Floats | None:
-    """Latitude and longitude in deg and altitude in m (3,) that a log's channels state; else None.
+    """Return latitude and longitude in deg and altitude in m (3,) that channels state; else None.
 
     An altitude that is not stated is zero. Raises BadInput where channels state different origins, or
     one states half of one.

@@ -131,7 +131,7 @@ def into_plane_of(stream: Stream, origin: Origin) -> Stream:
 
 
 def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
-    """The fields of messages that are vectors or directions in the axes of the plane."""
+    """Return the fields of messages that are vectors or directions in the axes of the plane."""
     field, covariance = _FIELDS[stream.schema.full_name]
     if not len(stream):  # vectors have no width here
         return {}
@@ -155,13 +155,13 @@ def _moved_fields(stream: Stream, movement: Movement) -> dict[str, Floats]:
 
 
 def _below(place_m: Floats, movement: Movement) -> Floats:
-    """What is missing of flat places (n, 2) in another plane, since the earth falls off below theirs."""
+    """Return what flat places (n, 2) lack in another plane, since the earth falls off below theirs."""
     fall_m = np.sum(place_m**2, axis=1) / (2.0 * SEMI_MAJOR_M)
     return -fall_m[:, None] * movement.rotation[:2, 2]
 
 
 def _turned(covariance: Floats, jacobian: Floats) -> Floats:
-    """Covariances (n, d d) in other axes; what is unknown stays so."""
+    """Return covariances (n, d d) in other axes; what is unknown stays so."""
     size, unknown = len(jacobian), np.isnan(covariance)
     known = np.where(unknown, 0.0, covariance).reshape(-1, size, size)
     turned = (jacobian @ known @ jacobian.T).reshape(len(covariance), size * size)

@@ -50,7 +50,12 @@ def state_stream(
 
 
 def wrapped(mean: Floats, components: Components) -> Floats:
-    """Return means (n, d) with their angles wrapped."""
+    """Return means (n, d) with their angles wrapped to [-pi, pi).
+
+    Args:
+        mean: (n, d).
+        components: the d names and their kinds.
+    """
     angular = [index for index, kind in enumerate(components.values()) if kind == "angle"]
     if not angular:
         return mean

@@ -37,7 +37,7 @@ def are_kinds(kinds: Sequence[str]) -> bool:
 
 
 def manifold_blocks(kinds: Sequence[str]) -> Iterator[tuple[str, slice]]:
-    """Kind and columns of every number, angle, axis and quaternion."""
+    """Yield kind and columns of every number, angle, axis and quaternion."""
     index = 0
     while index < len(kinds):
         width = WIDTHS[kinds[index]]
@@ -69,7 +69,7 @@ def tangent_components(components: Sequence[str], kinds: Sequence[str]) -> list[
 
 
 def _common(names: Sequence[str]) -> str:
-    """What the names of a vector's components begin with, of more than a letter; else `rotation`."""
+    """Find what names of a vector's components begin with, if more than a letter; else `rotation`."""
     stem = names[0]
     while not all(name.startswith(stem) for name in names):
         stem = stem[:-1]
@@ -191,7 +191,7 @@ def rotation_vector(x: Floats) -> Floats:
 
 
 def _slerp(left: Floats, right: Floats, weight: Floats) -> Floats:
-    """Along the great circle, from left to the nearer one of right and -right."""
+    """Go along the great circle, from left to the nearer one of right and -right."""
     turn = rotation_vector(compose(conjugate(left), right))
     angle = (1.0 if left.shape[1] == 2 else 0.5) * weight[:, None] * turn
     length = np.linalg.norm(angle, axis=1, keepdims=True)

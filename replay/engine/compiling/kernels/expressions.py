@@ -68,7 +68,7 @@ class Expressions(Scope):
         return tuple(self.listed(node.elts))
 
     def listed(self, nodes: list[ast.expr]) -> Iterator[Any]:
-        """Entries or arguments, with `*others` among them."""
+        """Yield entries or arguments, those of `*others` among them."""
         for node in nodes:
             if isinstance(node, ast.Starred):
                 yield from self.iterated(node.value)
@@ -110,7 +110,7 @@ class Expressions(Scope):
         raise TypeError("a loop goes over a range, or over a tuple")
 
     def of_BinOp(self, node: ast.BinOp) -> Any:  # noqa: N802
-        """`a + b` and the like."""
+        """Lower `a + b` and the like."""
         return self.operation(node.op, self.value(node.left), self.value(node.right))
 
     def operation(self, node: ast.operator, left: Any, right: Any) -> Any:
@@ -136,7 +136,7 @@ class Expressions(Scope):
         raise TypeError(f"a number is needed, not a {type(value).__name__}")
 
     def of_UnaryOp(self, node: ast.UnaryOp) -> Any:  # noqa: N802
-        """`-a`, `not a`."""
+        """Lower `-a` and `not a`."""
         value = self.value(node.operand)
         if isinstance(node.op, ast.Not):
             found = self.truth(value)
@@ -154,7 +154,7 @@ class Expressions(Scope):
         return bool(value)
 
     def of_BoolOp(self, node: ast.BoolOp) -> Any:  # noqa: N802
-        """`a and b`: the second is looked at only where the first leaves it open."""
+        """Lower `a and b`: the second is looked at only where the first leaves it open."""
         is_and = isinstance(node.op, ast.And)
         first = self.truth(self.value(node.values[0]))
         rest = node.values[1] if len(node.values) == 2 else ast.BoolOp(node.op, node.values[1:])
@@ -164,7 +164,7 @@ class Expressions(Scope):
         return self.chosen(first, rest, known) if is_and else self.chosen(first, known, rest)
 
     def of_Compare(self, node: ast.Compare) -> Any:  # noqa: N802
-        """`a < b`, `a < b < c`."""
+        """Lower `a < b` and `a < b < c`."""
         left, found = self.value(node.left), None
         for operation, right_node in zip(node.ops, node.comparators, strict=True):
             right = self.value(right_node)
@@ -208,7 +208,7 @@ class Expressions(Scope):
         return found
 
     def of_IfExp(self, node: ast.IfExp) -> Any:  # noqa: N802
-        """`a if condition else b`."""
+        """Lower `a if condition else b`."""
         condition = self.truth(self.value(node.test))
         if isinstance(condition, Number):
             return self.chosen(condition, node.body, node.orelse)
@@ -343,7 +343,7 @@ class Expressions(Scope):
         raise TypeError(f"a kernel that makes no arrays cannot call {name}; others have allocates=True")
 
     def new_array(self, like: Any, dtype: Any = float, *, is_zero: bool) -> Array:
-        """`np.empty`, `np.zeros` and the like, of known sizes: there until the function returns."""
+        """Make what `np.empty` and the like give, of known sizes: there until the function returns."""
         shape = like.shape if isinstance(like, Array) else like if isinstance(like, tuple) else (like,)
         if not all(is_static(size) for size in shape):
             raise TypeError("an array that is made here has sizes that are known; pass it as scratch")
@@ -354,7 +354,7 @@ class Expressions(Scope):
         return array
 
     def copied(self, array: Array) -> Array:
-        """`array.copy()`, of known sizes: there until the function returns."""
+        """Make what `array.copy()` gives, of known sizes: there until the function returns."""
         copy = self.new_array(array, is_zero=False)
         self.fill(copy, array)
         return copy

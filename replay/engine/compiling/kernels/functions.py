@@ -36,7 +36,7 @@ def absolute(emitter: Emitter, x: Scalar) -> Number:
 
 
 def _least(operation: Any, emitter: Emitter, *values: Scalar) -> Number:
-    """Python's `min` and `max`: the first of equal ones."""
+    """Lower Python's `min` and `max`: the first of equal ones."""
     kind = common_kind(*values)
     found, *others = (emitter.as_kind(each, kind) for each in values)
     for each in others:
@@ -45,7 +45,7 @@ def _least(operation: Any, emitter: Emitter, *values: Scalar) -> Number:
 
 
 def _bounded(operation: Any, emitter: Emitter, x: Scalar, y: Scalar) -> Number:
-    """`np.minimum` and `np.maximum`, which are NaN where an argument is."""
+    """Lower `np.minimum` and `np.maximum`, which are NaN where an argument is."""
     kind = common_kind(x, y)
     x, y = emitter.as_kind(x, kind), emitter.as_kind(y, kind)
     first = compare(emitter, operation, x, y)
@@ -55,7 +55,7 @@ def _bounded(operation: Any, emitter: Emitter, x: Scalar, y: Scalar) -> Number:
 
 
 def is_nan(emitter: Emitter, x: Scalar) -> Number:
-    """`np.isnan(x)`."""
+    """Lower `np.isnan(x)`."""
     code = emitter.as_kind(x, REAL).code
     return emitter.number(TRUTH, f"fcmp uno double {code}, {code}")
 
@@ -115,7 +115,7 @@ def _round(emitter: Emitter, x: Scalar) -> Number:
 
 
 def _frexp(emitter: Emitter, x: Scalar) -> tuple[Number, Number]:
-    """`math.frexp(x)`."""
+    """Lower `math.frexp(x)`."""
     emitter.declared.add("declare { double, i32 } @llvm.frexp.f64.i32(double)")
     both = emitter.fresh()
     emitter.add(

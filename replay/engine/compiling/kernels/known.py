@@ -11,12 +11,12 @@ from replay.engine.compiling.kernels.values import Array, Record, entries
 
 
 def is_in(x: Any, many: Any) -> bool:
-    """`x in many`."""
+    """Tell what `x in many` is."""
     return x in many
 
 
 def is_not_in(x: Any, many: Any) -> bool:
-    """`x not in many`."""
+    """Tell what `x not in many` is."""
     return x not in many
 
 

@@ -72,7 +72,7 @@ class _Lowering(Frame):
         super().__init__(program, function, arguments, kinds)
 
     def body(self) -> Any:
-        """Lower all of it; what it returns."""
+        """Lower all of it, and return what it returns."""
         self.statements(self.definition.body)
         if self._exit:
             if not self.ended:
@@ -106,18 +106,18 @@ class _Lowering(Frame):
             self.value(statement.value)
 
     def do_Assign(self, statement: ast.Assign) -> None:  # noqa: N802
-        """`a = b = value`."""
+        """Lower `a = b = value`."""
         value = self.value(statement.value)
         for target in statement.targets:
             self.give(target, value)
 
     def do_AnnAssign(self, statement: ast.AnnAssign) -> None:  # noqa: N802
-        """`a: type = value`."""
+        """Lower `a: type = value`."""
         if statement.value is not None:
             self.give(statement.target, self.value(statement.value))
 
     def do_AugAssign(self, statement: ast.AugAssign) -> None:  # noqa: N802
-        """`a += value`, of a name, or of a place in an array, which is found once."""
+        """Lower `a += value`, of a name, or of a place in an array, which is found once."""
         target = statement.target
         if isinstance(target, ast.Subscript):
             place = self.element(target)

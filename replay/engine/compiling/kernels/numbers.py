@@ -28,7 +28,7 @@ class Number(NamedTuple):
 
     @property
     def type(self) -> str:
-        """LLVM's type."""
+        """Name LLVM's type."""
         return WHOLE if self.kind == WORD else self.kind
 
 
@@ -204,7 +204,7 @@ def binary(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Num
 
 
 def _divided(emitter: Emitter, operation: Any, x: Number, y: Number) -> Number:
-    """`x % y` or `x // y`, whose remainder has the sign of y."""
+    """Lower `x % y` or `x // y`, whose remainder has the sign of y."""
     if x.kind == WORD:
         name = "urem" if operation is operator.mod else "udiv"
         return emitter.number(WORD, f"{name} i64 {x.code}, {y.code}")
@@ -276,12 +276,12 @@ def compare(emitter: Emitter, operation: Any, left: Scalar, right: Scalar) -> Nu
 
 
 def negative(emitter: Emitter, x: Scalar) -> Number:
-    """`-x`."""
+    """Lower `-x`."""
     if kind_of(x) == REAL:
         return emitter.number(REAL, f"fneg double {emitter.as_kind(x, REAL).code}")
     return emitter.number(WHOLE, f"sub nsw i64 0, {emitter.as_kind(x, WHOLE).code}")
 
 
 def inverse(emitter: Emitter, x: Scalar) -> Number:
-    """`not x`."""
+    """Lower `not x`."""
     return emitter.number(TRUTH, f"xor i1 {emitter.truth(x).code}, true")

@@ -58,7 +58,7 @@ class Array:
 
     @property
     def turned(self) -> "Array":
-        """`array.T`."""
+        """Return what `array.T` is."""
         return Array(self.dtype, self.pointer, self.shape[::-1], self.strides[::-1], self.is_local)
 
 
@@ -250,7 +250,7 @@ def store(emitter: Emitter, place: Array, value: Scalar) -> None:
 
 
 def table(name: str, numbers: np.ndarray) -> tuple[str, Array]:
-    """LLVM's definition of an array that is known and never written to, and the array."""
+    """Return LLVM's definition of an array that is known and never written to, and the array."""
     dtype = numbers.dtype.str
     stored, kind = STORED[dtype]
     if stored == "i8" and kind == TRUTH:
