@@ -131,6 +131,14 @@ def learn_classifier(
     """Return a classifier whose score is above zero for genuine; a missing score counts as its mean, 0.
 
     QDA, LDA, logistic regression and all calibrated ones give a log-likelihood ratio: equal priors.
+
+    Args:
+        parameters: which classifier.
+        vectors: the training scores (rows, matchers), in z units, NaN where missing.
+        genuine: (rows,) which of them are of the same user.
+        rng: for the classifiers that draw.
+
+    Raises BadInput where it cannot be fitted to these.
     """
     with extra("papers", f"classifier {parameters.classifier}"):
         from sklearn.calibration import CalibratedClassifierCV  # which takes long to import
@@ -157,7 +165,7 @@ def learn_classifier(
 
 
 def _log_odds(probabilities: Floats) -> Floats:
-    """Of the second class, from the probabilities (n, 2) of both; finite."""
+    """Return those of the second class, from the probabilities (n, 2) of both; finite."""
     logarithms = np.log(np.maximum(probabilities, LEAST_PROBABILITY))
     return logarithms[:, 1] - logarithms[:, 0]
 
@@ -188,7 +196,7 @@ def learn_mixture(
     genuine: Booleans,
     rng: np.random.Generator,
 ) -> Scorer:
-    """The log-likelihood ratio of two HMMs, eq. 5 with eta 0.
+    """Learn the log-likelihood ratio of two HMMs, eq. 5 with eta 0.
 
     Args:
         parameters: how the models are fitted.
@@ -244,7 +252,7 @@ def _by_mixture(
 def _sequence(
     matchers: tuple[Matcher, ...], chosen: list[int], parameters: MixtureParameters
 ) -> tuple[int, int]:
-    """(n, m) of a subset; raises BadInput where its modalities have different numbers of matchers."""
+    """Return (n, m) of a subset; raises BadInput where modalities have different numbers of matchers."""
     modalities = [matchers[index].modality for index in chosen]
     counts = {modalities.count(each) for each in modalities}
     if parameters.topology == "joint":
@@ -264,7 +272,7 @@ def _learnt(
     learner: Learner,
     is_ratio: bool,
 ) -> Stream:
-    """The cross-validated fusion of the chosen matchers."""
+    """Return the cross-validated fusion of the chosen matchers."""
     users = len(compared.scores)
     rng = np.random.default_rng(parameters.seed)
     fold = user_folds(users, parameters.folds, rng)
@@ -282,7 +290,7 @@ def _learnt(
 
 
 def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
-    """Scores (users, users, matchers) in global z units, some modalities as logarithms."""
+    """Return scores (users, users, matchers) in global z units, some modalities as logarithms."""
     scores = compared.scores
     if parameters.failures == "missing":
         scores = np.where(compared.failed, np.nan, scores)
@@ -302,7 +310,14 @@ def _prepared(compared: Comparisons, parameters: LearnerParameters) -> Floats:
 def fused_stream(
     compared: Comparisons, pairs: Pairs, fused: Floats, metadata: Mapping[str, str]
 ) -> Stream:
-    """Make score vectors of one of fused scores (n,), in arrival order; topic and name come later."""
+    """Make score vectors of one of fused scores, in arrival order; topic and name come later.
+
+    Args:
+        compared: the comparisons, for the probes' arrivals.
+        pairs: the n pairs that were fused.
+        fused: (n,), their scores.
+        metadata: what the channel states beside its component.
+    """
     order = np.lexsort((pairs.gallery, pairs.probe, compared.arrival_ns[pairs.probe]))
     return make_stream(
         "",

@@ -93,7 +93,7 @@ def log_likelihood(model: MixtureHmm, sequences: Floats) -> Floats:
 
 
 def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
-    """States in the order of the vectors: k-means of each, one step at a time, or any after any."""
+    """Make states in the order of the vectors: k-means of each, one step at a time, or any after any."""
     with extra("papers", "a mixture of scores"):
         from sklearn.cluster import KMeans  # which takes long to import
 
@@ -113,7 +113,7 @@ def _start(sequences: Floats, how: Fit, rng: np.random.Generator) -> MixtureHmm:
 
 
 def _uneven(vectors: Floats) -> Floats:
-    """Vectors (count, m) on scales that are bent a little, each otherwise.
+    """Return vectors (count, m) on scales that are bent a little, each otherwise.
 
     Scores that are whole numbers are often as far from one mean as from another; here the lower one is
     the nearer, where rounding would decide.
@@ -123,7 +123,7 @@ def _uneven(vectors: Floats) -> Floats:
 
 
 def _improve(model: MixtureHmm, sequences: Floats, floor: float) -> tuple[MixtureHmm, float]:
-    """One step of Baum-Welch; returns the mean log-likelihood of the model before it."""
+    """Do one step of Baum-Welch; returns the mean log-likelihood of the model before it."""
     count, length, size = sequences.shape
     emission = _log_components(model, sequences.reshape(-1, size)).reshape(
         count, length, *model.weights.shape
@@ -148,7 +148,7 @@ def _improve(model: MixtureHmm, sequences: Floats, floor: float) -> tuple[Mixtur
 
 
 def _mixtures(model: MixtureHmm, vectors: Floats, responsibility: Floats, floor: float) -> MixtureHmm:
-    """The model with mixtures that fit vectors (s, count, m) of responsibilities (s, count, g)."""
+    """Fit the model's mixtures to vectors (s, count, m) of responsibilities (s, count, g)."""
     mass = responsibility.sum(axis=1) + np.finfo(float).tiny
     share = responsibility.swapaxes(1, 2)
     means = share @ vectors / mass[..., None]
@@ -194,7 +194,7 @@ def _backward(model: MixtureHmm, states: Floats) -> Floats:
 
 
 def _log(probability: Floats) -> Floats:
-    """The logarithm, minus infinity for what cannot be."""
+    """Return the logarithm, minus infinity for what cannot be."""
     with np.errstate(divide="ignore"):
         return np.log(probability)
 

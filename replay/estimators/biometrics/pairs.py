@@ -53,7 +53,7 @@ def normalise(scores: Floats, how: str) -> Floats:
 
 
 def _deviations(scores: Floats) -> Floats:
-    """The standard deviation (matchers,) of each matcher's scores, missing ones left out."""
+    """Compute the standard deviation (matchers,) of each matcher's scores, missing ones left out."""
     with np.errstate(over="ignore", invalid="ignore"):
         deviations = np.nanstd(scores, axis=(0, 1), ddof=1)
     unusable = ~(np.isfinite(deviations) & (deviations > 0))
@@ -81,7 +81,7 @@ def all_pairs(users: int) -> Pairs:
 
 
 def trimmed_pairs(users: int, rng: np.random.Generator) -> Pairs:
-    """The paper's trimmed database: the genuine comparisons, two random other probes per gallery user.
+    """Draw the paper's trimmed database: genuine comparisons, two random other probes per gallery user.
 
     The probe is the same for all matchers: one for each would inflate the results.
     """
@@ -130,7 +130,7 @@ def cross_validate(
 
 
 def subsets_of(matchers: tuple[Matcher, ...]) -> dict[str, list[int]]:
-    """The three factors' subsets: each modality, the k-th matcher of every modality, all, singles.
+    """List the three factors' subsets: each modality, the k-th matcher of each modality, all, singles.
 
     A subset of one matcher goes by that matcher's name; those of the paper (M1, M2, R1, R2, all) are
     the larger ones.

@@ -49,7 +49,15 @@ class Steps(NamedTuple):
 
 
 def make_steps(offsets: NDArray, increment: NDArray, measurement: NDArray) -> Steps:
-    """Steps with every vector at exactly unit length; BadInput where one is neither unit nor NaN."""
+    """Make steps with every vector at exactly unit length.
+
+    Args:
+        offsets: (runs + 1,), where the rows of each run begin.
+        increment: known turns (rows, d), unit vectors.
+        measurement: unit vectors (rows, d), NaN for none.
+
+    Raises BadInput where a vector is neither unit nor NaN, or the numbers of rows differ.
+    """
     if not len(increment) == len(measurement) == offsets[-1]:
         raise BadInput(
             f"{len(increment)} increments and {len(measurement)} measurements for {offsets[-1]} steps; "
@@ -163,7 +171,9 @@ def run_kalman_filter(
     *,
     rotated: bool,
 ) -> tuple[Gaussian, Gaussian]:
-    """The paper's modified Kalman filter on R^d (section 7): measurements mirrored, means normalised.
+    """Run the paper's modified Kalman filter on R^d (section 7), which mirrors measurements.
+
+    Means are normalised.
 
     Args:
         noise: see there; the paper adds it as it is, wherever the state points.

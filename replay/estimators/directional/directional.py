@@ -129,7 +129,7 @@ def follow_all(advance: Advance, messages: Messages, state: Any, results: Result
 
 
 def distributions(given: Given[Any], topic: str, d: int) -> Distributions:
-    """Prior and noises; BadInput where neither parameters nor channel state one with d components."""
+    """Return prior and noises; BadInput where parameters and channels state none with d components."""
     found = {}
     for name in Distributions._fields:
         value = getattr(given.parameters, name)
@@ -194,13 +194,13 @@ def _start_kalman(topic: str, d: int, given: Given[KalmanParameters]) -> tuple[A
 
 
 def _steps(messages: Messages) -> Steps:
-    """Steps without control input."""
+    """Make steps without control input."""
     count, d = messages.value.shape
     return make_steps(messages.offsets, np.tile(np.eye(d)[0], (count, 1)), messages.value)
 
 
 def _widened(state: Any, runs: int) -> Any:
-    """A state without batch axes, once for every run."""
+    """Repeat a state without batch axes for every run."""
     return type(state)(*(np.repeat(part[None], runs, axis=0) for part in state))
 
 

@@ -118,7 +118,7 @@ def _axial_density(distribution: bingham.Bingham, angle: NDArray) -> Floats:
 
 
 def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
-    """The densities (rows, cells) of measurements in every cell; of one angle where the other is NaN."""
+    """Compute the densities (rows, cells) of measurements; of one angle where the other is NaN."""
     missing = np.isnan(measured)
     sigmas = np.where(missing, np.sqrt(UNIFORM), np.sqrt(np.diag(model.measurement)))
     correlation = model.measurement[0, 1] / np.sqrt(np.prod(np.diag(model.measurement)))
@@ -129,7 +129,7 @@ def _likelihood(model: HeadingModel, measured: Floats, grid: NDArray) -> Floats:
 
 
 def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> sparse.csr_array:
-    """Probabilities of the next cell (rows) given the last one (columns)."""
+    """Compute the probabilities of the next cell (rows) given the last one (columns)."""
     moved = np.stack(motion(grid[:, 0], grid[:, 1], model.coupling_rad, *model.drift_rad), -1)
     reached = np.stack(
         [wrapped_normal.density(WrappedNormal(each, model.system), grid) for each in moved], axis=1
@@ -139,7 +139,7 @@ def _transition(model: HeadingModel, grid: NDArray, motion: Motion) -> sparse.cs
 
 
 def _in_step(offsets: Integers) -> Iterator[tuple[Integers, Integers]]:
-    """Row by row through all runs at once: the runs that have a next row, and these rows."""
+    """Go row by row through all runs at once: the runs that have a next row, and these rows."""
     counts = np.diff(offsets)
     for step in range(int(counts.max(initial=0))):
         runs = np.flatnonzero(counts > step)

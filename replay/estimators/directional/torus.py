@@ -79,7 +79,15 @@ Motion = Callable[..., tuple[Component, Component]]
 def make_heading_model(
     coupling_rad: float, drift_rad: ArrayLike, system: ArrayLike, measurement: ArrayLike
 ) -> HeadingModel:
-    """A checked model; BadInput where a covariance is not positive definite or a number not finite."""
+    """Make a checked model.
+
+    Args:
+        coupling_rad: c in the motion.
+        drift_rad: what is added in every step, (2,).
+        system, measurement: covariances of w and v, (2, 2), rad^2.
+
+    Raises BadInput where a covariance is not positive definite or a number not finite.
+    """
     if not (np.isfinite(coupling_rad) and np.isfinite(drift_rad).all() and np.shape(drift_rad) == (2,)):
         raise BadInput("coupling and drift of a heading model must be finite, and the drift two numbers")
     covariances = [make_wrapped_normal(np.zeros(2), each).covariance for each in (system, measurement)]
@@ -129,8 +137,12 @@ def run_unscented_filter(
 ) -> tuple[WrappedNormal, WrappedNormal]:
     """Run the unscented Kalman filter with the paper's five equally weighted samples.
 
-    Args as `run_toroidal_filter`, and
+    Args:
+        model, state, offsets, measurement, motion: as for `run_toroidal_filter`.
         wrapped: take the innovation in [-pi, pi); else everything is merely taken modulo 2 pi.
+
+    Returns:
+        What `run_toroidal_filter` returns.
     """
     return _run(_unscented_step, motion, model, state, offsets, measurement, wrapped)
 
@@ -158,7 +170,7 @@ def _run(
 
 @cache
 def _over_runs(step: Function, motion: Motion) -> Function:
-    """The compiled loop of a filter: what `step` makes processes a row, whose state is written down."""
+    """Compile the loop of a filter: what `step` makes processes a row, whose state is written down."""
     loop = over_events(step(motion), _write, fails=False)
     return compile_over_runs(loop, allocates=False, title="a filter of headings")
 

@@ -74,7 +74,7 @@ class Detections(NamedTuple):
 
 
 def parameter_names(setting: Setting, sensors: Sequence[int]) -> list[str]:
-    """Names of the parameters, with their units, for sensors of these numbers."""
+    """Name the parameters, with their units, for sensors of these numbers."""
     shot = model.SHOT_COMPONENTS[: 2 if setting.mode == Mode.BEARINGS_ONLY else 3]
     estimated = sensors if setting.estimate_sensors else []
     return [*shot, *(name for sensor in estimated for name in model.sensor_components(sensor))]
@@ -110,7 +110,12 @@ def bound(setting: Setting, shooter_m: Floats, trajectory_rad: Floats, sensor_m:
 def noise_free(
     medium: Medium, shooter_m: Floats, trajectory_rad: Floats, sensor_m: Floats
 ) -> Detections:
-    """Compute what perfect sensors hear; shapes as for `bound`."""
+    """Compute what perfect sensors hear.
+
+    Args:
+        medium: the speeds of sound and bullet.
+        shooter_m, trajectory_rad, sensor_m: as for `bound`.
+    """
     position = np.broadcast_to(sensor_m, (len(shooter_m), *sensor_m.shape[-2:]))
     with np.errstate(invalid="ignore"):
         angles = model.hear(
@@ -193,7 +198,7 @@ def _bearings(setting: Setting, heard: Detections, geometry: _Geometry) -> _Bloc
 
 
 def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Both directions of arrival and the delay, on the branch nearest to the measured shockwave."""
+    """Return both directions of arrival and the delay, on the branch nearest to the shockwave."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     misses = [
@@ -214,7 +219,7 @@ def _native_measurements(setting: Setting, heard: Detections, geometry: _Geometr
 
 
 def _local_estimates(setting: Setting, heard: Detections, geometry: _Geometry) -> _Blocks:
-    """Bearing, and the range and the trajectory that a sensor works out of what it heard."""
+    """Return bearing, and the range and the trajectory that a sensor works out of what it heard."""
     noise, medium = setting.noise, setting.medium
     azimuth, distance, trajectory = geometry
     side = model.measured_side(heard.muzzle_blast_rad, heard.shockwave_rad)
@@ -271,7 +276,7 @@ def _check(setting: Setting, heard: Detections) -> None:
 
 
 def _blocks(residual: list, jacobian: list, covariance: list, slope: list | None = None) -> _Blocks:
-    """Blocks from lists, nested as deep as the matrix, of numbers and arrays (runs, sensors)."""
+    """Make blocks from lists, nested as deep as the matrix, of numbers and arrays (runs, sensors)."""
     shape = residual[0].shape
     return _Blocks(
         _stack(residual, shape),
@@ -288,7 +293,7 @@ def _stack(entries: list | tuple | Floats | float, shape: tuple[int, ...]) -> Fl
 
 
 def _chain_rule(setting: Setting, azimuth: Floats, distance: Floats) -> Floats:
-    """Derivatives of azimuth, range and trajectory by all parameters, (runs, sensors, 3, n)."""
+    """Return derivatives of azimuth, range and trajectory by all parameters, (runs, sensors, 3, n)."""
     runs, sensors = distance.shape
     x, y = np.cos(azimuth), np.sin(azimuth)
     by_shooter = _stack([[-y / distance, x / distance], [x, y], [0.0, 0.0]], distance.shape)
@@ -310,7 +315,7 @@ def _by_parameters(view: _Blocks, chain: Floats) -> _Blocks:
 
 
 def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
-    """Position fixes as two more measurements of every sensor, which are its last parameters."""
+    """Take position fixes as two more measurements of every sensor, which are its last parameters."""
     runs, sensors, _, n = view.jacobian.shape
     selection = np.eye(n)[-2 * sensors :].reshape(sensors, 2, n)
     wider = [(0, 0), (0, 0), (0, 2), (0, 2)]
@@ -325,7 +330,7 @@ def _append_fixes(view: _Blocks, residual: Floats, sigma_m: float) -> _Blocks:
 
 
 def _absorb_fixes(view: _Blocks, sigma_m: float) -> _Blocks:
-    """The error of a position fix shifts what its sensor measures as a shift of the shooter would."""
+    """Add the error of a position fix, which shifts what is measured as a shift of the shooter would."""
     by_shooter = view.jacobian[..., :2]
     share = sigma_m**2 * by_shooter @ np.swapaxes(by_shooter, 2, 3)
     return view._replace(covariance=view.covariance + share)

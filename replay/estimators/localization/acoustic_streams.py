@@ -92,7 +92,7 @@ def gather_detections(detections: list[Ragged], positions: list[Ragged]) -> tupl
 
 
 def _latest(positions: Ragged, batches: Batches) -> Floats:
-    """The latest fix (batches, 2) of a sensor at the end of each batch, NaN where it had none."""
+    """Return the latest fix (batches, 2) of a sensor at the end of each batch, NaN where it had none."""
     times = positions.stream.publish_time_ns
     latest = np.full(len(batches.run), -1)
     for run in np.unique(batches.run):

@@ -173,7 +173,7 @@ def _solve_block(model: Model, start: Floats, tolerance: float, max_iterations: 
 
 
 def _gauss_newton(here: _Whitened) -> tuple[Floats, Floats]:
-    """The full step, and its length in standard deviations."""
+    """Compute the full step, and its length in standard deviations."""
     scale = _column_scale(here.jacobian)
     scaled = here.jacobian * scale[:, None, :]
     transposed = np.swapaxes(scaled, 1, 2)
@@ -210,7 +210,7 @@ def _line_search(
 
 
 def _judge(model: Model, parameters: Floats, iterations: Integers, status: Integers) -> Solution:
-    """Bound, rank and cost where each run ended."""
+    """Compute bound, rank and cost where each run ended."""
     runs, n = parameters.shape
     covariance, cost = np.full((runs, n, n), np.nan), np.full(runs, np.nan)
     rank = np.zeros(runs, np.int64)
@@ -223,7 +223,7 @@ def _judge(model: Model, parameters: Floats, iterations: Integers, status: Integ
 
 
 def information_root(at: Linearization) -> Floats:
-    """Rows (runs, k, n) whose outer products sum to the Fisher information.
+    """Return rows (runs, k, n) whose outer products sum to the Fisher information.
 
     First the whitened Jacobian; then, where the covariance depends on the parameters, one row for each
     of its entries: the trace term is half the scalar product of the whitened derivatives (Osborne et
@@ -243,7 +243,7 @@ def information_root(at: Linearization) -> Floats:
 
 
 def cramer_rao_bound(at: Linearization) -> Bound:
-    """The inverse of the Fisher information, from its root, so that no digits are lost to squares.
+    """Invert the Fisher information, from its root, so that no digits are lost to squares.
 
     Where the triangular factor proves full rank it is inverted, which is fast; singular values decide
     the rest. A run whose model is not finite has rank 0.
@@ -277,7 +277,7 @@ def unobservable_directions(at: Linearization) -> list[Floats]:
 
 
 def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
-    """The information root with columns of unit length, and the scale that made them so."""
+    """Return the information root with columns of unit length, and the scale that made them so."""
     root = information_root(at)
     root = np.where(np.isfinite(root).all(axis=(1, 2), keepdims=True), root, 0.0)
     scale = _column_scale(root)
@@ -285,7 +285,7 @@ def _scaled_root(at: Linearization) -> tuple[Floats, Floats]:
 
 
 def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
-    """Matrices whose squares are the inverse information, and where the rank is full for sure.
+    """Return matrices whose squares are the inverse information, and where the rank is full for sure.
 
     With F the inverse of the triangular factor, no singular value is below 1 / |F| nor above sqrt(n).
     """
@@ -301,7 +301,7 @@ def _inverse_factor(root: Floats) -> tuple[Floats, Booleans]:
 
 
 def _singular_values(root: Floats) -> tuple[Floats, Floats]:
-    """All n singular values, largest first, and their right vectors as columns."""
+    """Return all n singular values, largest first, and their right vectors as columns."""
     runs, rows, n = root.shape
     _, singular, right = np.linalg.svd(root, full_matrices=rows < n)
     values = np.zeros((runs, n))
@@ -310,7 +310,12 @@ def _singular_values(root: Floats) -> tuple[Floats, Floats]:
 
 
 def describe_direction(names: Sequence[str], direction: Floats) -> str:
-    """Name a direction (n,): the shares of its parameters against the largest, in their order."""
+    """Name a direction by the shares of its parameters against the largest, in their order.
+
+    Args:
+        names: of the n parameters.
+        direction: (n,); shares up to `PARTICIPATION` are left out.
+    """
     share = direction / direction[np.argmax(np.abs(direction))]
     parts = [(name, part) for name, part in zip(names, share, strict=True) if abs(part) > PARTICIPATION]
     return ", ".join(f"{name} {part:+.3g}" for name, part in parts)
@@ -345,7 +350,7 @@ def _whiten(at: Linearization) -> _Whitened:
 
 
 def _whitener(covariance: Floats) -> Floats:
-    """Inverse square root of the covariance, in its shape; NaN for a run where it is not positive."""
+    """Return an inverse square root of the covariance, in its shape; NaN where it is not positive."""
     if covariance.ndim == 2:
         positive = covariance > 0.0
         return np.where(positive, 1.0 / np.sqrt(np.where(positive, covariance, 1.0)), np.nan)
@@ -370,6 +375,6 @@ def _half_square(residual: Floats) -> Floats:
 
 
 def _column_scale(matrix: Floats) -> Floats:
-    """What gives each column (runs, m, n) unit length, (runs, n); 1 for a column of zeros."""
+    """Return what gives each column (runs, m, n) unit length, (runs, n); 1 for a column of zeros."""
     norm = np.sqrt((matrix * matrix).sum(axis=1))
     return 1.0 / np.where(norm > 0.0, norm, 1.0)

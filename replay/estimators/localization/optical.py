@@ -68,7 +68,7 @@ class Observability(NamedTuple):
 
 
 def parameter_names(scene: Scene, targets: Sequence[int], sensors: Sequence[int]) -> list[str]:
-    """Names of the parameters, with their units, for targets and sensors of these numbers."""
+    """Name the parameters, with their units, for targets and sensors of these numbers."""
     places = [name for target in targets for name in target_components(target)]
     biases = [name for sensor in sensors for name in bias_components(sensor)]
     return places + [name for name, wanted in zip(biases, scene.wanted, strict=True) if wanted]
@@ -122,10 +122,17 @@ def starting_point(scene: Scene, measured: Floats) -> Floats:
 
 
 def printed_starting_point(scene: Scene, measured: Floats) -> Floats:
-    """Eqs (21)-(23) for the first two sensors, nominal attitudes zero; the print has z, x, y as x, y, z.
+    """Begin as printed, (21)-(23), for the first two sensors, nominal attitudes zero.
 
-    They hang on the difference of two azimuths: where all is nearly in one upright plane, as in the
-    paper's three-sensor scenes, they start too far off. Only to try them.
+    The print has z, x, y as x, y, z. It hangs on the difference of two azimuths: where all is nearly in
+    one upright plane, as in the paper's three-sensor scenes, it starts too far off. Only to try it.
+
+    Args:
+        scene: what is known before the measurements.
+        measured: (runs, targets, sensors, 2), in rad.
+
+    Returns:
+        Parameters (runs, n), with zero for the biases.
     """
     first, second = scene.position_m[:2]
     azimuth_1, azimuth_2 = measured[:, :, 0, 0], measured[:, :, 1, 0]
@@ -200,7 +207,7 @@ def observability(scene: Scene, measured: Floats, parameters: Floats) -> Observa
 
 
 def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | None:
-    """The axis about which this direction turns every sensor alike; None where it does not."""
+    """Find the axis about which this direction turns every sensor alike; None where it does not."""
     if not scene.wanted.all():
         return None
     *_, attitude = _geometry(scene, parameters[None])
@@ -215,10 +222,18 @@ def _turning_axis(scene: Scene, parameters: Floats, unseen: Floats) -> Floats | 
 
 
 def sigma_with_one_bias_known(scene: Scene, measured: Floats, parameters: Floats) -> Floats:
-    """Compute the CRLB sigmas (rad) of all wanted biases (columns) when one (row) is known.
+    """Compute the CRLB sigmas of all wanted biases when one of them is known.
 
-    One run, as for `observability`. A row with infinite or large values is a bias that must not be the
-    one to fix: what cannot be observed goes on without it.
+    A row with infinite or large values is a bias that must not be the one to fix: what cannot be
+    observed goes on without it.
+
+    Args:
+        scene: what is known before the measurements.
+        measured: of one run, (targets, sensors, 2), in rad.
+        parameters: (n,), at which it is linearised.
+
+    Returns:
+        Sigmas in rad, a square: a row for the bias that is known, a column for each bias.
     """
     at = linearize(scene, measured[None], parameters[None])
     wanted = int(scene.wanted.sum())
@@ -245,7 +260,7 @@ def _check(scene: Scene, measured: Floats) -> None:
 
 
 def _geometry(scene: Scene, parameters: Floats) -> tuple[Floats, Floats, Floats]:
-    """Targets, sensors and biased attitudes, components first, to broadcast over targets, sensors."""
+    """Return targets, sensors and biased attitudes, components first, to broadcast over both."""
     runs, sensors = len(parameters), len(scene.position_m)
     targets = (parameters.shape[1] - scene.wanted.sum()) // 3
     target = parameters[:, : 3 * targets].reshape(runs, targets, 3)

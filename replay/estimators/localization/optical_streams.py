@@ -109,7 +109,7 @@ def _solve(given: Given[Any]) -> list[Ragged]:
 
 
 def _constant(ragged: Ragged, field: str, width: int) -> Floats:
-    """The one value (width,) that a stream has in all runs."""
+    """Return the one value (width,) that a stream has in all runs."""
     check_width(ragged.stream, field, width)
     values: Floats = ragged[field]
     if len(values) == 0 or (values != values[:1]).any():

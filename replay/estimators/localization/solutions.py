@@ -30,7 +30,7 @@ class Batches(NamedTuple):
 
 
 def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
-    """The messages of all sensors in one table: run, sensor (its place among them), time_ns, fields."""
+    """Put the messages of all sensors in a table: run, sensor (its place among them), time_ns, fields."""
     return pd.concat(
         [
             pd.DataFrame(
@@ -48,7 +48,7 @@ def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
 
 
 def batches_of(table: pd.DataFrame, key: str, runs: int) -> tuple[Batches, Integers]:
-    """The batches of a table, one for each value of `key` in each run, and which one each row is of.
+    """Return a table's batches, one for each value of `key` in each run, and which one each row is of.
 
     A run's batches are in the order of their last stamps, whatever their keys.
     """

@@ -47,7 +47,7 @@ def drift(target: Components, duration_s: Any, parameters: Any) -> Components:
 
 
 def measure(target: Components, noise: Components, reference: Any, parameters: Any) -> Components:
-    """A point of the surface and its squares, with noise of two scales and of the point itself."""
+    """Measure a point of the surface and its squares, with noise of two scales and of the point."""
     x, y = surface_point(target, (noise[0], noise[1]))
     return quadratic((x + noise[2], y + noise[3]))
 
@@ -72,12 +72,18 @@ def moments(
     spread: Floats,
     cross: Floats,
 ) -> None:
-    """The exact moments of the quadratic measurement y = (m, m^2).
+    """Fill the exact moments of the quadratic measurement y = (m, m^2).
 
     Given the state, m is Gaussian with mean c and variance v = l^2 / 3 + r in each axis. So Cov(y) is
     the mean of Cov(y | state), where Var m^2 = 2 v^2 + 4 c^2 v and Cov(m, m^2) = 2 c v, plus the
     covariance of E(y | state) = (c, c^2 + v); squares of Gaussians have Cov(s^2, t^2) =
     2 P_st^2 + 4 m_s m_t P_st and Cov(s, t^2) = 2 m_t P_st.
+
+    Args:
+        mean, covariance: of the state: two half sides l and the centre c, in m, (4,) and (4, 4).
+        reference: none.
+        parameters: with `point_variance_m2`, r.
+        predicted, spread, cross: E y (4,), Cov(y) (4, 4), Cov(state, y) (4, 4), overwritten.
     """
     for i in range(2):
         size, place = i, 2 + i
@@ -108,7 +114,15 @@ def moments(
 def scatter(
     mean: Floats, covariance: Floats, axis: int, point_variance_m2: float
 ) -> tuple[float, float, float]:
-    """The mean over the state of v, 2cv and 2v^2 + 4c^2 v: Var m, Cov(m, m^2) and Var m^2 given it."""
+    """Compute the means over the state of v, 2cv and 2v^2 + 4c^2 v, see `moments`, of one axis.
+
+    They are Var m, Cov(m, m^2) and Var m^2 given the state.
+
+    Args:
+        mean, covariance: (4,), (4, 4).
+        axis: 0 for x, 1 for y.
+        point_variance_m2: r.
+    """
     size, place = mean[axis], mean[2 + axis]
     own, shared = covariance[axis, axis], covariance[axis, 2 + axis]
     size_square = size**2 + own
@@ -129,7 +143,12 @@ def scatter(
 
 
 def square_covariance(mean: Floats, covariance: Floats, first: int, second: int) -> float:
-    """Cov(s^2, t^2) of two components of a Gaussian."""
+    """Compute Cov(s^2, t^2) of two components of a Gaussian.
+
+    Args:
+        mean, covariance: (n,), (n, n).
+        first, second: the places of s and t in the state.
+    """
     shared = covariance[first, second]
     return 2.0 * shared * shared + 4.0 * mean[first] * mean[second] * shared
 

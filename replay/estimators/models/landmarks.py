@@ -87,7 +87,7 @@ def move(pose: Components, velocity: Components, duration_s: Any, parameters: An
 
 
 def velocity_noise(duration_s: Any, parameters: Any) -> Components:
-    """The mean of white noise over a time T has the variance density^2 / T."""
+    """Return the variances of means of white noise over a time T: density^2 / T."""
     return (
         parameters.forward_noise_density**2 / duration_s,
         parameters.turn_noise_density**2 / duration_s,
@@ -95,7 +95,7 @@ def velocity_noise(duration_s: Any, parameters: Any) -> Components:
 
 
 def sight(pose: Components, place: Components) -> Components:
-    """Range and bearing of a place; NaN on the very spot, where neither has a derivative."""
+    """Return range and bearing of a place; NaN on the very spot, where neither has a derivative."""
     distance, bearing = range_bearing(pose, place)
     # 0, or NaN where the distance is 0: numba has no np.where for numbers
     defined = np.minimum(np.inf * (distance > 0.0), 0.0)
@@ -103,7 +103,7 @@ def sight(pose: Components, place: Components) -> Components:
 
 
 def range_and_bearing(pose: Components, landmark: Components, parameters: Any) -> Components:
-    """Range and bearing of a landmark, with the sensor's bias."""
+    """Return range and bearing of a landmark, with the sensor's bias."""
     distance, bearing = sight(pose, landmark)
     return distance + parameters.bias_range_m, bearing + parameters.bias_bearing_rad
 
@@ -119,17 +119,17 @@ def bearing_alone(pose: Components, landmark: Components, parameters: Any) -> Co
 
 
 def sight_noise(parameters: Any) -> Components:
-    """Variances of range and bearing."""
+    """Return the variances of range and bearing."""
     return parameters.sigma_range_m**2, parameters.sigma_bearing_rad**2
 
 
 def range_noise(parameters: Any) -> Components:
-    """Variance of the range."""
+    """Return the variance of the range."""
     return (parameters.sigma_range_m**2,)
 
 
 def bearing_noise(parameters: Any) -> Components:
-    """Variance of the bearing."""
+    """Return the variance of the bearing."""
     return (parameters.sigma_bearing_rad**2,)
 
 
@@ -141,7 +141,7 @@ def antenna(pose: Components, reference: Any, parameters: Any) -> Components:
 
 
 def fix_noise(parameters: Any) -> Components:
-    """Variances of a fix that does not state them."""
+    """Return the variances of a fix that does not state them."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2
 
 
@@ -151,7 +151,7 @@ def pose_itself(pose: Components, reference: Any, parameters: Any) -> Components
 
 
 def pose_noise(parameters: Any) -> Components:
-    """Variances of a pose that does not state them."""
+    """Return the variances of a pose that does not state them."""
     return parameters.sigma_fix_m**2, parameters.sigma_fix_m**2, parameters.sigma_heading_rad**2
 
 
@@ -161,27 +161,27 @@ def heading_alone(pose: Components, reference: Any, parameters: Any) -> Componen
 
 
 def heading_noise(parameters: Any) -> Components:
-    """Variance of a heading that does not state it."""
+    """Return the variance of a heading that does not state it."""
     return (parameters.sigma_heading_rad**2,)
 
 
 def read_pose(stream: Stream) -> Floats:
-    """Poses in the plane (n, 3) of those in space."""
+    """Return poses in the plane (n, 3) of those in space."""
     return np.column_stack([stream["position_m"][:, :2], heading(stream["quaternion"])])
 
 
 def read_pose_covariance(stream: Stream) -> Floats:
-    """Their covariances (n, 3, 3): x, y and a turn about z, of the frame's axes."""
+    """Return the covariances (n, 3, 3) of poses: x, y and a turn about z, of the frame's axes."""
     return stream["covariance"].reshape(-1, 6, 6)[:, PLANAR][:, :, PLANAR]
 
 
 def read_heading(stream: Stream) -> Floats:
-    """Headings (n, 1) of orientations."""
+    """Return the headings (n, 1) of orientations."""
     return heading(stream["quaternion"])[:, None]
 
 
 def read_heading_covariance(stream: Stream) -> Floats:
-    """Their variances (n, 1, 1), which the channel states for all, about x, y and z."""
+    """Return their variances (n, 1, 1), which the channel states for all, about x, y and z."""
     stated = [float(each) for each in stream.metadata.get("covariance_rad2", "nan").split(",")]
     return np.full((len(stream), 1, 1), stated[-1])
 
@@ -192,8 +192,17 @@ def align(
     """Find the pose at the last of some fixes: the antenna's path turned and shifted to them.
 
     By least squares. To its covariance is added what the odometry errs by: the mean of a random walk
-    over a span, seen from its end, has a third of the variance that it has grown to. None while the
-    heading is less sure than `COURSE_SIGMA_RAD`. See `start.Start`.
+    over a span, seen from its end, has a third of the variance that it has grown to.
+
+    Args:
+        path: poses (k, 3) where the odometry alone leads from zero, at the fixes.
+        places, covariances: of the fixes, (k, 2) in m, (k, 2, 2).
+        span_s: the time from the first to the last of them.
+        parameters: with the antenna's place and the odometry's noise densities.
+
+    Returns:
+        The pose (3,) and its covariance (3, 3), or None while the heading is less sure than
+        `COURSE_SIGMA_RAD`. See `start.Start`.
     """
     weight = 2.0 / np.trace(covariances, axis1=1, axis2=2)
     seen = np.stack(antenna(path.T, None, parameters), axis=1)

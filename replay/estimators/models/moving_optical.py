@@ -72,7 +72,7 @@ def moved_target(state: Components, first: int, duration_s: Component) -> Compon
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Both targets keep their velocities."""
+    """Move both targets, which keep their velocities."""
     x1, y1, z1 = moved_target(state, 0, duration_s)
     x2, y2, z2 = moved_target(state, 6, duration_s)
     velocity1, velocity2 = (state[3], state[4], state[5]), (state[9], state[10], state[11])
@@ -106,7 +106,7 @@ def to_body(orientation: Components, x: Components) -> Components:
 
 
 def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
-    """Azimuth and elevation in rad of a target; `reference` has its number, and the sensor's pose."""
+    """Return a target's azimuth and elevation in rad; `reference` has its number, and a sensor's pose."""
     second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (

@@ -74,7 +74,7 @@ class PoseRangingParameters(RangingParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Position and velocity after a while."""
+    """Return position and velocity after a while."""
     x, y, vx, vy = state
     return x + duration_s * vx, y + duration_s * vy, vx, vy
 
@@ -86,7 +86,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def move_pose(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Pose and its velocities after a while."""
+    """Return a pose and its velocities after a while."""
     x, y, heading, vx, vy, turn = state
     return x + duration_s * vx, y + duration_s * vy, heading + duration_s * turn, vx, vy, turn
 
@@ -182,7 +182,7 @@ def find_pose(streams: Mapping[str, Stream], parameters: Any) -> Started:
 def first_ranges(
     streams: Mapping[str, Stream], parameters: Any, least: int
 ) -> tuple[int, Floats, Floats, Floats]:
-    """The first ranges of at least so many pairs of anchor and tag, to three anchors, within `start_s`.
+    """Find the first ranges of so many pairs of anchor and tag at least, to three anchors, in `start_s`.
 
     Returns the stamp of the first, the ranges (n,), their anchors (n, 3) and tags (n, 3), zeros where
     the model has none. Raises BadInput where there are none.
@@ -220,13 +220,24 @@ def places(points: Stream | None, asked: Map) -> dict[int, Floats]:
 
 
 def around(anchors: Floats, parameters: Any) -> list[Floats]:
-    """Places (2,) to four sides of the anchors' middle."""
+    """Return places (2,) to four sides of the anchors' middle, from which a search begins.
+
+    Args:
+        anchors: (n, 3), in m; one that is there more than once counts once.
+        parameters: with `start_reach_m`, how far the places are from the middle.
+    """
     middle, reach = np.unique(anchors, axis=0).mean(axis=0)[:2], parameters.start_reach_m
     return [middle + reach * np.array(side) for side in ((1, 0), (-1, 0), (0, 1), (0, -1))]
 
 
 def best_fit(residuals: Any, starts: list[Floats], parameters: Any) -> Floats:
-    """Return the least of the robust least squares from several starts."""
+    """Return the least of the robust least squares from several starts.
+
+    Args:
+        residuals: place (k,) -> residuals (n,) of ranges, in m.
+        starts: places (k,) to search from.
+        parameters: with `sigma_range_m`; residuals of more than three of it count less.
+    """
     from scipy.optimize import least_squares  # which takes long to import
 
     scale = 3.0 * parameters.sigma_range_m

@@ -51,6 +51,11 @@ def moments(
     """Move mean and covariance by their exact moments.
 
     x' = x + g a^2 with a Gaussian: E a^2 = m^2 + P, Var a^2 = 2 P^2 + 4 m^2 P, Cov(x, a^2) = 2 m P_xa.
+
+    Args:
+        mean, covariance: of both partial pressures, (2,) and (2, 2), changed in place.
+        control, duration_s: of no use: every step is `parameters.step_s` long.
+        parameters: with `step_s`.
     """
     square = mean[0] * mean[0] + covariance[0, 0]
     variance = 2.0 * covariance[0, 0] ** 2 + 4.0 * mean[0] ** 2 * covariance[0, 0]
@@ -69,7 +74,7 @@ def read(pressures: Components, reference: Any, parameters: Any) -> Components:
 
 
 def reading_noise(parameters: Any) -> Components:
-    """Its variance."""
+    """Return the variance of a reading."""
     return (parameters.pressure_variance,)
 
 

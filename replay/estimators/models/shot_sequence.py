@@ -68,7 +68,7 @@ class MovingShooterParameters(ModelParameters):
 
 
 def move(state: Components, control: Components, duration_s: Any, parameters: Any) -> Components:
-    """Place, aim and velocity after a while."""
+    """Return place, aim and velocity after a while."""
     x, y, trajectory, vx, vy = state
     return x + duration_s * vx, y + duration_s * vy, trajectory, vx, vy
 
@@ -132,7 +132,7 @@ def log_likelihood(
 
 
 def _log_mixture(deviation: float, sigma: float, span: float, share: float) -> float:
-    """The log density of a Gaussian of which a share is spread over a span; 0 of what is missing."""
+    """Compute the log density of a Gaussian with a share spread over a span; 0 of what is missing."""
     if np.isnan(deviation):
         return 0.0
     gaussian = -0.5 * (deviation / sigma) ** 2 - np.log(sigma) - 0.5 * LOG_TWO_PI
@@ -174,7 +174,7 @@ def find_shooter(streams: Mapping[str, Stream], parameters: Any) -> Started:
 
 
 def _best_shot(heard: Floats, sensors: Floats, parameters: Any) -> Floats | None:
-    """Place and direction (3,) of one shot, by what sensors (n, 2) hear (n, 4); None of too little."""
+    """Find place and direction (3,) of a shot by what sensors (n, 2) hear (n, 4); None of too little."""
     sigma = np.sqrt(np.array(hear_noise(parameters)))
 
     def residuals(shot: Floats) -> Floats:

@@ -66,7 +66,7 @@ def read_differences(stream: Stream) -> Floats:
 
 
 def read_variances(stream: Stream) -> Floats:
-    """Its covariance (n, 1, 1)."""
+    """Return a reading's covariance (n, 1, 1)."""
     return stream["variance_s2"][:, None, None]
 
 
@@ -125,7 +125,7 @@ def find_source(streams: Mapping[str, Stream], parameters: Any) -> Started:
 def _settled(
     residuals: Function, slopes: Function, place: Floats, near_m: float
 ) -> tuple[Floats, Floats]:
-    """Where the gradient of a soft_l1 cost is zero, near a place (n,), and the information (n, n) there.
+    """Find where a soft_l1 cost's gradient is zero, near a place (n,), and the information (n, n) there.
 
     A search by the cost itself ends where rounding hides what is lower, at another place on another CPU.
     Of a source that nothing tells the distance of, the gradient is zero at infinity: it stays in place.

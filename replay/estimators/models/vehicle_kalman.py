@@ -66,7 +66,7 @@ def manoeuvring_noise(state: Components, duration_s: Any, parameters: Any) -> Co
 
 
 def stand(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """It stays where it is."""
+    """Return the state, which stays where it is."""
     return state[0], 0.0 * state[1], state[2], 0.0 * state[3]
 
 

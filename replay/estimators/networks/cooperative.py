@@ -94,7 +94,7 @@ class CooperativeState(NamedTuple):
 
 
 def memory(states: int) -> RobotMemory:
-    """Memory for one run of so many states."""
+    """Allocate memory for one run of so many states."""
     return RobotMemory(
         np.empty(3),
         np.empty((3, 3)),
@@ -197,7 +197,7 @@ def advance(
 def _events(
     block: Block, state: CooperativeState, prefixes: Sequence[str], mode: Mode, settings: RobotSettings
 ) -> RobotEvents:
-    """The block's events as columns; a robot's estimate is due at its odometry."""
+    """Return the block's events as columns; a robot's estimate is due at its odometry."""
     order, is_able = block.events, state.reasons == ""
     value = np.stack(
         [block.column("forward_mps", "range_m"), block.column("turn_radps", "bearing_rad")], axis=1
@@ -230,7 +230,7 @@ def _number(prefix: str) -> int:
 
 
 def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
-    """The prefixes of the robots that have what is needed, by number."""
+    """Return the prefixes of the robots that have what is needed, by number."""
     leaves = {
         "odometry": schemas.ODOMETRY,
         "range_bearing": schemas.RANGE_BEARING,
@@ -243,7 +243,7 @@ def _robots(topics: Mapping[str, Topic]) -> tuple[str, ...]:
 def _find(
     name: str, topics: Mapping[str, Topic], parameters: CooperativeParameters
 ) -> Iterator[Binding]:
-    """One filter for all robots; raises BadInput where an anchor is not among them."""
+    """Yield one filter for all robots; raises BadInput where an anchor is not among them."""
     prefixes = _robots(topics)
     if len(prefixes) < 2 or "/landmarks" not in topics:
         return

@@ -56,12 +56,18 @@ class FusionMemory(NamedTuple):
 
 
 def fusion_memory(count: int, states: int) -> FusionMemory:
-    """Memory for the fusion of so many estimates at most."""
+    """Allocate memory for the fusion of so many estimates at most."""
     return FusionMemory(np.empty((count, states, states)), np.empty(count))
 
 
 def summed(count: int, weights: Floats, information: Floats, covariance: Floats) -> bool:
-    """Fill the covariance of the weighted sum of informations, (14)."""
+    """Fill the covariance of the weighted sum of informations, (14); False where it is singular.
+
+    Args:
+        count: K, how many are summed.
+        weights, information: of each, (K,), (K, n, n); more of them are left alone.
+        covariance: (n, n), overwritten.
+    """
     size = len(covariance)
     total = np.zeros((size, size))
     for i in range(count):
@@ -74,7 +80,13 @@ def summed(count: int, weights: Floats, information: Floats, covariance: Floats)
 def combined(
     count: int, weights: Floats, information: Floats, means: Floats, mean: Floats, covariance: Floats
 ) -> bool:
-    """Fill mean and covariance of the weighted sum of informations, (14) and (15)."""
+    """Fill mean and covariance of the weighted sum, (14) and (15); False where it is singular.
+
+    Args:
+        count, weights, information: as for `summed`.
+        means: (K, n), of the estimates.
+        mean, covariance: (n,), (n, n), overwritten.
+    """
     if not summed(count, weights, information, covariance):
         return False
     size = len(mean)
@@ -88,7 +100,11 @@ def combined(
 
 
 def trace_slope(covariance: Floats, slope: Floats) -> None:
-    """Fill P^2 / tr P: the criterion gains tr(I_i slope) by weight i."""
+    """Fill P^2 / tr P: the criterion gains tr(I_i slope) by weight i.
+
+    Args:
+        covariance, slope: P and what is filled, (n, n).
+    """
     trace = 0.0
     for row in range(len(covariance)):
         trace += covariance[row, row]
@@ -104,7 +120,11 @@ def trace_slope(covariance: Floats, slope: Floats) -> None:
 
 
 def determinant_slope(covariance: Floats, slope: Floats) -> None:
-    """Fill P / n: the criterion gains tr(I_i slope) by weight i."""
+    """Fill P / n: the criterion gains tr(I_i slope) by weight i.
+
+    Args:
+        covariance, slope: P and what is filled, (n, n).
+    """
     size = len(covariance)
     for row in range(size):
         for column in range(size):
@@ -119,10 +139,17 @@ def weigh_optimally(
     weights: Floats,
     tolerance: float,
 ) -> float:
-    """Weights by w_i <- w_i g_i^p, normalised, until none can gain more than the tolerance.
+    """Fill weights by w_i <- w_i g_i^p, normalised, until none can gain more than the tolerance.
 
     For the trace p is 1/2, for the determinant 1. At the least criterion no gain g_i = tr(I_i slope)
     exceeds 1, and those of weights above 0 are 1.
+
+    Args:
+        by_trace: whether the trace is least, or the determinant.
+        count, covariances, memory, weights, tolerance: as for `weigh`.
+
+    Returns:
+        The gap, see `Fusions`; infinity where a covariance is singular.
     """
     gap = np.inf
     size = covariances.shape[1]
@@ -154,7 +181,11 @@ def weigh_optimally(
 
 
 def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
-    """Niehsen: weights in proportion to 1 / tr P_i."""
+    """Weigh in proportion to 1 / tr P_i: Niehsen.
+
+    Args:
+        count, covariances, weights: as for `weigh`.
+    """
     total = 0.0
     for i in range(count):
         trace = 0.0
@@ -167,7 +198,12 @@ def weigh_by_traces(count: int, covariances: Floats, weights: Floats) -> None:
 
 
 def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
-    """Franken and Huepper: weights by what is lost from |sum of I| without I_i, plus |I_i|."""
+    """Weigh by what is lost from |sum of I| without I_i, plus |I_i|: Franken and Huepper.
+
+    Args:
+        count, weights: as for `weigh`.
+        information: (K, n, n).
+    """
     size = information.shape[1]
     whole = np.zeros((size, size))
     rest = np.empty((size, size))
@@ -184,7 +220,11 @@ def weigh_by_shares(count: int, information: Floats, weights: Floats) -> None:
 
 
 def weigh_fully(count: int, weights: Floats) -> None:
-    """Naive Kalman fusion, as if all errors were independent: every weight is 1."""
+    """Weigh each by 1, as if all errors were independent: naive Kalman fusion.
+
+    Args:
+        count, weights: as for `weigh`.
+    """
     for i in range(count):
         weights[i] = 1.0
 
@@ -192,7 +232,16 @@ def weigh_fully(count: int, weights: Floats) -> None:
 def weigh(
     rule: int, count: int, covariances: Floats, memory: FusionMemory, weights: Floats, tolerance: float
 ) -> float:
-    """Fill the weights of a rule that adds up weighted informations; returns their certificate."""
+    """Fill the weights of a rule that adds up weighted informations; returns their certificate.
+
+    Args:
+        rule: its number in `RULES`.
+        count: K, how many estimates there are.
+        covariances: (K, n, n).
+        memory: with their informations.
+        weights: (K,), overwritten.
+        tolerance: how much the criterion may still gain.
+    """
     if rule in (CI_TRACE, CI_DETERMINANT):
         by_trace = rule == CI_TRACE
         return weigh_optimally(by_trace, count, covariances, memory, weights, tolerance)

@@ -129,7 +129,15 @@ linear_sight = derivative(
 def advance(
     carried: RobotStates, run: int, robot: int, time_ns: int, density: Floats, work: RobotMemory
 ) -> None:
-    """Move one robot to a time by its odometry, with its correlations."""
+    """Move one robot to a time by its odometry, with its correlations.
+
+    Args:
+        carried: the robots of all runs, changed in place.
+        run, robot: which.
+        time_ns: nothing is done where the robot is there already.
+        density: of the odometry's noise, forward and turn, (2,).
+        work: to work in.
+    """
     duration_s = (time_ns - carried.time_ns[run, robot]) * 1e-9
     if duration_s <= 0.0:
         return
@@ -156,7 +164,14 @@ def advance(
 
 
 def fill_spread(covariance: Floats, first: int, rows: Floats, spread: Floats) -> None:
-    """Fill rows P rows' with the block P (3, 3) of one robot; symmetric by construction."""
+    """Fill rows P rows' with the block P (3, 3) of one robot; symmetric by construction.
+
+    Args:
+        covariance: (3 n, 3 n) of all robots.
+        first: where the robot's block begins.
+        rows: (k, 3).
+        spread: (k, k), overwritten.
+    """
     for row in range(len(rows)):
         for column in range(row + 1):
             entry = 0.0
@@ -174,7 +189,16 @@ def look(
     difference: Floats,
     work: RobotMemory,
 ) -> None:
-    """Fill the innovation of a robot's sighting of a place, and its rows by both robots."""
+    """Fill the innovation of a robot's sighting of a place, and its rows by both robots.
+
+    Args:
+        mean: (3 n,) of all robots.
+        robot: the one that sees.
+        place: x and y in m, of a landmark or of the robot that is seen.
+        value: range in m and bearing in rad, (2,).
+        difference: (2,), overwritten.
+        work: whose `both` is filled.
+    """
     first = 3 * robot
     linear_sight((mean[first], mean[first + 1], mean[first + 2]), place, work)
     for row in range(2):
@@ -185,7 +209,13 @@ def look(
 
 
 def see_through(covariance: Floats, first: int, side: int, work: RobotMemory) -> float:
-    """Fill what a sighting says of one robot's block of the covariance; returns the block's trace."""
+    """Fill what a sighting says of one robot's block of the covariance; returns the block's trace.
+
+    Args:
+        covariance, first: as for `fill_spread`.
+        side: 0 for the robot that sees, 1 for the one that is seen.
+        work: with `both`; `spread` and `square` of this side are filled.
+    """
     rows, trace = work.both[side], 0.0
     fill_spread(covariance, first, rows, work.spread[side])
     for k in range(3):
@@ -203,7 +233,12 @@ def see_through(covariance: Floats, first: int, side: int, work: RobotMemory) ->
 
 
 def scale(covariance: Floats, first: int, factor: float) -> None:
-    """Scale the block of one robot."""
+    """Scale the block of one robot, in place.
+
+    Args:
+        covariance, first: as for `fill_spread`.
+        factor: by which.
+    """
     for row in range(3):
         for column in range(3):
             covariance[first + row, first + column] *= factor
@@ -219,7 +254,17 @@ def meet(
     fusion: SightingFusion,
     work: RobotMemory,
 ) -> bool:
-    """Use a sighting; False where a covariance is not positive definite."""
+    """Use a sighting; False where a covariance is not positive definite.
+
+    Args:
+        mean, covariance: (3 n,), (3 n, 3 n) of all robots, changed in place.
+        robots: the one that sees and the one that is seen, -1 for a landmark, (2,).
+        difference: the innovation (2,), see `look`.
+        variance: of range and bearing, (2,).
+        gate: the largest squared distance of what is used.
+        fusion: how another robot's estimate is used.
+        work: with `both` by `look`.
+    """
     own, noise, traces = np.zeros((2, 2)), np.empty((2, 2)), np.zeros(2)
     first, both = (3 * robots[0], 3 * robots[1]), robots[1] >= 0
     for row in range(2):

@@ -32,7 +32,11 @@ class Fused(NamedTuple):
 
 
 def inverted(matrix: Floats, inverse: Floats) -> bool:
-    """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular."""
+    """Fill the inverse of a positive definite matrix; False where it is not, or nearly singular.
+
+    Args:
+        matrix, inverse: (n, n).
+    """
     size = len(matrix)
     factor = np.zeros((size, size))
     if not cholesky(factor, matrix, size):
@@ -59,7 +63,12 @@ def inverted(matrix: Floats, inverse: Floats) -> bool:
 
 
 def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
-    """Fill matrix @ vector."""
+    """Fill matrix @ vector.
+
+    Args:
+        matrix: (n, n).
+        vector, image: (n,), not the same.
+    """
     for row in range(len(vector)):
         image[row] = 0.0
         for k in range(len(vector)):
@@ -67,7 +76,12 @@ def transform(matrix: Floats, vector: Floats, image: Floats) -> None:
 
 
 def blend(share: float, left: Floats, rest: float, right: Floats, total: Floats) -> None:
-    """Fill share * left + rest * right."""
+    """Fill share * left + rest * right.
+
+    Args:
+        share, rest: what left and right are multiplied by.
+        left, right, total: (n, n); the last, which is filled, may be one of the others.
+    """
     for row in range(len(total)):
         for column in range(len(total)):
             total[row, column] = share * left[row, column] + rest * right[row, column]
@@ -104,11 +118,16 @@ def steps_for(tolerance: float) -> int:
 
 
 def golden(step: int, steps: int, value: float, section: Floats) -> float:
-    """Find where in (0, 1) a search for the least value looks next, after `value` at the last place.
+    """Find where in (0, 1) a search for the least value looks next: golden section.
 
-    Golden section; the last of all steps is the middle of what is left. `section` (7,) is what the
-    search remembers: both ends, both inner places and their values, and which one was asked for. Written
-    like this, the function that is searched is called in one place, and compiled once.
+    The last of all steps is the middle of what is left. Written like this, the function that is searched
+    is called in one place, and compiled once.
+
+    Args:
+        step, steps: which step, from 0, of how many.
+        value: that at the last place; of no use at step 0.
+        section: (7,), what the search remembers: both ends, both inner places and their values, and which
+            one was asked for.
     """
     if step == 0:
         section[0], section[1] = 1e-9, 1.0 - 1e-9

@@ -177,7 +177,7 @@ def _schedule(
     prior_ns: Integers,
     name: str,
 ) -> tuple[Activities, Sensing, Integers]:
-    """The activities of all nodes and runs, their measurements, and the rows of what arrives."""
+    """Return the activities of all nodes and runs, their measurements, and the rows of what arrives."""
     numbers = list(sensors)
     centralised = name == CENTRALISED
     sensing = _sensing(whole, sensors, components)

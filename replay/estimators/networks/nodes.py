@@ -112,7 +112,7 @@ class NodeMemory(NamedTuple):
 
 
 def node_memory(nodes: int, most: int, states: int) -> NodeMemory:
-    """Memory for so many nodes, of which each fuses so many estimates at most."""
+    """Allocate memory for so many nodes, of which each fuses so many estimates at most."""
     square, many = (nodes, states, states), (most, states, states)
     return NodeMemory(
         Nodes(
@@ -145,7 +145,12 @@ class NodeResults(NamedTuple):
 
 
 def move(mean: Floats, covariance: Floats, density: float, duration_s: float) -> None:
-    """Predict with constant velocity, in place."""
+    """Predict with constant velocity, in place.
+
+    Args:
+        mean, covariance: (n,), positions in m, then velocities; (n, n).
+        density, duration_s: of the acceleration's noise; how long.
+    """
     predict_constant_velocity(
         mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s)
     )
@@ -156,7 +161,10 @@ def observe(
 ) -> None:
     """Update with what is measured, component by component, in place.
 
-    `independent` is the part of the covariance that stems from measurements since it was zero.
+    Args:
+        mean, covariance: (n,), (n, n).
+        independent: the part of the covariance from measurements since it was zero, (n, n).
+        value, variance: (n,), NaN for what is not measured.
     """
     size = len(mean)
     gain, crossed = np.empty(size), np.empty(size)
@@ -187,7 +195,13 @@ def observe(
 def observe_all(
     activity: int, mean: Floats, covariance: Floats, independent: Floats, inputs: NodeInputs
 ) -> None:
-    """Update with all that a node measures in an activity, see `observe`."""
+    """Update with all that a node measures in an activity, see `observe`.
+
+    Args:
+        activity: its number.
+        mean, covariance, independent: as for `observe`.
+        inputs: with the measurements.
+    """
     activities, sensing = inputs.events, inputs.sensing
     for k in range(activities.measured[activity], activities.measured[activity + 1]):
         variance = sensing.variance[sensing.sensor[k]]
@@ -195,7 +209,11 @@ def observe_all(
 
 
 def squared_distance(difference: Floats, covariance: Floats) -> float:
-    """Return the squared Mahalanobis distance; infinity where the covariance is singular."""
+    """Return the squared Mahalanobis distance; infinity where the covariance is singular.
+
+    Args:
+        difference, covariance: (n,), (n, n).
+    """
     information = np.empty_like(covariance)
     if not inverted(covariance, information):
         return np.inf
@@ -207,7 +225,11 @@ def squared_distance(difference: Floats, covariance: Floats) -> float:
 
 
 def divergence(mean: Floats, covariance: Floats, of_mean: Floats, of_covariance: Floats) -> float:
-    """Return the Kullback-Leibler divergence (nats) of a Gaussian from another one, the second."""
+    """Return the Kullback-Leibler divergence (nats) of a Gaussian from another one, the second.
+
+    Args:
+        mean, covariance, of_mean, of_covariance: of the first and the second, (n,), (n, n).
+    """
     size = len(mean)
     information, difference = np.empty_like(covariance), np.empty(size)
     if not inverted(of_covariance, information):
@@ -224,6 +246,10 @@ def agrees(mean: Floats, covariance: Floats, received: Estimate, gate: float) ->
     """Tell whether an estimate may be of the same state, however both are correlated.
 
     The difference's covariance is at most P_a / w + P_b / (1 - w) for any w; here w is 1 / 2.
+
+    Args:
+        mean, covariance, received: both estimates, (n,), (n, n).
+        gate: their largest squared distance; infinity lets everything in.
     """
     if gate == np.inf:
         return True
@@ -263,7 +289,14 @@ def act(
     results: NodeResults,
     work: NodeMemory,
 ) -> bool:
-    """Take all nodes through a time: they send first, and then take in what they hear."""
+    """Take all nodes through a time: they send first, then take in what they hear; False if they fail.
+
+    Args:
+        run: which.
+        begin, end: the activities of this time.
+        inputs, results, work: what nodes go by, what is filled, what is worked in.
+        failed_ns: (runs,), gets the time at which a fusion fails.
+    """
     activities, fusion, (nodes, parts, weights, memory) = inputs.events, inputs.fusion, work
     for activity in range(begin, end):
         predict_and_send(activity, inputs.prior_ns[run], inputs, nodes, results)
@@ -309,7 +342,13 @@ def predict_and_send(
 def is_due(
     node: int, now: int, mean: Floats, covariance: Floats, inputs: NodeInputs, nodes: Nodes
 ) -> bool:
-    """Tell whether x* may be sent again, and differs enough from what the last message says of now."""
+    """Tell whether x* may be sent again, and differs enough from what the last message says of now.
+
+    Args:
+        node, now: its number, and the time in ns.
+        mean, covariance: x*, (n,), (n, n).
+        inputs, nodes: what nodes go by, and what they sent last.
+    """
     sensing, fusion = inputs.sensing, inputs.fusion
     if nodes.last_ns[node] < 0:
         return True

@@ -23,7 +23,7 @@ SIGHTING_STEPS = 40
 
 
 def mix_inverse(weight: float, pair: Estimate, fused: Estimate) -> bool:
-    """Inverse CI of two estimates at a weight: I_a + I_b less that of w P_a + (1 - w) P_b."""
+    """Fuse two estimates by inverse CI at a weight: I_a + I_b less that of w P_a + (1 - w) P_b."""
     size, shares = len(fused.mean), (weight, 1.0 - weight)
     covariance, information = np.zeros((3, size, size)), np.empty((3, size, size))
     for i in range(2):
@@ -103,16 +103,24 @@ class Stake(NamedTuple):
 
 
 def sighting_weight(by_trace: bool, stake: Stake, shared: Floats, own: Floats) -> float:
-    """The weight w of the update by a measurement of part of a state that rests on another estimate.
+    """Find the weight w of a measurement of part of a state that rests on another estimate.
 
-    Its noise has a part `shared` that is correlated with the state in an unknown way, and one that is
-    not, `own`, the sensor's: P / w stands against shared / (1 - w) + own, at the w of the least trace,
-    which depends on the state's units, or the least determinant, which does not. It is above 0: at 0
-    whatever the measurement does not see would be lost. NaN where a covariance is singular.
+    Its noise has a part that is correlated with the state in an unknown way, and one that is not, the
+    sensor's: P / w stands against shared / (1 - w) + own, at the w of the least trace, which depends on
+    the state's units, or the least determinant, which does not. It is above 0: at 0 whatever the
+    measurement does not see would be lost.
 
     With R = shared / (1 - w) + own and S = H P H' / w + R the fused covariance has the trace
     tr P / w - tr(S^-1 H P P H') / w^2 and a determinant in proportion to |R| / (w^n |S|). Trace and
     logarithm are convex in w.
+
+    Args:
+        by_trace: whether the trace is least, or the determinant.
+        stake: what the measurement says of the state.
+        shared, own: the parts of the noise, (m, m).
+
+    Returns:
+        The weight; NaN where a covariance is singular.
     """
     noise, total, precision = np.empty_like(own), np.empty_like(own), np.empty_like(own)
     section = np.empty(7)

@@ -11,7 +11,11 @@ from replay.distributions.bingham_kernels import Vector
 
 
 def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
-    """Tell whether no component of the three vectors is NaN or infinite."""
+    """Tell whether no component of the three vectors is NaN or infinite.
+
+    Args:
+        rate, force, field: (3,).
+    """
     total = 0.0
     for i in range(3):
         total += rate[i] + force[i] + field[i]
@@ -19,7 +23,12 @@ def all_finite(rate: NDArray, force: NDArray, field: NDArray) -> bool:
 
 
 def fill_isotropic(sigma_rad: float, z: NDArray) -> None:
-    """Fill concentrations about the identity, in the order of a quaternion's components."""
+    """Fill concentrations about the identity, in the order of a quaternion's components.
+
+    Args:
+        sigma_rad: standard deviation of a turn about each axis.
+        z: (4,), overwritten; the first is 0, the mode's.
+    """
     z[:] = -2.0 / sigma_rad**2
     z[0] = 0.0
 
@@ -33,7 +42,12 @@ def turn_quaternion(x_rad: float, y_rad: float, z_rad: float) -> tuple[float, fl
 
 
 def turn_back(turned: Vector, vector: NDArray) -> None:
-    """Turn a fixed vector, in place, into the frame of a body that has turned by a quaternion."""
+    """Turn a fixed vector, in place, into the frame of a body that has turned by a quaternion.
+
+    Args:
+        turned: the unit quaternion (4,), w first.
+        vector: (3,), changed.
+    """
     w, x, y, z = turned[0], -turned[1], -turned[2], -turned[3]
     a, b, c = vector[0], vector[1], vector[2]
     d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
@@ -43,7 +57,7 @@ def turn_back(turned: Vector, vector: NDArray) -> None:
 
 
 def triad(force: Components, field: Components) -> tuple[float, float, float, float]:
-    """The orientation under which force points up and field north; NaN where they are parallel."""
+    """Find the orientation under which force points up, field north; NaN where they are parallel."""
     up = unit(force)
     east = unit(cross(field, up))
     north = cross(up, east)
@@ -69,7 +83,12 @@ def unit(vector: Components) -> Components:
 
 
 def fill_diagonal(values: NDArray, out: NDArray) -> None:
-    """Fill a diagonal matrix."""
+    """Fill a diagonal matrix.
+
+    Args:
+        values: (n,).
+        out: (n, n), overwritten.
+    """
     out[:] = 0.0
     for i in range(len(values)):
         out[i, i] = values[i]

@@ -138,7 +138,13 @@ class Anchor:
 
 
 def motion_between(time_ns: Integers, poses: Floats, bounds: Bounds) -> Motion:
-    """Return the motion between two stamps (2,) by the poses (2, 3) that odometry has there."""
+    """Return the motion between two stamps by the poses that odometry has there.
+
+    Args:
+        time_ns: (2,), the earlier one first.
+        poses: (2, 3), x, y in m and heading in rad.
+        bounds: how far odometry errs, which grows with the time between.
+    """
     span_s = float(time_ns[1] - time_ns[0]) * 1e-9
     *displacement, turn = relative_pose(*poses)
     return Motion(

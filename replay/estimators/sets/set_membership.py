@@ -108,7 +108,13 @@ def set_metadata(topic: str, known: Known) -> dict[str, str]:
 def set_streams(
     prefix: str, metadata: Mapping[str, str], borders: Sequence[tuple[int, list[Floats]]]
 ) -> tuple[Stream, Stream]:
-    """Return the sets of a run, by stamp the borders of each, and how many vertices each has."""
+    """Return the sets of a run, and how many vertices each has, as streams.
+
+    Args:
+        prefix: of their topics.
+        metadata: what the channels state.
+        borders: by stamp (ns) the rings of each set, (vertices, 2) in m; no ring for an empty one.
+    """
 
     def whole(numbers: Iterable[int]) -> Integers:
         return np.fromiter(numbers, np.int64)
