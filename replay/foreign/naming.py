@@ -64,7 +64,7 @@ def name_of(label: str, settings: Mapping[str, Any]) -> tuple[str, dict[str, Any
 
 
 def _label(kind: str, rest: str) -> str:
-    """The stem of a library or program; of a script where an interpreter comes first."""
+    """Take the stem of a library or program; of a script where an interpreter comes first."""
     words = [rest]
     if kind == "exec":
         words = split_command(rest)

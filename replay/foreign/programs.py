@@ -109,7 +109,7 @@ def _cannot_go_back(label: str, window_ns: int) -> Recursive:  # noqa: ARG001
 
 
 def _state_of(words: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """The size and the last change of the files that a command names, by which it is asked again."""
+    """Return sizes and last changes of the files that a command names, by which it is asked again."""
     found = []
     for word in words:
         with suppress(OSError, ValueError):
@@ -159,7 +159,7 @@ def _of_files(label: str, words: tuple[str, ...]) -> Estimator[Any]:
 
 
 def _parameters_in(label: str, words: Sequence[str]) -> dict[str, float]:
-    """The parameters that places such as {sigma_m=0.1} declare, with their defaults."""
+    """Return the parameters that places such as {sigma_m=0.1} declare, with their defaults."""
     found: dict[str, float] = {}
     for name, default in (place for word in words for place in _PLACE.findall(word)):
         if name in (LOG, TABLES, OUT) and not default:
@@ -181,7 +181,7 @@ def _is_map(topic: Topic) -> bool:
 
 
 def _truth(label: str, topics: Mapping[str, Topic], named: str) -> Topic | None:
-    """The truth that estimates are of; raises BadInput where several are."""
+    """Return the truth that estimates are of; raises BadInput where several are."""
     truths = {
         name: topic
         for name, topic in topics.items()

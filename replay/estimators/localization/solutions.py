@@ -30,7 +30,7 @@ class Batches(NamedTuple):
 
 
 def table_of(streams: Sequence[Ragged], fields: Sequence[str]) -> pd.DataFrame:
-    """Put the messages of all sensors in a table: run, sensor (its place among them), time_ns, fields."""
+    """Put the messages of all sensors in a table: run, sensor (its place there), time_ns, fields."""
     return pd.concat(
         [
             pd.DataFrame(

@@ -106,7 +106,7 @@ def to_body(orientation: Components, x: Components) -> Components:
 
 
 def sight(state: Components, reference: Components, bias: Components, clock_s: Any) -> Components:
-    """Return a target's azimuth and elevation in rad; `reference` has its number, and a sensor's pose."""
+    """Return a target's azimuth and elevation, rad; `reference` has its number, and a sensor's pose."""
     second = 1.0 * (reference[0] == 2.0)
     one, other = moved_target(state, 0, -clock_s), moved_target(state, 6, -clock_s)
     offset = (

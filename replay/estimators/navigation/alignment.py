@@ -189,13 +189,13 @@ def check_prior(streams: Mapping[str, Stream], parameters: Any) -> list[str]:
 
 
 def _wide(sigma: float | None, covariance: Floats) -> Floats:
-    """The covariance (3, 3) of a start at a message of this one, which is used once more."""
+    """Return the covariance (3, 3) of a start at a message of this one, which is used once more."""
     given = stated_or(sigma, None)
     return WIDER**2 * covariance if given is None else given**2 * np.eye(3)
 
 
 def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> Floats:
-    """Of the tilt and the accelerometer's bias (6, 6), in the body's axes, where `up` is up.
+    """Return that of the tilt and the accelerometer's bias (6, 6), in the body's axes, `up` being up.
 
     Where the tilt's is not given they go together: a bias is levelled away, and the body leans by as
     much as the bias is of gravity.
@@ -216,7 +216,7 @@ def _tilt_covariance(up: Floats, unsteadiness_mps2: float, parameters: Any) -> F
 def _first_place(
     fix: Stream, samples: ImuSamples, topic: str, parameters: Any
 ) -> tuple[int, Floats, Floats]:
-    """When the first fix within the samples was measured, its place (3,) and covariance (3, 3).
+    """Find when the first fix within the samples was measured, its place (3,) and covariance (3, 3).
 
     One in the plane has the height of the origin. Raises BadInput where there is none.
     """
@@ -236,7 +236,7 @@ def _first_place(
 
 
 def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, float]:
-    """Roll and pitch, rad, under which the mean of the first specific forces points up.
+    """Find roll and pitch, rad, under which the mean of the first specific forces points up.
 
     Raises BadInput where that is not gravity in m/s2, or points down.
     """
@@ -260,7 +260,7 @@ def _tilt(samples: ImuSamples, topic: str, parameters: Any) -> tuple[float, floa
 def _bias(
     samples: ImuSamples, topic: str, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[Floats, float]:
-    """The mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
+    """Return the mean turn rate (3,) at rest, zeros where there was none, and its standard deviation.
 
     The means of single stretches of `level_s` differ by noise and unrest; the earth turns too.
 
@@ -289,7 +289,7 @@ def _bias(
 
 
 def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) -> str:
-    """What to say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
+    """Say where the unit and the fixes set off as far apart as their clocks' leap seconds."""
     moved = motion.first_above(row, parameters.still_mps)
     level = samples.time_ns < samples.time_ns[0] + round(parameters.level_s / NS)
     if moved is None:
@@ -313,7 +313,7 @@ def _leap(samples: ImuSamples, motion: GnssMotion, row: int, parameters: Any) ->
 def _turned(
     samples: ImuSamples, start_ns: int, tilted: Components, bias: Floats
 ) -> tuple[Floats, Floats]:
-    """Seconds since the start (n,), of the samples from there on, and what the body turned about up."""
+    """Return seconds since the start (n,), of the samples from there on, and the turn about up."""
     since = samples.time_ns >= start_ns
     since_s = np.asarray((samples.time_ns[since] - start_ns) * NS, float)
     up = np.array(into_body(tilted, (0.0, 0.0, 1.0)))
@@ -322,7 +322,7 @@ def _turned(
 
 
 def _integral(values: NDArray, times_s: Floats) -> NDArray:
-    """What values (n,) come to from the first time on, by the trapezoid rule."""
+    """Integrate values (n,) from the first time on, by the trapezoid rule."""
     from scipy.integrate import cumulative_trapezoid  # which takes long to import
 
     return np.asarray(cumulative_trapezoid(values, times_s, initial=0.0))
@@ -331,7 +331,7 @@ def _integral(values: NDArray, times_s: Floats) -> NDArray:
 def _heading(
     turning: tuple[Floats, Floats], start_ns: int, motion: GnssMotion, row: int, parameters: Any
 ) -> tuple[float, float] | None:
-    """The heading at the start, rad, and its standard deviation; None where nothing moves.
+    """Find the heading at the start, rad, and its standard deviation; None where nothing moves.
 
     It is the first course, less what the body turned about up until then. A body that looks where it
     goes has the same of all later courses; how much they differ is how far it may be off.
@@ -358,7 +358,7 @@ def _mounting(
     heading: float,
     parameters: Any,
 ) -> str:
-    """What to say where the body accelerates in another direction than its velocity changes.
+    """Say where the body accelerates in another direction than its velocity changes.
 
     Both are compared over the intervals of the velocities, in the plane and as complex numbers.
     """

@@ -136,7 +136,7 @@ def first_of_periods(stream: Stream) -> Booleans:
 
 
 def read_velocity(stream: Stream) -> Floats:
-    """No velocity (n, 3), once a period."""
+    """Return no velocity (n, 3), once a period."""
     return np.where(first_of_periods(stream)[:, None], np.zeros(3), np.nan)
 
 
@@ -146,7 +146,7 @@ def read_field(stream: Stream) -> Floats:
 
 
 def find(streams: Mapping[str, Stream], parameters: Any) -> Started:
-    """Orientation and field by the means of the rest, in which force is up and the field is north.
+    """Find orientation and field by the means of the rest: force is up there, and the field north.
 
     Raises BadInput where there is no magnetometer, or both point the same way.
     """

@@ -114,7 +114,7 @@ class NavigationParameters(AlignmentParameters):
 
 
 def read_inertial(stream: Stream) -> Floats:
-    """Specific force and turn rate (n, 6) of inertial samples."""
+    """Return the specific force and turn rate (n, 6) of inertial samples."""
     return np.hstack([stream["specific_force_mps2"], stream["turn_rate_radps"]])
 
 
@@ -144,7 +144,7 @@ def move_noise(state: Components, duration_s: Any, parameters: Any) -> Component
 
 
 def gap_noise(state: Components, duration_s: Any, parameters: Any) -> Components:
-    """The variances that a gap of the unit adds: of where it may have gone and turned meanwhile."""
+    """Return the variances that a gap of the unit adds: where it may have gone and turned meanwhile."""
     speed_squared = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
     gained = (parameters.gap_acceleration_mps2 * duration_s) ** 2
     moved = (speed_squared + 0.25 * gained) * duration_s**2

@@ -63,7 +63,7 @@ def read_samples(inertial: Stream, parameters: Any) -> ImuSamples:
 
 
 def stated_or(sigma: float | None, otherwise: Any) -> Any:
-    """A parameter that may not be given, which is None, or NaN among the numbers that a filter has."""
+    """Return a parameter, or else what holds where it is None, or NaN among a filter's numbers."""
     return otherwise if sigma is None or np.isnan(sigma) else sigma
 
 
@@ -85,7 +85,7 @@ PLUMB_SIGMA_RAD = 1e-4  # by which the plumb line is off the ellipsoid's normal
 
 
 def unsteadiness(samples: ImuSamples, motion: GnssMotion | None, parameters: Any) -> float:
-    """How far the mean specific force of the first samples may be from gravity's, m/s2, by motion.
+    """Compute how far the first samples' mean specific force may be from gravity's, m/s2, by motion.
 
     It is as much as they differ among themselves, and as the velocity changes meanwhile.
     """

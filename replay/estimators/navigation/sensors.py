@@ -32,7 +32,7 @@ def be_high(state: Components, reference: Any, parameters: Any) -> Components:
 
 
 def roll_along(state: Components, samples: Components, parameters: Any) -> Components:
-    """The velocity of the wheels, forward, left, up: they neither slip sideways nor leave the ground."""
+    """Return the velocity of the wheels, forward, left, up: they neither slip aside nor lift off."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, gx, gy, gz, _, _, _ = state
     wx, wy, wz = turn_rate(samples, (gx, gy, gz), parameters)
     axle = parameters.axle_x_m, parameters.axle_y_m, parameters.axle_z_m
@@ -108,29 +108,29 @@ def range_noise(parameters: Any) -> Components:
 
 
 def read_heading(stream: Stream) -> Floats:
-    """Headings (n, 1) of orientations."""
+    """Return the headings (n, 1) of orientations."""
     return heading(stream["quaternion"])[:, None]
 
 
 def read_height(stream: Stream) -> Floats:
-    """Heights (n, 1)."""
+    """Return heights (n, 1)."""
     return stream["value"][:, :1]
 
 
 def read_wheels(stream: Stream) -> Floats:
-    """Velocities of the wheels (n, 3): forward as measured, no other."""
+    """Return the velocities of the wheels (n, 3): forward as measured, no other."""
     forward = stream["forward_mps"]
     return np.stack([forward, np.zeros(len(forward)), np.zeros(len(forward))], axis=1)
 
 
 def read_standing(stream: Stream) -> Floats:
-    """No velocity (n, 3) where the value is not zero, nothing where it is: the body may move."""
+    """Return no velocity (n, 3) where the value is not zero, nothing where it is: the body may move."""
     stands = stream["value"][:, :1] != 0.0
     return np.where(stands, 0.0, np.full((len(stands), 3), np.nan))
 
 
 def read_rolling(stream: Stream) -> Floats:
-    """No velocity to the side and up (n, 2) where the value is not zero, nothing where it is."""
+    """Return no velocity to the side and up (n, 2) where the value is not zero, nothing where it is."""
     return read_standing(stream)[:, :2]
 
 

@@ -63,7 +63,7 @@ WITH_HEADING = Correction(heading, move, step_to, move_back)
 
 
 def _moved(state: Components, step: Components, slope: Components, of_body: float) -> Components:
-    """The state after a step whose rest is of the body's axes, 1, or of the plane's, 0."""
+    """Return the state after a step whose rest is of the body's axes, 1, or of the plane's, 0."""
     orientation = state[6:10]
     up = into_body(orientation, UP)
     down = _times(-1.0, up)
@@ -84,7 +84,7 @@ def _moved(state: Components, step: Components, slope: Components, of_body: floa
 def _forth(
     step: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """How a vector changes by its step: along its circle, and by the rest of the step, swung."""
+    """Return how a vector changes by its step: along its circle, and by the rest of the step, swung."""
     rest = _less(step, _times(turn, slope))
     return _plus(_arc(slope, axis, turn), _rotated(rest, axis, swing))
 
@@ -92,27 +92,27 @@ def _forth(
 def _back(
     change: Components, slope: Components, axis: Components, turn: Component, swing: Component
 ) -> Vector:
-    """The step by which a vector changes so, see `_forth`."""
+    """Return the step by which a vector changes so, see `_forth`."""
     rest = _rotated(_less(change, _arc(slope, axis, turn)), axis, -swing)
     return _plus(_times(turn, slope), rest)
 
 
 def _arc(slope: Components, axis: Components, turn: Component) -> Vector:
-    """From a point to that a turn further on, on a circle about the axis with this tangent there."""
+    """Go from a point to that a turn further on, on a circle about the axis with this tangent there."""
     once = cross(axis, slope)
     bent = _plus(_times(1.0 - np.cos(turn), once), _times(turn - np.sin(turn), cross(axis, once)))
     return _plus(_times(turn, slope), bent)
 
 
 def _rotated(vector: Components, axis: Components, angle: Component) -> Vector:
-    """The vector, rotated about the unit vector of an axis: Rodrigues' formula."""
+    """Rotate a vector about the unit vector of an axis: Rodrigues' formula."""
     once = cross(axis, vector)
     turned = _plus(_times(np.sin(angle), once), _times(1.0 - np.cos(angle), cross(axis, once)))
     return _plus(vector, turned)
 
 
 def _across(axis: Components, vector: Components) -> Vector:
-    """What is at right angles to the unit vector of an axis."""
+    """Return what of a vector is at right angles to the unit vector of an axis."""
     return _less(vector, _times(_dot(axis, vector), axis))
 
 

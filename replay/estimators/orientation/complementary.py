@@ -107,7 +107,7 @@ def follow_madgwick(
     state: ComplementaryState,
     results: Results,
 ) -> None:
-    """A step of the gyro, and one down the gradient of what force and field contradict."""
+    """Take a step of the gyro, and one down the gradient of what force and field contradict."""
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])
         q = began(run, messages, row, state)
@@ -148,7 +148,7 @@ def follow_mahony(
     state: ComplementaryState,
     results: Results,
 ) -> None:
-    """A step of the gyro less its bias, turned towards what force and field say, (48)."""
+    """Take a step of the gyro less its bias, turned towards what force and field say, (48)."""
     bias = state.bias[run]
     for row in range(messages.offsets[run], messages.offsets[run + 1]):
         force, rate, field = unit_vectors(messages.value[row])

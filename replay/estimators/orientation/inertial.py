@@ -180,7 +180,7 @@ def run_dead_reckoning(
     *,
     unbiased: bool,
 ) -> tuple[ReckoningState, OrientationEstimates]:
-    """The gyro alone from the attitude of the rest on, less its mean over the rest where `unbiased`.
+    """Follow the gyro alone from the attitude of the rest on, less its mean there where `unbiased`.
 
     There are no estimates before the rest is over, nor after a gap. Args and errors as
     `run_inertial_filter`.
@@ -208,7 +208,7 @@ def attitudes(
 def _prepared(
     model: InertialModel, samples: InertialSamples, estimates: OrientationEstimates | None
 ) -> tuple[InertialSamples, OrientationEstimates]:
-    """Checked samples, and estimates to fill."""
+    """Return checked samples, and estimates to fill."""
     rows = int(samples.offsets[-1])
     if any(column.shape != (rows, 3) for column in samples[2:]) or samples.time_ns.shape != (rows,):
         raise BadInput(
@@ -350,7 +350,7 @@ def _start_block(state: InertialState, run: int, time_ns: int) -> None:
 
 
 def _end_block(model: InertialModel, state: InertialState, run: int, elapsed_s: float) -> None:
-    """One prediction over the block and one update with its attitude, in place."""
+    """Predict once over the block and update once with its attitude, in place."""
     axes, z = state.axes[run], state.concentrations[run]
     moments, noise, work = np.empty(4), np.empty(4), np.empty((4, 4))
     if z[0] < 0.0:
@@ -380,7 +380,7 @@ def _dead_reckon(
     estimates: OrientationEstimates,
     row: int,
 ) -> None:
-    """The orientation that the block's increment leads to, and the error that it adds."""
+    """Write the orientation that the block's increment leads to, and the error that it adds."""
     increment, covariance = state.increment[run], estimates.covariance[row]
     compose(state.axes[run, :, 3], increment, estimates.orientation[row])
     for i in range(3):

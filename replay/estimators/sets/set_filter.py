@@ -195,7 +195,7 @@ def follow(
 
 
 def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) -> SetStep:
-    """What a frame says by itself."""
+    """Say what a frame says by itself."""
     headings = narrowed(ALL_HEADINGS, cut, seen, bounds.bearing_rad) or ALL_HEADINGS
     return SetStep(frame.time_ns, frame.time_ns, [cut], headings)
 
@@ -203,7 +203,7 @@ def _first(frame: Frame, cut: shapely.Geometry, seen: Bearings, bounds: Bounds) 
 def _advance(
     anchor: Anchor, frame: Frame, cut: shapely.Geometry, seen: Bearings, pose: Floats, bounds: Bounds
 ) -> SetStep:
-    """The set of an anchor moved to a frame and cut by it; the anchor is cut by the frame as well."""
+    """Move an anchor's set to a frame and cut it by that; the anchor is cut by the frame as well."""
     stamps = np.array([anchor.time_ns, frame.time_ns])
     motion = motion_between(stamps, np.array([anchor.pose, pose]), bounds)
     past = [moved(part, anchor.headings, motion) for part in anchor.parts]
@@ -228,7 +228,7 @@ def _advance(
 def _cut(
     anchor: Anchor, step: SetStep, cut: shapely.Geometry, seen: Bearings, motion: Motion, bounds: Bounds
 ) -> SetStep | None:
-    """The step and its anchor cut by a frame; None, and no change, where nothing would be left."""
+    """Cut the step and its anchor by a frame; None, and no change, where nothing would be left."""
     common = shapely.union_all(step.parts).intersection(cut)
     if common.area == 0.0:
         return None
@@ -252,7 +252,7 @@ def _cut(
 
 
 def _contradicting(frame: Frame, places: shapely.Geometry) -> int | None:
-    """The relative bearing whose bound is exceeded most at the corner of a set that suits it best."""
+    """Find the relative bearing exceeding its bound most at the corner of a set that suits it best."""
     excess = np.nan_to_num(excess_rad(frame.pairs, shapely.get_coordinates(places)), nan=0.0)
     best = excess[np.argmin(excess.max(axis=1))]
     return int(np.argmax(best)) if best.max() > 0.0 else None
@@ -290,7 +290,7 @@ def solve(given: Given[SetFilterParameters]) -> list[Ragged]:
 def _streams(
     prefix: str, metadata: Mapping[str, str], steps: Sequence[SetStep], frame_at: Mapping[int, Frame]
 ) -> tuple[Stream, ...]:
-    """Sets as `set_membership` gives them, what each rests on, and what was found wrong."""
+    """Make sets as `set_membership` gives them, what each rests on, and what was found wrong."""
     blamed = [(frame_at[step.time_ns], step.blamed) for step in steps if step.blamed is not None]
     with_finding = [step for step in steps if step.finding is not None]
     return (

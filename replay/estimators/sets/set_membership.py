@@ -196,7 +196,7 @@ def known_of(topic: Topic, landmarks: Topic, parameters: SetParameters) -> Known
 
 
 def _numbers(topic: Topic, name: str) -> tuple[float, ...]:
-    """Finite numbers, with commas between, that a channel states."""
+    """Read finite numbers, with commas between, that a channel states."""
     try:
         numbers = tuple(float(part) for part in topic.metadata[name].split(","))
     except ValueError:

@@ -106,7 +106,7 @@ def start(given: Filtering) -> tuple[Filtering, Mixture]:
 
 
 def no_components(runs: int, most: int) -> Mixture:
-    """Mixtures without components."""
+    """Make mixtures without components."""
     return Mixture(
         used=np.zeros(runs, np.int64),
         time_ns=np.full(runs, -1),
@@ -148,7 +148,7 @@ def _work(most: int, detections: int) -> PhdMemory:
 
 
 def _no_sets(scans: Scans, mixture: Mixture, settings: PhdSettings) -> Sets:
-    """Room for the elements: twice the weight that a scan can lead to at most."""
+    """Make room for the elements: twice the weight that a scan can lead to at most."""
     count = len(scans.time_ns)
     bound = np.empty(count)
     passed = (1.0 - settings.detection_probability) * settings.survival_probability
@@ -189,7 +189,7 @@ def scans_of(scan: Ragged, detection: Ragged) -> Scans:
 
 
 def _outputs(topic: str, scans: Scans, sets: Sets, before: Mixture, after: Mixture) -> list[Ragged]:
-    """Per scan the set's size and the expected number, its elements, and the runs that failed."""
+    """Return per scan the set's size and the expected number, its elements, and the runs that failed."""
     reported = np.flatnonzero(sets.is_reported)
     offsets = np.searchsorted(reported, scans.offsets)
     time_ns, elements, expected = (

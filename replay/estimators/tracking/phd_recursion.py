@@ -116,13 +116,26 @@ class PhdMemory(NamedTuple):
 
 
 def put(weight: float, mean: Floats, covariance: Floats, mixture: Any, row: int) -> None:
-    """Write a component down in a row of anything that has these columns."""
+    """Write a component down in a row of anything that has these columns.
+
+    Args:
+        weight, mean, covariance: of the component, the latter (4,), (4, 4).
+        mixture: a mixture of one run, or the memory.
+        row: which.
+    """
     mixture.weight[row] = weight
     copy_gaussian(mean, covariance, mixture.mean[row], mixture.covariance[row])
 
 
 def prepare(mean: Floats, covariance: Floats, variance: float, work: PhdMemory, parent: int) -> bool:
-    """Fill what all detections share in the update of a component; False where S is singular."""
+    """Fill what all detections share in the update of a component; False where S is singular.
+
+    Args:
+        mean, covariance: of the component, (4,), (4, 4).
+        variance: of a detection, per axis, in m^2.
+        work: filled.
+        parent: the component's number.
+    """
     factor, gain = work.seen_factor[parent], work.seen_gain[parent]
     for i in range(2):
         for j in range(2):
@@ -150,7 +163,17 @@ def add_detected(
     work: PhdMemory,
     end: int,
 ) -> int:
-    """Append what one detection makes of every component, and a birth; returns the new end."""
+    """Append what one detection makes of every component, and a birth; returns the new end.
+
+    Args:
+        run: which.
+        parents: how many components there are.
+        place: of the detection, (2,), in m.
+        mixture: before the scan.
+        settings: of the filter.
+        work: with what `prepare` filled of each component; its components are appended to.
+        end: how many of these there are.
+    """
     first = end
     total = settings.clutter_per_m2
     for parent in range(parents):

@@ -107,7 +107,13 @@ class ReportMemory(NamedTuple):
 
 
 def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, float, float]:
-    """Return the spread of one axis after a while of constant velocity with white acceleration."""
+    """Return the spread of one axis after a while of constant velocity with white acceleration.
+
+    Args:
+        spread: (3,), variance of the position, covariance, variance of the velocity.
+        density: of the acceleration's noise, in m^2/s^3.
+        duration_s: how long.
+    """
     return (
         spread[0]
         + duration_s * (2.0 * spread[1] + duration_s * (spread[2] + density * duration_s / 3.0)),
@@ -119,7 +125,14 @@ def widened(spread: Floats, density: float, duration_s: float) -> tuple[float, f
 def reported(
     spread: Floats, level: int, duration_s: float, velocity_variance: float, settings: ReportSettings
 ) -> tuple[float, float, float]:
-    """Return the spread of one axis of what is reported after a while, at a level of noise."""
+    """Return the spread of one axis of what is reported after a while, at a level of noise.
+
+    Args:
+        spread, duration_s: as for `widened`.
+        level: which of `LEVELS`.
+        velocity_variance: what the report adds to its level's, in (m/s)^2.
+        settings: with the levels' noise.
+    """
     a, b, c = widened(spread, settings.acceleration_density[level], duration_s)
     return (
         a + settings.position_variance[level],
@@ -129,7 +142,7 @@ def reported(
 
 
 def density_at(difference: tuple[float, float, float, float], a: float, b: float, c: float) -> float:
-    """The density of differences (x, vx, y, vy) when each axis has the covariance (a, b; b, c)."""
+    """Compute the density of differences (x, vx, y, vy); each axis has the covariance (a, b; b, c)."""
     x, vx, y, vy = difference
     determinant = a * c - b * b
     squared = c * (x * x + y * y) - 2.0 * b * (x * vx + y * vy) + a * (vx * vx + vy * vy)
@@ -139,7 +152,13 @@ def density_at(difference: tuple[float, float, float, float], a: float, b: float
 def differences(
     mean: Floats, position: Floats, velocity: Floats, duration_s: float
 ) -> tuple[float, float, float, float]:
-    """Compute what is reported (x, vx, y, vy) minus what a track predicts."""
+    """Compute what is reported (x, vx, y, vy) minus what a track predicts.
+
+    Args:
+        mean: of the track, (4,) x, vx, y, vy.
+        position, velocity: as reported, (2,) in m, (2,) in m/s.
+        duration_s: from the track's last report to this one.
+    """
     return (
         position[0] - mean[0] - duration_s * mean[1],
         velocity[0] - mean[1],
@@ -167,7 +186,13 @@ def are_slow(tracks: Tracks, run: int, place: int, speed_mps: float, settings: R
 
 
 def birth_density(velocity: Floats, own_variance: float, settings: ReportSettings) -> float:
-    """Compute how densely vessels not met before report this, per m^2, s and (m/s)^2."""
+    """Compute how densely vessels not met before report this, per m^2, s and (m/s)^2.
+
+    Args:
+        velocity: as reported, (2,) in m/s.
+        own_variance: of that, in (m/s)^2.
+        settings: with births, and the speeds of vessels.
+    """
     moving = 1.0 / (np.pi * settings.top_speed_mps**2)
     variance = settings.slow_mps**2 + own_variance
     squared = (velocity[0] ** 2 + velocity[1] ** 2) / variance

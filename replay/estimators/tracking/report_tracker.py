@@ -155,7 +155,7 @@ def _no_tracks(runs: int) -> Tracks:
 
 
 def _with_room(tracks: Tracks, more: int) -> Tracks:
-    """A copy with places for so many more tracks."""
+    """Copy the tracks, with places for so many more."""
 
     def with_room(each: NDArray) -> NDArray:
         room = np.zeros((len(each), more, *each.shape[2:]), each.dtype)
@@ -166,7 +166,7 @@ def _with_room(tracks: Tracks, more: int) -> Tracks:
 
 
 def _trimmed(tracks: Tracks) -> Tracks:
-    """Without the places that no run uses."""
+    """Leave out the places that no run uses."""
     most = int(tracks.used.max(initial=0))
     columns: Any = tracks
     return Tracks(*(each if each.ndim == 1 else each[:, :most].copy() for each in columns))

@@ -48,7 +48,7 @@ def detection_of(target: Components, origin: Any, parameters: Any) -> Component:
 
 
 def clutter_in_plane(range_m: Component, bearing_rad: Component, parameters: Any) -> Component:
-    """Clutter per m^2: by range, and more or less in one sector."""
+    """Return the clutter per m^2: by range, and more or less in one sector."""
     near, factor = parameters.clutter_per_m2, parameters.far_clutter_factor
     density = between(range_m, near, near * factor, parameters)
     if is_within(bearing_rad, parameters.sector_from_rad, parameters.sector_to_rad):
@@ -67,7 +67,7 @@ def place_of(target: Components, origin: Any, parameters: Any) -> Components:
 
 
 def place_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """The lower triangle of a place's covariance: wider across the line of sight than along it."""
+    """Return the lower triangle of a place's covariance: wider across the line of sight than along."""
     x, y = away(target, origin)
     along, across = parameters.sigma_m**2, parameters.sigma_across_rad**2
     return along + across * y * y, -across * x * y, along + across * x * x
@@ -92,13 +92,13 @@ def place_birth(
 
 
 def bearing_of(target: Components, origin: Any, parameters: Any) -> Components:
-    """Anticlockwise from the x axis, as a sensor says that is turned by its bias."""
+    """Return a bearing anticlockwise from the x axis, as a sensor says that is turned by its bias."""
     x, y = away(target, origin)
     return (np.arctan2(y, x) + parameters.bias_rad,)
 
 
 def bearing_noise(target: Components, origin: Any, parameters: Any) -> Components:
-    """The variance of a bearing; it does not matter much where on a hull it points when that is far."""
+    """Return a bearing's variance; where on a hull it points does not matter much when that is far."""
     across = parameters.sigma_across_m / np.hypot(*away(target, origin))
     return (parameters.sigma_rad**2 + across**2,)
 
@@ -115,7 +115,7 @@ def bearing_clutter(detection: Any, parameters: Any) -> Component:
 
 
 def polar_of(target: Components, origin: Any, parameters: Any) -> Components:
-    """Range and bearing of where a target was `lag_s` ago, each out by its bias."""
+    """Return range and bearing of where a target was `lag_s` ago, each out by its bias."""
     x, y = away(target, origin)
     x, y = x - parameters.lag_s * target[1], y - parameters.lag_s * target[3]
     return np.hypot(x, y) + parameters.bias_range_m, np.arctan2(y, x) + parameters.bias_rad

@@ -28,7 +28,7 @@ class SensorTopics(NamedTuple):
 
     @property
     def sensors(self) -> list[str]:
-        """Their names: what their topics begin with."""
+        """Name the sensors: what their topics begin with."""
         return [scan.rpartition("/")[0].strip("/") for scan in self.scans]
 
 
@@ -72,7 +72,7 @@ def scans_of(block: Block, found: SensorTopics, kinds: Sequence[ScanSensor], fix
 
 
 def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
-    """Detections (n,) in the order of their scans, and which of these (2, scans) are those of each.
+    """Return detections (n,) in the order of their scans, and which of these (2, scans) each has.
 
     Raises BadInput where two scans of a run have one number, a scan has another number of detections
     than it says, or the scan of a detection is not there.
@@ -104,7 +104,7 @@ def by_scan(scan: Ragged, detection: Ragged) -> tuple[Integers, Integers]:
 
 
 def _measured(stream: Stream, kind: ScanSensor) -> Floats:
-    """The detections (n, 2); a bearing stands first."""
+    """Return the detections (n, 2); a bearing stands first."""
     if kind.fields == ("position_m",):
         return read_vectors(stream, "position_m", PLANE)
     measured = np.zeros((len(stream), 2))
@@ -114,7 +114,7 @@ def _measured(stream: Stream, kind: ScanSensor) -> Floats:
 
 
 def _origins(scans: Ragged, fixes: Ragged, known: Sequence[Fix | None]) -> Floats:
-    """Where the sensor is at its scans (n, 2): at the last fix until then, or at the first known."""
+    """Find where the sensor is at its scans (n, 2): at the last fix until then, or the first known."""
     found = np.empty((len(scans), 2))
     places = read_vectors(fixes.stream, "position_m", PLANE)
     for run, before in enumerate(known):

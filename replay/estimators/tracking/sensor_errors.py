@@ -62,7 +62,7 @@ def errors_of(sensors: Sequence[str], kinds: Sequence[ScanSensor], settings: Seq
 
 
 def with_errors(where: str, targets: Targets, errors: Errors) -> Targets:
-    """Targets whose state has the errors too.
+    """Return targets whose state has the errors too.
 
     Raises BadInput that begins with `where` where the model cannot be joined with them.
     """
@@ -103,7 +103,7 @@ def _longer(stage: Stage, names: tuple[str, ...], lengths: tuple[int, ...]) -> S
 
 
 def _moving(model: Model, motion: Motion, names: tuple[str, ...], noises: int) -> Motion:
-    """A motion beside which the errors fade and are renewed; `noises` is how many its noise has."""
+    """Return a motion beside which the errors fade and are renewed; its noise has `noises` numbers."""
     n, is_triangle = model.size, noises > model.size
     move_own, noise_own = motion.move, motion.noise
     assert noise_own is not None

@@ -38,7 +38,7 @@ class TargetParameters(ModelParameters):
 
 
 def move(state: Components, control: Any, duration_s: Any, parameters: Any) -> Components:
-    """Constant velocity."""
+    """Move at constant velocity."""
     x, vx, y, vy = state
     return x + duration_s * vx, vx, y + duration_s * vy, vy
 
@@ -74,7 +74,7 @@ class Targets(NamedTuple):
 
 
 def targets_of(where: str, parameters: Any, scans: Sequence[Topic]) -> Targets:
-    """The targets that a tracker's parameters ask for; what they leave out, the scans' channels state.
+    """Return the targets of a tracker's parameters; what these leave out, the scans' channels state.
 
     Raises BadInput that begins with `where` for a model that cannot be a target's, or lacks a number.
     """
@@ -127,7 +127,7 @@ def _check(where: str, model: Model) -> None:
 
 
 def _stage_of(where: str, model: Model, mode: str | None) -> Stage:
-    """The model with the motion that is named, or all of its modes."""
+    """Return the model with the motion that is named, or all of its modes."""
     if mode is not None:
         if not model.modes or mode not in model.modes:
             raise BadInput(f"{where}: no mode '{mode}'; {choices(mode, model.modes or ())}")
@@ -138,7 +138,7 @@ def _stage_of(where: str, model: Model, mode: str | None) -> Stage:
 
 
 def _unknown(where: str, model: Model, sigma_mps: float) -> tuple[Floats, Floats]:
-    """Mean (n,) and standard deviations (t,) of a target of which only the position is known."""
+    """Return mean (n,) and sigmas (t,) of a target of which only the position is known."""
     mean, sigma = unknown(model.state, model.start)
     for row, (name, _) in enumerate(tangent_components(list(model.state), model.kinds)):
         if name in POSITION:

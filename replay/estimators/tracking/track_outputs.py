@@ -47,23 +47,23 @@ def track_outputs(
 
 
 def _filled(column: NDArray, ends: Integers) -> NDArray:
-    """The rows of a column (runs, rows, ...) that each run has filled, end to end."""
+    """Return the rows of a column (runs, rows, ...) that each run has filled, end to end."""
     return np.concatenate([of_run[:end] for of_run, end in zip(column, ends, strict=True)])
 
 
 def _bounds(ends: Integers) -> Integers:
-    """Where the rows of each run begin and end (runs + 1,), from how many it has."""
+    """Find where the rows of each run begin and end (runs + 1,), from how many it has."""
     return np.concatenate([[0], np.cumsum(ends)])
 
 
 def _track_stamps(scans: Scans, tracked: TrackOutputs) -> Integers:
-    """The stamps of all tracks after all scans."""
+    """Return the stamps of all tracks after all scans."""
     used = tracked.confirmed != NEVER
     return np.repeat(scans.time_ns[used], tracked.confirmed[used])
 
 
 def _of_tracks(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
-    """After every scan how many tracks there are, which, and how probably each exists."""
+    """Tell after every scan how many tracks there are, which, and how probably each exists."""
     metadata, ends = named(stage.model.state), tracked.end[:, 0]
     used = np.flatnonzero(tracked.confirmed != NEVER)
     size = make_stream(
@@ -91,7 +91,7 @@ def _of_tracks(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) ->
 
 
 def _modes(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Iterator[Ragged]:
-    """How probable the modes of each track are, where there are several."""
+    """Tell how probable the modes of each track are, where there are several."""
     if not stage.modes:
         return
     ends = tracked.end[:, 0]
@@ -106,7 +106,7 @@ def _modes(topic: str, stage: Stage, scans: Scans, tracked: TrackOutputs) -> Ite
 
 
 def _associations(topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs) -> Ragged:
-    """Which detection of a scan is which track's, and how probably."""
+    """Tell which detection of a scan is which track's, and how probably."""
     ends = tracked.end[:, 1]
     track, scan, detection = _filled(tracked.pair, ends).T
     stream = make_stream(
@@ -124,7 +124,7 @@ def _associations(topic: str, found: SensorTopics, scans: Scans, tracked: TrackO
 
 
 def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) -> Iterator[Ragged]:
-    """What was approximated, what was not used, and how many scans were used again."""
+    """Tell what was approximated, what was not used, and how many scans were used again."""
     approximated = np.flatnonzero(tracked.approximated)
     tracks = tracked.approximated[approximated]
     stream = make_stream(
@@ -146,7 +146,7 @@ def _of_scans(topic: str, scans: Scans, tracked: TrackOutputs, repeated: int) ->
 def _innovations(
     topic: str, found: SensorTopics, scans: Scans, tracked: TrackOutputs
 ) -> Iterator[Ragged]:
-    """By sensor the innovation of every confirmed track's likeliest detection in each of its scans."""
+    """Yield by sensor the innovation of a confirmed track's likeliest detection in each of its scans."""
     ends = tracked.end[:, 1]
     pair, probability = _filled(tracked.pair, ends), _filled(tracked.associated, ends)
     white, factor = _filled(tracked.white, ends), _filled(tracked.factor, ends)

@@ -56,7 +56,7 @@ def _refuse_out_of_sequence(_: int) -> Recursive:
 
 
 def _smoothed(tracks: Ragged, targets: Targets) -> Ragged:
-    """The stream of tracks with smoothed states."""
+    """Return the stream of tracks with smoothed states."""
     stream, size = tracks.stream, targets.stage.model.size
     run = np.repeat(np.arange(tracks.runs), np.diff(tracks.offsets))
     _, track = np.unique(

@@ -201,7 +201,7 @@ class TrackerParameters(Parameters):
     @model_validator(mode="before")
     @classmethod
     def _managed(cls, values: Any) -> Any:
-        """Existence is what jipda and pmbm are about; the others count hits."""
+        """Fill in what an association says of existence: jipda and pmbm are about it, others count."""
         association = values.get("association", "jipda")
         goes_by_existence = association in EXISTING
         given = values.get("management")
@@ -330,7 +330,7 @@ def tracker_of(parameters: TrackerParameters, targets: Targets, settings: Tracke
 
 
 def _bind(name: str, topics: Mapping[str, Topic], parameters: TrackerParameters) -> list[Bound]:
-    """One tracker of all sensors."""
+    """Bind one tracker of all sensors."""
     found = find_sensors(topics, parameters.sensors)
     if not found.scans:
         return []

@@ -28,7 +28,7 @@ class TrackerSetup(NamedTuple):
     most_tracks: int
 
     def no_tracks(self, runs: int) -> Tracks:
-        """Runs in which nothing was met yet."""
+        """Return the tracks of runs in which nothing was met yet."""
         first, count = self.tracker.shared
         shared = self.newborn.covariance[first : first + count, first : first + count]
         return no_tracks(runs, self.most_tracks, self.tracker.sizes, len(self.found.scans), shared)
@@ -81,7 +81,7 @@ def _begin(block: Block, setup: TrackerSetup, tracks: Any) -> TrackerState:
 
 
 def _scans(state: TrackerState, block: Block, setup: TrackerSetup) -> tuple[Scans, Fixes]:
-    """A block's scans, and the last own positions after it."""
+    """Return a block's scans, and the last own positions after it."""
     scans = scans_of(block, setup.found, KINDS, state.fixes)
     fixes = state.fixes.items()
     return scans, {topic: latest_fixes(block.streams[topic], known) for topic, known in fixes}
@@ -128,7 +128,7 @@ def run_out_of_sequence(
 
 
 def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -> Iterator[Integers]:
-    """The rows of a run's scans that can be used together: those that go on in time, and late ones."""
+    """Yield rows of a run's scans that can be used together: those that go on in time, and late ones."""
     known = np.append(before.pending.time_ns[-1:], scans.time_ns[first:end])
     newest_ns = np.maximum.accumulate(known)[len(known) - (end - first) :]
     late = scans.time_ns[first:end] < newest_ns
@@ -139,7 +139,7 @@ def _stretches(before: OutOfSequenceState, scans: Scans, first: int, end: int) -
 def _take(
     out_of_sequence: OutOfSequenceState, arrived: Scans, setup: TrackerSetup, back_ns: int
 ) -> tuple[OutOfSequenceState, list[list[Ragged]]]:
-    """One run after scans that go on in time, or after one that is late; and what is said then."""
+    """Take one run through scans that go on in time, or one that is late; also what is said then."""
     base, pending, head = out_of_sequence
     repeated = int(np.count_nonzero(pending.time_ns > arrived.time_ns[0]))
     pending = in_time(pending, arrived)

@@ -35,7 +35,7 @@ class Scanning(NamedTuple):
 
     @property
     def log_odds_of_detection(self) -> float:
-        """The log weight of a vehicle's being detection j, before its likelihood, to being missed."""
+        """Return the log weight of being detection j, before its likelihood, to being missed."""
         missed = max(1.0 - self.detection_probability, LEAST_MISSED)
         clutter = max(self.clutter_per_m2, LEAST_CLUTTER_PER_M2)
         return float(np.log(self.detection_probability / (missed * clutter)))
@@ -70,7 +70,12 @@ def log_likelihoods(predicted: Floats, covariance: Floats, detections: Floats) -
 
 
 def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
-    """Return the most probable map of every run, vehicles taken as independent (Hungarian method)."""
+    """Return the most probable map of every run, vehicles taken as independent (Hungarian method).
+
+    Args:
+        log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
+        scanning: what is known of the sensor.
+    """
     runs, vehicles, detections = log_likelihood.shape
     gain = log_likelihood + scanning.log_odds_of_detection
     chosen = np.full((runs, vehicles), MISSED)
@@ -86,7 +91,7 @@ def best_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
 
 def _assigned(gain: Floats) -> Integers:
-    """The map (vehicles,) with the greatest sum of gains (vehicles, detections); being missed has 0."""
+    """Find the map (vehicles,) of most gain (vehicles, detections) in sum; being missed has 0."""
     vehicle, detection = linear_sum_assignment(-np.maximum(gain, 0.0))
     chosen = np.full(len(gain), MISSED)
     chosen[vehicle] = np.where(gain[vehicle, detection] > 0.0, detection, MISSED)
@@ -97,6 +102,10 @@ def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
     """Return all maps of every run inside the gates, but for those of next to no weight.
 
     Where a scan is whole and clean, no vehicle is missed, unless nothing is left for it.
+
+    Args:
+        log_likelihood: (runs, vehicles, detections), see `log_likelihoods`.
+        scanning: what is known of the sensor.
     """
     runs = np.arange(len(log_likelihood))
     gain = log_likelihood + scanning.log_odds_of_detection
@@ -113,7 +122,7 @@ def all_maps(log_likelihood: Floats, scanning: Scanning) -> Hypotheses:
 
 
 def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
-    """Maps of some runs, one vehicle after another; `log_weight` is the sum of gains."""
+    """Build maps of some runs, one vehicle after another; `log_weight` is the sum of gains."""
     _, vehicles, detections = gain.shape
     run, chosen = runs, np.empty((len(runs), 0), np.int64)
     taken, score = np.zeros((len(runs), detections), bool), np.zeros(len(runs))
@@ -136,7 +145,7 @@ def _extended(runs: Integers, gain: Floats, *, may_miss: bool) -> Hypotheses:
 
 
 def log_permanents(logs: Floats) -> Floats:
-    """The logarithms of the permanents of exp(logs), (...,) of (..., n, n): sums over permutations.
+    """Compute the logarithms of permanents of exp(logs), (...,) of (..., n, n): sums over permutations.
 
     The first rows share out every set of so many columns, n 2^(n-1) products of positive numbers. A
     permanent too small for a number is that of its greatest term.

@@ -33,7 +33,7 @@ def follow_axis(
     step_s: float = 1.0,
     prior_variance: tuple[float, float] = (2.5, 1.0),
 ) -> Axis:
-    """The Kalman filter of one axis with fixes of this variance: predict, then update, `steps` times."""
+    """Filter one axis with fixes of this variance: predict, then update, `steps` times."""
     position, cross, velocity = noise_moments(acceleration_sigma_mps2, step_s)
     noise = np.array([[position, cross], [cross, velocity]])
     transition = np.array([[1.0, step_s], [0.0, 1.0]])
@@ -64,7 +64,7 @@ class Bounds(NamedTuple):
 def bounds(
     vehicles: int, fix_variance_m2: float, sensor_variance_m2: float, *, stochastic: bool
 ) -> Bounds:
-    """The least total errors; topology is one combination, a shape seen from anywhere all but three."""
+    """Compute the least total errors; topology is one combination, a shape seen anyhow all but three."""
     both = 1.0 / (1.0 / fix_variance_m2 + 1.0 / sensor_variance_m2)
     alone, together = (follow_axis(each) for each in (fix_variance_m2, both))
     kind = "stochastic" if stochastic else "deterministic"

@@ -180,7 +180,7 @@ def _advance(setup: Setup, method: Method, cloud: Cloud, frames: Frames, run: in
 def _generator(
     method: Method, cloud: Cloud, frames: Frames, run: int, number: int
 ) -> np.random.Generator:
-    """A run's own random stream, the same whatever other runs there are; starts are drawn at first."""
+    """Make a run's own random stream, the same whatever other runs there are; starts come first."""
     found = cloud.generators[run]
     if found is None:
         seen = frames.network[run, number]
@@ -196,7 +196,7 @@ def _generator(
 
 
 def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generator) -> Floats:
-    """States after a turn with an acceleration each."""
+    """Return states after a turn with an acceleration each."""
     motion = setup.motion
     states = joint.mean.reshape(-1, motion.vehicles, STATES)
     moved = np.stack(turn(np.moveaxis(states, -1, 0), motion.turn_rate_radps, duration_s), axis=-1)
@@ -207,7 +207,7 @@ def _moved(setup: Setup, joint: Joint, duration_s: float, rng: np.random.Generat
 
 
 def _set_likelihood(setup: Setup, method: Method, mean: Floats, seen: Floats) -> Floats:
-    """The log likelihood (particles,) of full unordered fixes: a permanent, or one for each axis."""
+    """Compute the log likelihood (particles,) of full unordered fixes: a permanent, or one per axis."""
     places = positions(setup.motion, mean)
     squared = (seen - places[:, :, None]) ** 2 / setup.network.variance_m2
     if method.kind == "set":
@@ -216,7 +216,7 @@ def _set_likelihood(setup: Setup, method: Method, mean: Floats, seen: Floats) ->
 
 
 def _drawn(setup: Setup, joint: Joint, seen: Floats, rng: np.random.Generator) -> tuple[Joint, Floats]:
-    """Every particle with an association of its own, and the log likelihood (particles,) of the scan."""
+    """Return particles with an association each, and the scan's log likelihood (particles,)."""
     particles, vehicles = len(joint.mean), setup.motion.vehicles
     rows = position_rows(vehicles, setup.states)
     noise = setup.network.variance_m2 * np.ones(2 * vehicles)
@@ -238,7 +238,7 @@ def _drawn(setup: Setup, joint: Joint, seen: Floats, rng: np.random.Generator) -
 
 
 def _by_topology(setup: Setup, method: Method, joint: Joint, seen: Floats) -> tuple[Joint, Floats]:
-    """The particles after a full scan's topology, and its log likelihood (particles,)."""
+    """Return the particles after a full scan's topology, and its log likelihood (particles,)."""
     variance_m2 = setup.infrastructure.variance_m2
     if method.kind == "associations":
         measured = topology_measurement(setup.motion, joint, seen[None], variance_m2)
@@ -251,7 +251,7 @@ def _by_topology(setup: Setup, method: Method, joint: Joint, seen: Floats) -> tu
 
 
 def _estimate(method: Method, cloud: Cloud, run: int) -> tuple[Floats, Floats]:
-    """The best association's Gaussian, or the moments of the drawn states."""
+    """Return the best association's Gaussian, or the moments of the drawn states."""
     own = slice(run * method.particles, (run + 1) * method.particles)
     mean = cloud.joint.mean[own]
     weight = np.exp(cloud.log_weight[run])

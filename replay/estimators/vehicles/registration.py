@@ -83,7 +83,7 @@ def is_spread(detections: Floats, variance_m2: Floats | float) -> Booleans:
 
 
 def _middle(places: Floats) -> Floats:
-    """The means (runs, 1, 2) of what is there of places (runs, vehicles, 2); zero for nothing."""
+    """Return means (runs, 1, 2) of what is there of places (runs, vehicles, 2); zero for nothing."""
     there = np.isfinite(places)
     count = np.maximum(there.sum(axis=1, keepdims=True), 1)
     return np.asarray(np.where(there, places, 0.0).sum(axis=1, keepdims=True) / count)
@@ -110,7 +110,7 @@ def fitted_pose(places: Floats, detections: Floats) -> Floats:
 
 
 def _centred(places: Floats) -> NDArray[np.complex128]:
-    """Places (runs, vehicles, 2) about their mean, as complex numbers."""
+    """Return places (runs, vehicles, 2) about their mean, as complex numbers."""
     return np.asarray((places - _middle(places)) @ np.array([1.0, 1j]))
 
 

@@ -113,7 +113,7 @@ class VehiclesResults(NamedTuple):
 
 
 def no_results(setup: Setup, runs: int, frames: int) -> VehiclesResults:
-    """Results that say nothing."""
+    """Make results that say nothing."""
     states, vehicles = setup.states, setup.motion.vehicles
     return VehiclesResults(
         np.full((runs, frames, states), np.nan),
@@ -227,7 +227,7 @@ def frames_of(setup: Setup, block: Block) -> Frames:
     skipped = np.zeros((*shape, vehicles), bool)
 
     def place(topic: str) -> tuple[Integers, Integers, Integers]:
-        """Runs, frames and rows of a topic's messages."""
+        """Return runs, frames and rows of a topic's messages."""
         chosen = np.flatnonzero(events.topic == names.get(topic, -1))
         first = sum(len(ragged) for ragged in list(block.streams.values())[: names.get(topic, 0)])
         return run_of[chosen], frame_of[chosen], events.source[chosen] - first
@@ -306,7 +306,7 @@ def _advance(
 
 
 def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
-    """The joint states after so long, (runs,); most often it is as long in all runs."""
+    """Return the joint states after so long, (runs,); most often it is as long in all runs."""
     for span_ns in np.unique(duration_ns):
         move = partial(predict, setup.motion, duration_s=float(span_ns) * 1e-9)
         joint = where(duration_ns == span_ns, joint, move)
@@ -316,7 +316,13 @@ def _predicted(setup: Setup, joint: Joint, duration_ns: Integers) -> Joint:
 def outputs_of(
     setup: Setup, frames: Frames, results: VehiclesResults, failing: Booleans
 ) -> Iterator[Ragged]:
-    """Yield every vehicle's estimates, the pose's where it is estimated, and who failed."""
+    """Yield every vehicle's estimates, the pose's where it is estimated, and who failed.
+
+    Args:
+        setup: of the method.
+        frames, results: what was seen and what came of it, of all runs.
+        failing: (runs,), which failed in these frames.
+    """
     runs, count = frames.time_ns.shape
     is_estimated = np.isfinite(results.mean).all(axis=2) & (np.arange(count) < frames.counts[:, None])
 
@@ -332,7 +338,7 @@ def outputs_of(
         return Ragged(stream, np.concatenate([[0], np.cumsum(rows.sum(axis=1))]))
 
     def innovations(vehicle: int) -> Ragged:
-        """What was associated with a vehicle; the target is the detection's number in its scan."""
+        """Return what a vehicle was associated with; the target is a detection's number in its scan."""
         detection, innovation, spread = (each[:, :, vehicle] for each in results.associated)
         is_associated = detection != MISSED
         squared = np.einsum(

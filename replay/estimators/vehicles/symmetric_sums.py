@@ -31,7 +31,7 @@ class Pseudo(NamedTuple):
 
 
 def power_sums(m: Numbers, sigma: float) -> Numbers:
-    """Unbiased sums of powers (..., n) of measured numbers (..., n): those of order 1 to n.
+    """Compute unbiased sums of powers (..., n) of measured numbers (..., n): those of order 1 to n.
 
     Of real numbers by Hermite polynomials, sigma^a He_a(m / sigma), whose mean is p^a. Powers of
     complex numbers with circular noise are unbiased as they are.
@@ -47,12 +47,12 @@ def power_sums(m: Numbers, sigma: float) -> Numbers:
 
 
 def raw_power_sums(m: Numbers) -> Numbers:
-    """The paper's (8): sums of powers as they are, biased where the numbers are noisy and real."""
+    """Compute the paper's (8): sums of powers as they are, biased where numbers are noisy and real."""
     return np.sum(m[..., None, :] ** np.arange(1, m.shape[-1] + 1)[:, None], axis=-1)
 
 
 def power_sums_at(p: Numbers, sigma: float) -> Pseudo:
-    """Expected power sums of numbers p (..., n).
+    """Compute the expected power sums of numbers p (..., n).
 
     W[a, (i, j)] = s^j a! / ((a - j)! sqrt(j!)) p_i^(a - j) with s = sigma, for complex numbers
     sigma sqrt(2).
@@ -70,12 +70,12 @@ def power_sums_at(p: Numbers, sigma: float) -> Pseudo:
 
 
 def product_sums(m: Numbers) -> Numbers:
-    """The paper's (7): the elementary symmetric functions e_1 ... e_n of numbers (..., n), unbiased."""
+    """Compute the paper's (7): elementary symmetric functions e_1 ... e_n of (..., n), unbiased."""
     return _elementary(m)[..., 1:]
 
 
 def _elementary(m: Numbers) -> Numbers:
-    """The functions e_0 ... e_n (..., n + 1)."""
+    """Compute the functions e_0 ... e_n (..., n + 1)."""
     n = m.shape[-1]
     found = np.zeros((*m.shape[:-1], n + 1), m.dtype)
     found[..., 0] = 1.0
@@ -85,7 +85,7 @@ def _elementary(m: Numbers) -> Numbers:
 
 
 def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
-    """Expected sums of products of numbers p (..., n): W[a, T] = sigma^|T| e_{a - |T|}(p without T).
+    """Compute expected sums of products of p (..., n): W[a, T] = sigma^|T| e_{a - |T|}(p without T).
 
     T are the non-empty subsets of the numbers, 2^n - 1 of them.
     """
@@ -106,7 +106,7 @@ def product_sums_at(p: Numbers, sigma: float) -> Pseudo:
 def update_root(
     mean: Floats, root: Floats, measured: Numbers, innovation: Numbers, factor: Numbers
 ) -> tuple[Floats, Floats]:
-    """Kalman's update in square-root form: means (..., n), factors X (..., n, k) with P = X X'.
+    """Apply Kalman's update in square-root form: means (..., n), factors X (..., n, k), P = X X'.
 
     NaN where the numbers have grown beyond all measure, or the innovation's covariance is singular.
     One QR decomposition of [[W', 0], [Z', X']] gives the root of the innovation's covariance, the gain

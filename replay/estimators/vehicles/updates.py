@@ -94,7 +94,13 @@ def split_method(method: str) -> tuple[str, str]:
 
 
 def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
-    """Return the joint states with those of some rows changed."""
+    """Return the joint states with those of some rows changed.
+
+    Args:
+        joint: of all runs.
+        rows: (k,), which change.
+        changed: what these become.
+    """
     if len(rows) == len(joint.mean):
         return changed
     mean, covariance = joint.mean.copy(), joint.covariance.copy()
@@ -103,7 +109,13 @@ def put(joint: Joint, rows: Integers, changed: Joint) -> Joint:
 
 
 def where(chosen: Booleans, joint: Joint, change: Callable[[Joint], Joint]) -> Joint:
-    """Return the joint states, changed where chosen."""
+    """Return the joint states, changed where chosen.
+
+    Args:
+        chosen: (runs,).
+        joint: of all runs.
+        change: of the joint states of the runs that are chosen.
+    """
     rows = np.flatnonzero(chosen)
     return put(joint, rows, change(joint.of(rows))) if len(rows) else joint
 
@@ -159,10 +171,15 @@ def update_by_set(setup: Setup, joint: Joint, detections: Floats) -> tuple[Joint
 
 
 def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
-    """Update by symmetric sums of full scans (runs, detections, 2); others have none, tell nothing.
+    """Update by symmetric sums of full scans; others have none, and tell nothing.
 
     Sums of numbers less their expected mean are linear combinations of the sums themselves; they lose
     fewer digits.
+
+    Args:
+        setup: of the method.
+        joint: of the runs.
+        detections: (runs, detections, 2), in m, NaN where a run has no more.
     """
     vehicles, states = setup.motion.vehicles, setup.states
     full = np.flatnonzero(np.isfinite(detections[..., 0]).sum(axis=1) == vehicles)
@@ -195,7 +212,7 @@ def update_by_sums(setup: Setup, joint: Joint, detections: Floats) -> Joint:
 
 
 def _root(covariance: Floats) -> Floats:
-    """Factors X with X X' = covariances that rounding may have made a little indefinite."""
+    """Return factors X with X X' = covariances that rounding may have made a little indefinite."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), np.float64)
     except np.linalg.LinAlgError:
@@ -220,7 +237,13 @@ def blocks_of(matrices: Floats, vehicles: int) -> Floats:
 
 
 def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Floats:
-    """Return detections less predictions, (h, vehicles * axes), by vehicle; NaN where missed."""
+    """Return detections less predictions, (h, vehicles * axes), by vehicle; NaN where missed.
+
+    Args:
+        maps: h hypotheses.
+        predicted: (runs, vehicles, axes).
+        places: the detections, (runs, detections, axes).
+    """
     if places.shape[1] == 0:
         return np.full((len(maps.run), predicted[0].size), np.nan)
     chosen = places[maps.run[:, None], maps.detection]
@@ -229,7 +252,13 @@ def innovations_of(maps: Hypotheses, predicted: Floats, places: Floats) -> Float
 
 
 def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
-    """Update by topology; scans with another number of detections, or a point, tell nothing."""
+    """Update by topology; scans with another number of detections, or a point, tell nothing.
+
+    Args:
+        setup: of the method.
+        joint: of the runs.
+        seen: (runs, detections, 2), in m in the sensor's frame, NaN where a run has no more.
+    """
     vehicles = setup.motion.vehicles
     rows = np.flatnonzero(np.isfinite(seen[..., 0]).sum(axis=1) == vehicles)
     if vehicles < 2 or len(rows) == 0:
@@ -243,10 +272,20 @@ def update_by_topology(setup: Setup, joint: Joint, seen: Floats) -> Joint:
 def update_by_pose(
     setup: Setup, joint: Joint, seen: Floats, registered: Booleans, may_start: Booleans
 ) -> tuple[Joint, Booleans]:
-    """Update by detections (runs, detections, 2) from a pose found along; also which runs found it.
+    """Update by detections from a pose found along.
 
     The pose is found anew, from what is known of the vehicles alone, where it was not yet known, and
     where it is supposed to change from scan to scan.
+
+    Args:
+        setup: of the method.
+        joint: of the runs.
+        seen: (runs, detections, 2), in m in the sensor's frame, NaN where a run has no more.
+        registered: (runs,), where the pose is known.
+        may_start: (runs,), where it may be found.
+
+    Returns:
+        The joint states, and where (runs,) the pose is known now.
     """
     vehicles = setup.motion.vehicles
     ordered = np.full((len(seen), vehicles, 2), np.nan)
@@ -287,7 +326,7 @@ def _position_blocks(setup: Setup, joint: Joint) -> Floats:
 
 
 def _recognised(setup: Setup, joint: Joint, seen: Floats) -> Floats:
-    """The detections (runs, vehicles, 2) in the vehicles' order, by the pose as it is thought to be."""
+    """Return detections (runs, vehicles, 2) in the vehicles' order, by the pose as thought to be."""
     vehicles = setup.motion.vehicles
     sight = sight_of(setup.motion, joint)
     spread = sight.rows @ joint.covariance @ sight.rows.swapaxes(1, 2)

@@ -46,13 +46,18 @@ class Motion(NamedTuple):
 
 
 def positions(motion: Motion, mean: Floats) -> Floats:
-    """Return the vehicles' positions (runs, vehicles, 2) in means (runs, n)."""
+    """Return the vehicles' positions (runs, vehicles, 2).
+
+    Args:
+        motion: for how many vehicles there are.
+        mean: (runs, n), see above.
+    """
     count = motion.vehicles
     return mean[:, : STATES * count].reshape(-1, count, STATES)[..., 0::2]
 
 
 def position_rows(vehicles: int, states: int, axes: tuple[int, ...] = (0, 1)) -> Floats:
-    """The matrix (axes * vehicles, states) that takes these axes of all positions from a state."""
+    """Make the matrix (axes * vehicles, states) that takes these axes of all positions from a state."""
     rows = np.zeros((vehicles, len(axes), states))
     for place, axis in enumerate(axes):
         rows[np.arange(vehicles), place, STATES * np.arange(vehicles) + 2 * axis] = 1.0
@@ -168,7 +173,10 @@ def collapse(
     """Return the Gaussian with the moments of the mixture over all associations of an unordered set.
 
     Exact weights: those of all maps of a set without loss are the terms of a permanent, so that this
-    is what an exact symmetric measurement equation filter collapses to. Args as for `weigh`.
+    is what an exact symmetric measurement equation filter collapses to.
+
+    Args:
+        joint, rows, innovations, noise, hypotheses: as for `weigh`.
     """
     score, innovations, group, run, gains = weigh(joint, rows, innovations, noise, hypotheses)
     weight = normalised(score, hypotheses.run)
@@ -184,7 +192,7 @@ def collapse(
 
 
 def _distinct(pattern: NDArray) -> tuple[Integers, Integers]:
-    """The distinct rows of a pattern whose first column is sorted, and which of them each row is."""
+    """Find a pattern's distinct rows, its first column being sorted, and which of them each row is."""
     if len(pattern) == 0 or pattern[:, 1:].all():
         runs, group = np.unique(pattern[:, 0], return_inverse=True)
         return np.concatenate([runs[:, None], np.ones_like(pattern[: len(runs), 1:])], axis=1), group
@@ -193,7 +201,7 @@ def _distinct(pattern: NDArray) -> tuple[Integers, Integers]:
 
 
 def _sums(values: Floats, group: Integers, groups: int) -> Floats:
-    """Sums of rows by group; groups are mostly of a single row."""
+    """Sum rows by group; groups are mostly of a single row."""
     out = np.zeros((groups, *values.shape[1:]))
     if len(values) == groups and np.array_equal(group, np.arange(groups)):
         return values
@@ -202,7 +210,11 @@ def _sums(values: Floats, group: Integers, groups: int) -> Floats:
 
 
 def normalised(score: Floats, run: Integers) -> Floats:
-    """Return exp(score), scaled to sum one in each run; runs are sorted."""
+    """Return exp(score), scaled to sum one in each run.
+
+    Args:
+        score, run: (h,), the latter sorted.
+    """
     first = np.flatnonzero(np.append(True, run[1:] != run[:-1]))
     count = np.diff(np.append(first, len(run)))
     weight = np.exp(score - np.repeat(np.maximum.reduceat(score, first), count))
@@ -215,12 +227,17 @@ def spread_of(places: Floats) -> Floats:
 
 
 def topology(places: Floats) -> Floats:
-    """The paper's (18), the sum of all squared distances between pairs, (...,) of (..., vehicles, 2)."""
+    """Compute the paper's (18), all squared distances between pairs, (...,) of (..., vehicles, 2)."""
     return places.shape[-2] * spread_of(places)
 
 
 def topology_moments(places: Floats, variance_m2: float) -> tuple[Floats, Floats]:
-    """Compute mean and variance of what noise adds to the measured topology of these places."""
+    """Compute mean and variance (...,) of what noise adds to the measured topology of places.
+
+    Args:
+        places: (..., vehicles, 2), in m.
+        variance_m2: of the noise, per axis.
+    """
     count = places.shape[-2]
     added = 2.0 * count * (count - 1) * variance_m2
     variance = 4.0 * count**2 * variance_m2 * (spread_of(places) + (count - 1) * variance_m2)
@@ -240,10 +257,15 @@ class Scalar(NamedTuple):
 
 
 def topology_measurement(motion: Motion, joint: Joint, detections: Floats, variance_m2: float) -> Scalar:
-    """Return the topology of scans (runs, vehicles, 2), whatever their frame and order.
+    """Return the topology of scans, whatever their frame and order.
 
     The innovation is NaN where it is too improbable: something was missed and something else taken for
     a vehicle.
+
+    Args:
+        motion, joint: of the vehicles in all runs.
+        detections: full scans, (runs, vehicles, 2), in m.
+        variance_m2: of a detection, per axis.
     """
     places = positions(motion, joint.mean)
     added, noise = topology_moments(places, variance_m2)
@@ -257,7 +279,7 @@ def topology_measurement(motion: Motion, joint: Joint, detections: Floats, varia
 
 
 def update_by_scalar(joint: Joint, measured: Scalar) -> Joint:
-    """Kalman's update by a scalar measurement."""
+    """Apply Kalman's update by a scalar measurement."""
     return update(joint, measured.rows, measured.innovation[:, None], measured.noise[:, None, None])
 
 
@@ -288,10 +310,16 @@ def sight_of(motion: Motion, joint: Joint) -> Sight:
 def update_by_shape(
     motion: Motion, joint: Joint, pose: Floats, seen: Floats, variance_m2: float
 ) -> Joint:
-    """Update by what a sensor sees (runs, vehicles, 2) from a pose of which nothing is known before.
+    """Update by what a sensor sees from a pose of which nothing is known before.
 
-    `pose` (runs, 3) is only where to linearise; NaN was not seen. What any change of the pose would
-    change is left out of the update of the vehicles; then the pose follows from them.
+    What any change of the pose would change is left out of the update of the vehicles; then the pose
+    follows from them.
+
+    Args:
+        motion, joint: of the vehicles in all runs.
+        pose: (runs, 3), x, y, heading, where to linearise and no more.
+        seen: (runs, vehicles, 2) in the sensor's frame, NaN where not seen.
+        variance_m2: of a detection, per axis.
     """
     own = slice(0, STATES * motion.vehicles)
     mean = joint.mean.copy()

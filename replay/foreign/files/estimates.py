@@ -49,7 +49,7 @@ def read_estimates(path: Path, label: str, truth: Topic | None) -> dict[str, Str
 
 
 def _of_log(path: Path, label: str, truth: Topic | None) -> dict[str, Stream]:
-    """Estimates and innovations of a log; what follows a label of its own stays."""
+    """Return estimates and innovations of a log; what follows a label of its own stays."""
     log = open_log(path)
     chosen = [name for name, topic in log.topics.items() if topic.schema_name in KEPT]
     if not any(log.topics[name].schema_name == KEPT[0] for name in chosen):
@@ -120,7 +120,7 @@ def _of_table(path: Path, topic: str, truth: Topic | None) -> Stream:
 
 
 def _components(names: list[str], truth: Topic | None) -> Components:
-    """Components with their kinds, as the truth has them; linear without one."""
+    """Return components with their kinds, as the truth has them; linear without one."""
     if truth is None:
         return dict.fromkeys(names, "linear")
     stated = stated_components(truth.metadata, {}, f"topic {truth.name}")
