@@ -17,10 +17,10 @@ from replay.inference.linear_algebra.gaussian import (
     Innovation,
     add_through,
     downdate,
-    inflate,
     kalman_step,
     whiten,
 )
+from replay.inference.linear_algebra.inflation import inflate
 from replay.inference.linear_algebra.manifold import by_right_jacobian
 from replay.inference.linear_algebra.sparse import (
     measuring_covariance,

@@ -73,7 +73,12 @@ def results(
 
 
 def begun(made: Results, due: Integers, recorded: Integers) -> Results:
-    """Set the ends of all runs to their beginnings, and what is not filled in to NaN; returns it."""
+    """Set the ends of all runs to their beginnings, and what is not filled in to NaN; returns it.
+
+    Args:
+        made: of all runs, changed.
+        due, recorded: (runs + 1,), where the rows for estimates and innovations of each run begin.
+    """
     made.estimates.end[:], made.innovations.end[:] = due[:-1], recorded[:-1]
     for each in (*made.estimates[2:], *made.innovations[3:]):
         each[:] = np.nan

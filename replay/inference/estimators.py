@@ -184,7 +184,7 @@ _MODEL = "name of the model to estimate; without one, that which fits the log."
 
 
 def _of_models(meanings_of: Mapping[str, Sequence[str]]) -> str:
-    """What a parameter means to the models that have it, where it is not the same to all."""
+    """Say what a parameter means to the models that have it, where it is not the same to all."""
     if len(meanings_of) == 1:
         return next(iter(meanings_of))
     return " ".join(f"{', '.join(models)}: {meaning}" for meaning, models in meanings_of.items())

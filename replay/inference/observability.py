@@ -287,6 +287,10 @@ def spectrum(information: Floats, scales: Floats) -> Spectrum:
     """Return rank and eigenvalues of D W D, and D e of the least, of length one in state units.
 
     A component whose scale is zero, as something known exactly, has no part: its eigenvalue is infinite.
+
+    Args:
+        information: W (t, t), of the state at the start of a window.
+        scales: the diagonal of D, the prior's standard deviations (t,).
     """
     known = scales == 0.0
     scaled = scales[:, None] * information * scales

@@ -265,7 +265,7 @@ def _correcting(model: Model, memory: Callable[[], Any]) -> Function:
 
 
 def _of_objects(value: Any) -> Any:
-    """A workspace that takes traced numbers."""
+    """Make a workspace that takes traced numbers."""
     if isinstance(value, np.ndarray):
         return value.astype(object) if value.dtype == float else value
     if isinstance(value, tuple):

@@ -266,17 +266,17 @@ class Judge:
 
     @property
     def components_without_truth(self) -> list[str]:
-        """A sentence for every estimate of which the truth lacks components, or is in another plane."""
+        """Say of every estimate of which components the truth lacks, or that it is in another plane."""
         return [sentence for sentence in self._unjudged.values() if sentence]
 
     @property
     def failures(self) -> list[str]:
-        """A sentence for every run that an estimator could not follow to the end, or not at all."""
+        """Say of every run that an estimator could not follow it to the end, or not at all."""
         return self._diagnostics.failures(self._names)
 
     @property
     def notes_of_coverage(self) -> list[str]:
-        """A sentence for every case that was not estimated throughout, and for measurements not used.
+        """Say of every case that was not estimated throughout, and of measurements not used.
 
         Those for what was assumed, as of where to begin, come first.
         """
@@ -306,7 +306,7 @@ class Judge:
 
     @property
     def times(self) -> "pd.DataFrame":
-        """The same for each run's spans of time; `until_s` is where a span ends, after the epoch."""
+        """Return the same by run and span of time; `until_s` is where a span ends, after the epoch."""
         from replay.judging.tables import joined, time_table
 
         return joined(time_table(each) for each in self._quantities.values())
@@ -327,7 +327,7 @@ class Judge:
 
     @property
     def late(self) -> "pd.DataFrame":
-        """Messages that came late: a row per estimator, case, what became of them, and span of time."""
+        """Return messages that came late: a row per estimator, case, what became of them, and span."""
         from replay.judging.tables import joined
 
         return joined(self._means.late())

@@ -129,7 +129,7 @@ def error_table(errors: Errors) -> pd.DataFrame:
 
 
 def _means(errors: Errors, count: Floats, sums: Floats) -> dict[str, Floats]:
-    """Columns of RMSE by quantity and of the mean NEES."""
+    """Return columns of RMSE by quantity and of the mean NEES."""
     mean = sums / count[:, None]
     columns: dict[str, Floats] = {}
     if errors.position:

@@ -89,7 +89,12 @@ def make_pairs(first: ArrayLike, second: ArrayLike, angle_rad: ArrayLike, bound_
 
 
 def arena_around(points: ArrayLike, margin_m: float) -> Arena:
-    """Return the rectangle around points (n, 2), larger by a margin on every side."""
+    """Return the rectangle around points, larger by a margin on every side.
+
+    Args:
+        points: (n, 2), in m.
+        margin_m: how much larger.
+    """
     places = np.asarray(points, float)
     return Arena(places.min(axis=0) - margin_m, places.max(axis=0) + margin_m)
 
@@ -195,7 +200,7 @@ def intersection(constraints: Floats, arena: Arena) -> Arcs:
 
 
 def _cut(constraints: Floats, arena: Arena) -> Arcs:
-    """All circles cut where they meet others, circle by circle, 2 k + 1 pieces each.
+    """Cut all circles where they meet others, circle by circle, 2 k + 1 pieces each.
 
     A circle is run through from its point nearest the arena's centre. With tau = tan(h s) / h, h half
     its curvature and s the distance run, another constraint along it is a quadratic in tau, whatever
@@ -234,7 +239,7 @@ def _cut(constraints: Floats, arena: Arena) -> Arcs:
 
 
 def _roots(quadratic: Floats, linear: Floats, constant: Floats) -> Floats:
-    """Both real roots (..., 2) of quadratics, without cancellation; NaN or infinite where none."""
+    """Find both real roots (..., 2) of quadratics, without cancellation; NaN or infinite where none."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = np.sqrt(linear**2 - 4.0 * quadratic * constant)
         half = -0.5 * (linear + np.where(linear < 0, -root, root))
@@ -270,7 +275,7 @@ def box(border: Arcs) -> Arena:
 
 
 def rings(border: Arcs, relative_tolerance: float = 1e-3) -> list[Floats]:
-    """Closed polygons (n, 2) around the set, which is on their left.
+    """Draw closed polygons (n, 2) around the set, which is on their left.
 
     They hold the set: vertices are on arcs that bend inwards and outside of those that bend outwards.
     Together they are larger than it by no more than the tolerance, in units of its area.
@@ -302,7 +307,7 @@ def signed_area(ring: Floats) -> float:
 
 
 def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
-    """A polygon's vertices along one arc, its end left out; tangents meet outside of convex arcs."""
+    """Find a polygon's vertices along an arc, its end left out; tangents meet outside of convex arcs."""
     length, curvature = border.length[index], border.curvature[index]
     pieces = int(np.ceil(length * np.sqrt(max(abs(curvature) / (4 * tolerance_m), 1.0 / length)) + 1e-9))
     pieces = max(pieces, int(np.ceil(abs(length * curvature))))
@@ -320,7 +325,7 @@ def _vertices(border: Arcs, index: int, tolerance_m: float) -> Floats:
 
 
 def to_blame(pairs: Pairs, arena: Arena) -> Integers:
-    """The pairs that contradict the others, the worst first; none where the exact set is not empty.
+    """Find the pairs that contradict the others, worst first; none where the exact set is not empty.
 
     They are those violated at the place in the arena where the fewest are; of all places where circles
     meet, the one with the least excess.

@@ -86,7 +86,7 @@ def frames(stream: Stream, landmarks: Stream, known: Known) -> Iterator[Frame]:
 
 
 def _maximum_range_m(stream: Stream, known: Known) -> float:
-    """How far the sensor sees: as stated, else the longest range that it measured."""
+    """Tell how far the sensor sees: as stated, else the longest range that it measured."""
     if known.maximum_range_m is not None:
         return known.maximum_range_m
     if "range_m" not in stream.columns:
@@ -103,7 +103,7 @@ def _arena(corners_m: tuple[float, ...]) -> Arena:
 
 
 def _within(places: Floats, range_m: float) -> Arena:
-    """The rectangle no farther than a range from any of the places (n, 2).
+    """Return the rectangle no farther than a range from any of the places (n, 2).
 
     Where there is none one landmark is misidentified, and the robot no farther from one of them.
     """
@@ -138,7 +138,7 @@ class Bearings(NamedTuple):
 def frames_with_bearings(
     stream: Stream, landmarks: Stream, known: Known
 ) -> Iterable[tuple[Frame, Bearings]]:
-    """The frames of a stream and the single bearings of each, none of a relative-bearing stream."""
+    """Yield a stream's frames and the single bearings of each, none of a relative-bearing stream."""
     places = dict(zip(landmarks["landmark_id"].tolist(), landmarks["position_m"][:, :2], strict=True))
     for frame in frames(stream, landmarks, known):
         bearings = Bearings(np.empty((0, 2)), np.empty(0))

@@ -53,7 +53,7 @@ class Odometry(NamedTuple):
     velocity: Floats
 
     def pose_at(self, time_ns: Integers) -> Floats:
-        """Poses (m, 3) at any stamps; before the first the robot stood still."""
+        """Return poses (m, 3) at any stamps; before the first the robot stood still."""
         row = np.maximum(np.searchsorted(self.time_ns, time_ns, side="right") - 1, 0)
         duration_s = np.maximum((time_ns - self.time_ns[row]) * 1e-9, 0.0)
         return np.stack(drive(self.pose[row].T, self.velocity[row].T, duration_s), axis=1)
@@ -143,7 +143,7 @@ def all_headings_of(one: Headings, other: Headings) -> Headings:
 
 
 def turned(headings: Headings, motion: Motion, direction: int = 1) -> Headings:
-    """Headings after a motion, or with the direction -1 before it."""
+    """Return headings after a motion, or with the direction -1 before it."""
     middle = float(wrap_angle(headings.middle_rad + direction * motion.turn_rad))
     return Headings(middle, min(headings.half_rad + motion.turn_error_rad, np.pi))
 
@@ -169,7 +169,12 @@ def moved(
 
 
 def directions(places: shapely.Geometry, target: Floats) -> Headings:
-    """Return directions in which a point is seen from a set; all of them where it is in its hull."""
+    """Return directions in which a point is seen from a set; all of them where it is in its hull.
+
+    Args:
+        places: the set.
+        target: the point (2,), in m.
+    """
     hull = places.convex_hull
     if hull.covers(shapely.Point(target)):
         return ALL_HEADINGS

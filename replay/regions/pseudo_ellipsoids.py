@@ -70,7 +70,7 @@ def monomials(points: Floats, order: Order) -> Floats:
 
 
 def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
-    """Rings u = a |x|^2 + b'x + c with |u| <= 1 on each pair's exact set: (2 n, 4), two a pair.
+    """Return rings u = a |x|^2 + b'x + c with |u| <= 1 on each pair's exact set: (2 n, 4), two a pair.
 
     Where the set is bounded these are the rings of (22), (23), clamped at a centre that lies in the set;
     (23) forgets the offset -d^2/4 of its interval. Where it is not, the arena bounds the values.
@@ -90,7 +90,7 @@ def ring_coefficients(pairs: Pairs, arena: Arena) -> Floats:
 
 
 def _least_on_axis(pairs: Pairs) -> Floats:
-    """The least value of both discs' functions over bounded sets: on the chord's bisector, (n, 2).
+    """Find both discs' least values over bounded sets, on the chord's bisector, (n, 2).
 
     At height t over the chord of length c, f_g = (sin g (t^2 - c^2/4) - cos g c t) / c; the set spans
     the heights c/2 cot(g/2) of both circles' tops.
@@ -112,7 +112,7 @@ def _least_on_axis(pairs: Pairs) -> Floats:
 
 
 def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
-    """A lower bound of the functions over the arena, tight where they are no discs: (k,)."""
+    """Bound the functions over the arena from below, tightly where they are no discs: (k,)."""
     x, y = np.meshgrid(*np.stack(arena, axis=1))
     corners = evaluate(constraints, np.stack([x.ravel(), y.ravel()], axis=1)).min(axis=0)
     with np.errstate(divide="ignore"):
@@ -121,13 +121,24 @@ def _least_in_arena(constraints: Floats, arena: Arena) -> Floats:
 
 
 def slack(ring: Floats, points: Floats, order: Order) -> Floats:
-    """Compute the ring's room at points (..., 2): 1 - u^2, or (9/4) u^2 (1 - u^2) for order 8."""
+    """Compute the ring's room (...,) at points: 1 - u^2, or (9/4) u^2 (1 - u^2) for order 8.
+
+    Args:
+        ring: coefficients of u, (4,), see `ring_coefficients`.
+        points: (..., 2), in the ring's unit.
+        order: how many monomials there are.
+    """
     squared = evaluate(ring[None], points)[..., 0] ** 2
     return 1.0 - squared if order == 4 else 2.25 * squared * (1.0 - squared)
 
 
 def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
-    """Return H (m, order), z (m,) and V (m, m) of a ring: e'V^-1 e = 1 - slack with e = z - H T."""
+    """Return H (m, order), z (m,) and V (m, m) of a ring: e'V^-1 e = 1 - slack with e = z - H T.
+
+    Args:
+        ring: coefficients of u, (4,).
+        order: how many monomials there are.
+    """
     a, bx, by, c = ring
     row = np.array([bx, by, a, a])
     if order == 4:
@@ -149,7 +160,13 @@ def measurement(ring: Floats, order: Order) -> tuple[Floats, Floats, Floats]:
 
 
 def fuse(prior: PseudoEllipsoid, ring: Floats, weight: float) -> PseudoEllipsoid:
-    """Filter by (18) in information form: one sum per parameter; `ring` in scaled positions."""
+    """Filter by (18) in information form: one sum per parameter.
+
+    Args:
+        prior: before.
+        ring: coefficients of u, (4,), in the prior's scaled positions.
+        weight: of the ring, 0 or more.
+    """
     rows, value, size = measurement(ring, order_of(prior))
     weighted = weight * np.linalg.inv(size)
     return prior._replace(
@@ -224,12 +241,12 @@ def fit(
 
 
 def _nothing(order: Order) -> PseudoEllipsoid:
-    """Zero information: the whole space."""
+    """Return zero information: the whole space."""
     return PseudoEllipsoid(np.zeros((order, order)), np.zeros(order), 0.0, np.zeros(2), 1.0)
 
 
 def _weights(rings: Floats, arena: Arena, order: Order, weighting: Weighting, sweeps: int) -> Floats:
-    """Weights (k,) of the rings, with a sum of one."""
+    """Find weights (k,) of the rings, with a sum of one."""
     count = len(rings)
     equal = np.full(count, 1.0 / count)
     if weighting == "equal":
@@ -267,7 +284,7 @@ def _shares(logarithms: Floats) -> Floats:
 
 
 def _area_over(rings: Floats, weights: Floats, arena: Arena, order: Order) -> Size:
-    """The area of the fused set as a function of the weights near those given.
+    """Make the area of the fused set a function of the weights near those given.
 
     It is seen through a window; a set that reaches out of it counts as larger than the window.
     """
@@ -293,7 +310,7 @@ def _fused(rings: Floats, weights: Floats, points: Floats, order: Order) -> Floa
 
 
 def _smallest_ellipsoid(rings: Floats, order: Order, sweeps: int) -> PseudoEllipsoid:
-    """The filter (7), (18) with the lambda that makes the determinant of C^e least.
+    """Filter by (7), (18) with the lambda that makes the determinant of C^e least.
 
     Its C^e is s A^-1, with the information A and the most room s, and a weight is lambda times s. Its
     prior is wide and proper, or the first determinants were infinite; it stays a part of the set.
@@ -332,7 +349,7 @@ def _grid(window: Arena, nodes: int) -> Grid:
 
 
 def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Arena:
-    """The arena, zoomed in to where the values are not negative, with a margin."""
+    """Zoom in to where the values are not negative, with a margin, from the arena."""
     window = arena
     for _ in range(8):
         grid = _grid(window, nodes)
@@ -351,7 +368,7 @@ def _window(values: Callable[[Floats], Floats], arena: Arena, nodes: int) -> Are
 
 
 def _outline(values: Floats, grid: Grid) -> Outline:
-    """Where the values are not negative, cut off at the grid's border."""
+    """Draw where the values are not negative, cut off at the grid's border."""
     tiny = 1e-9 * (grid.x[-1] - grid.x[0])
     x, y = (np.concatenate([[a[0] - tiny], a, [a[-1] + tiny]]) for a in (grid.x, grid.y))
     closed = np.pad(values, 1, constant_values=-float(np.abs(values).max()))

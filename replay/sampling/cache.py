@@ -32,7 +32,7 @@ class SetName:
     seed: int = 0
 
     def __str__(self) -> str:
-        """The name in an archive; raise its version whenever another set is to come out."""
+        """Return the name in an archive; raise its version whenever another set is to come out."""
         kind = "symmetric" if self.symmetric else "free"
         return f"lcd1-{kind}-n{self.dimension}-l{self.count}-seed{self.seed}"
 

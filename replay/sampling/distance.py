@@ -142,7 +142,7 @@ def _exponential_integrals(u: Array, e1: Array, e2: Array) -> None:
 
 
 def _exponential_integrals_beyond_one(u: float) -> tuple[float, float]:
-    """E1(u) and E2(u) - 1 for u > 1, by the continued fraction of E1 from its tail."""
+    """Compute E1(u) and E2(u) - 1 for u > 1, by the continued fraction of E1 from its tail."""
     tail = 0.0
     for k in range(20 + int(80 / u), 0, -1):
         tail = k / (1 + k / (u + tail))

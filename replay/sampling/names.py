@@ -54,7 +54,7 @@ class Sampling(BaseModel, ABC):
     def _at(self, dimension: int, report: Report, /) -> Sampler: ...
 
     def __str__(self) -> str:
-        """The name, without what is left at its default."""
+        """Return the name, without what is left at its default."""
         number = "" if self.number is None else f"-{getattr(self, self.number)}"
         options = [
             f":{key}" if value is True else f":{key}={value}"

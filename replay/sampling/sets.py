@@ -34,8 +34,10 @@ def sets_by_runs(
 ) -> Iterator[tuple[slice, SampleSets]]:
     """Yield the sets of all runs, as many runs at once as memory should hold.
 
-    Run r has the uses offsets[r]:offsets[r + 1]. A randomised sampling needs every run's generator, and
-    moves it on.
+    Args:
+        sampler: which draws them.
+        generators: of the runs; a randomised sampling needs all of them, and moves them on.
+        offsets: (runs + 1,); run r has the uses offsets[r]:offsets[r + 1].
     """
     runs = len(offsets) - 1
     if not sampler.redrawn:
@@ -61,9 +63,14 @@ def sets_by_runs(
 def seeded_by_data(
     generators: Generators, data: Array, offsets: NDArray[np.int64], seed: int, function: int = 0
 ) -> Generators:
-    """Copies of the runs' generators; one that is missing comes from `seed` and the run's first data.
+    """Copy the runs' generators; one that is missing comes from `seed` and the run's first data.
 
-    Every sampled `function` of a filter, counted from zero, has generators of its own.
+    Args:
+        generators: of the runs.
+        data: (n, ...), of all runs, of which the first row of each counts.
+        offsets: (runs + 1,), where the data of each run begin.
+        seed: of the estimator.
+        function: of several that are sampled its number, from zero; each has generators of its own.
     """
     words = np.ascontiguousarray(data).view(np.uint32).reshape(len(data), -1)
     return tuple(

@@ -4,7 +4,7 @@
 Velocities are random walks. Radios err by more than white noise: they have a bias, `bias_range_m`, an
 error of each anchor or each pair of anchor and tag that lasts for seconds, and outliers where the line
 of sight is blocked. All three are options, see `replay.inference.model.augmentation` and
-`replay.inference.linear_algebra.gaussian.inflation`.
+`replay.inference.linear_algebra.inflation`.
 """
 
 from collections.abc import Mapping

@@ -3,7 +3,7 @@
 A report has the muzzle blast's direction of arrival, the bullet's direction as the shockwave tells it,
 and the shockwave's lead. All are of the place from which the shot was fired: the sound has travelled
 since. Reports may be wrong, by an echo or a shockwave of another shot: to Gaussian methods as a whole,
-see `replay.inference.linear_algebra.gaussian.inflation`; to `particles:N` each component by itself.
+see `replay.inference.linear_algebra.inflation`; to `particles:N` each component by itself.
 """
 
 from collections.abc import Mapping

@@ -126,8 +126,8 @@ def golden(step: int, steps: int, value: float, section: Floats) -> float:
     Args:
         step, steps: which step, from 0, of how many.
         value: that at the last place; of no use at step 0.
-        section: (7,), what the search remembers: both ends, both inner places, their values, and which of
-            the places was asked for.
+        section: (7,), what the search remembers: both ends, both inner places, their values, and
+            which of these `value` is.
     """
     if step == 0:
         section[0], section[1] = 1e-9, 1.0 - 1e-9

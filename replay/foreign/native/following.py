@@ -248,7 +248,12 @@ def addresses_of(library: Library, description: Description) -> Addresses:
 
 
 def followed(made: Results, due: Integers, recorded: Integers) -> Followed:
-    """Cut results down to what was filled in."""
+    """Cut results down to what was filled in.
+
+    Args:
+        made: of all runs.
+        due, recorded: (runs + 1,), where the rows for estimates and innovations of each run begin.
+    """
     issued_ns = made.issued_ns[filled_rows(due, made.estimates.end)[0]]
     return Followed(issued_ns, *filled(made.estimates, due), *filled(made.innovations, recorded))
 
@@ -281,7 +286,15 @@ def filters_of(
     runs: int,
     description: Description,
 ) -> Filters:
-    """Make the filters of all runs; a run whose prior is NaN takes no part."""
+    """Make the filters of all runs; a run whose prior is NaN takes no part.
+
+    Args:
+        library: which makes them.
+        parameters, seed: what each is given.
+        prior: stamps (runs,), means (runs, n), covariances (runs, t, t), or None.
+        runs: how many.
+        description: what the library says of itself.
+    """
     n, t = len(description.state), description.tangent
     time_ns, mean, covariance = prior or (
         np.zeros(runs, np.int64),

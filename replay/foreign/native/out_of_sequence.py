@@ -90,7 +90,14 @@ def follow_as_arrived(
 
 
 def insert(begin: int, event: int, events: FilterEvents, order: Integers) -> int:
-    """Put a message where it belongs, by stamp and place in the file; returns its row."""
+    """Put a message where it belongs, by stamp and place in the file; returns its row.
+
+    Args:
+        begin: the first row of its run.
+        event: the message's, all rows before it being in order.
+        events: stamps and places of all.
+        order: (n,), by row the event that stands there, changed in place.
+    """
     time_ns, position = events.time_ns[event], events.arrival[event, 1]
     row = event
     while row > begin and (

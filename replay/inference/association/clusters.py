@@ -126,7 +126,15 @@ def gather_cluster(
     probability: Floats,
     memory: AssociationMemory,
 ) -> tuple[int, int]:
-    """List the tracks and detections that are connected with a track; returns how many there are."""
+    """List the tracks and detections that are connected with a track; returns how many there are.
+
+    Args:
+        first: the track.
+        weights: of pairs and of misses.
+        tracks, detections: how many there are; arrays may be longer.
+        probability: (tracks, 1 + detections), whose first column is NONE for tracks in no cluster yet.
+        memory: whose `rows` and `columns` are filled.
+    """
     memory.rows[0], probability[first, 0] = first, 0.0
     rows, columns, next_row = 1, 0, 0
     while next_row < rows:
@@ -154,6 +162,12 @@ def enumerate_maps(
     Of tracks and detections the fewer are slots, which the others, the items, take one after another.
     What the later items can do depends on the set of slots that are taken, not on who took them: sums
     over maps are sums over these 2^slots sets.
+
+    Args:
+        weights: of pairs and of misses.
+        rows, columns: how many tracks and detections the cluster has.
+        probability: (tracks, 1 + detections), filled for these.
+        memory: with the cluster that `gather_cluster` found.
     """
     tracks_are_slots = rows <= columns
     slots, items = (rows, columns) if tracks_are_slots else (columns, rows)
@@ -237,6 +251,9 @@ def propagate_beliefs(
     """Approximate the marginals of one cluster by messages between tracks and detections that settle.
 
     They are exact where the cluster is a tree, and more certain than exact ones else.
+
+    Args:
+        weights, rows, columns, probability, memory: as for `enumerate_maps`.
     """
     for k in range(rows):
         for j in range(columns):

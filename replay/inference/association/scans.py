@@ -68,7 +68,12 @@ BY_SCAN = ("time_ns", "sensor", "kind", "number", "first", "end", "origin")
 
 
 def take_scans(scans: Scans, rows: Integers) -> Scans:
-    """Return some of the scans, in this order, as those of one run."""
+    """Return some of the scans, in this order, as those of one run.
+
+    Args:
+        scans: of any runs.
+        rows: (k,), which of them.
+    """
     own = {name: getattr(scans, name)[rows] for name in BY_SCAN}
     counts = own["end"] - own["first"]
     ends = np.cumsum(counts)

@@ -70,12 +70,12 @@ def confirm(run: int, place: int, tracks: Tracks) -> None:
 
 
 def may_vanish(run: int, place: int, duration_s: float, tracks: Tracks, p: Any) -> None:
-    """Targets vanish at a steady rate."""
+    """Let targets vanish at a steady rate."""
     tracks.existence[run, place] *= np.exp(-duration_s / p.survival_s)
 
 
 def judge_existence(run: int, place: int, evidence: Evidence, tracks: Tracks, p: Any) -> None:
-    """By Bayes' rule; a confirmed track remains one while it is not below `keeping_existence`."""
+    """Judge by Bayes' rule; a confirmed track remains one while it is not below `keeping_existence`."""
     before, none = tracks.existence[run, place], evidence.probability[0]
     tracks.existence[run, place] = existence_after(before, none, evidence.detectable)
     needed = p.keeping_existence if tracks.is_confirmed[run, place] else p.confirming_existence

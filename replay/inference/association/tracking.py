@@ -247,9 +247,17 @@ def _compiled(tracker: Tracker) -> Callable[..., None]:
 def track_scans(
     tracker: Tracker, scans: Scans, settings: Floats, newborn: Newborn, before: Tracks
 ) -> tuple[Tracks, list[tuple[Scans, TrackOutputs]]]:
-    """Track scans: the tracks after them; and by batch, its scans and their outputs.
+    """Track scans, all runs at once.
 
-    `settings` (sensors, names) are the parameters for each sensor.
+    Args:
+        tracker: how.
+        scans: of all runs.
+        settings: (sensors, names), the parameters for each sensor.
+        newborn: how tracks begin.
+        before: the tracks before these scans.
+
+    Returns:
+        The tracks after them; and by batch, its scans and their outputs.
     """
     columns: Any = before
     tracks = Tracks(*(column.copy() for column in columns))

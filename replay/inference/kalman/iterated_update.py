@@ -24,11 +24,10 @@ from replay.inference.kalman.update import (
 from replay.inference.linear_algebra.gaussian import (
     downdate,
     drop_missing,
-    inflate,
-    inflation,
     kalman_step,
     whiten,
 )
+from replay.inference.linear_algebra.inflation import inflate, inflation
 from replay.inference.linear_algebra.tuples import tuple_of
 from replay.inference.model.corrections import correcting, relinearising, sloping
 from replay.inference.model.stage import Stage

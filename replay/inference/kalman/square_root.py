@@ -40,7 +40,8 @@ from replay.inference.kalman.update import (
     writing_innovation,
 )
 from replay.inference.linear_algebra.factors import FACTORS, fill_root, orthogonalise
-from replay.inference.linear_algebra.gaussian import inflation, whiten_by, wrap
+from replay.inference.linear_algebra.gaussian import whiten_by, wrap
+from replay.inference.linear_algebra.inflation import inflation
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
 from replay.inference.model.corrections import correcting, sloping
 from replay.inference.model.stage import Stage
@@ -145,7 +146,7 @@ def _gap_motion(stage: Stage) -> Function:
 
 
 def _sampled_motion(stage: Stage, samples: int) -> Function:
-    """Noise of the control enters by the derivative at the mean, noise of the motion as a sample."""
+    """Sample a motion; the control's noise enters by the derivative at the mean, its own as a sample."""
     model, motion = stage.model, stage.motion
     linearise = motion_derivative(model, motion, by_state=False) if motion.control_noise else nothing
     variances = (motion.noise if motion.noises else None) or no_variances

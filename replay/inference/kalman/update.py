@@ -20,12 +20,11 @@ from replay.inference.linear_algebra.gaussian import (
     add_through,
     downdate,
     drop_missing,
-    inflate,
-    inflation,
     kalman_step,
     whiten,
     wrap,
 )
+from replay.inference.linear_algebra.inflation import inflate, inflation
 from replay.inference.linear_algebra.linearization import Input, derivative, known_entries
 from replay.inference.linear_algebra.sparse import Pattern, measuring_covariance, pattern_of
 from replay.inference.linear_algebra.tuples import adding_noise, filling, tuple_of
@@ -214,7 +213,12 @@ def writing_innovation(stage: Stage, number: int) -> Function:
 
 
 def is_unmeasured(data: Floats, components: int) -> bool:
-    """Tell whether a message has none of these components, which stand first in its data."""
+    """Tell whether a message has none of a sensor's components.
+
+    Args:
+        data: of the message, NaN where not measured; the components stand first.
+        components: how many there are.
+    """
     measured = 0
     for i in range(components):
         measured += not np.isnan(data[i])
@@ -229,7 +233,7 @@ def kalman_update(stage: Stage, number: int, innovate: Function) -> Function:
 
     Missing components are left out of v, S and C, and so are those of which the model predicts nothing
     (NaN); the log-likelihood is that of the components present. It is zero where the gate is shut, as it
-    is where none is left. What the gate lets in may still count less, see `gaussian.inflation`.
+    is where none is left. What the gate lets in may still count less, see `inflation`.
 
     Args:
         stage: the model with the sensors at hand.

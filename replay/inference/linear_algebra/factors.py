@@ -107,7 +107,7 @@ def retriangulate(rows: Floats, factor: Floats) -> None:
 
 
 def _start(covariances: Floats) -> Floats:
-    """NaN where a covariance is not positive definite: such a run does not start."""
+    """Factor covariances; NaN where one is not positive definite: such a run does not start."""
     factors, whole = np.full_like(covariances, np.nan), is_positive_definite(covariances)
     factors[whole] = np.linalg.cholesky(covariances[whole])
     return factors
@@ -160,7 +160,7 @@ def _mix(weights: Floats, away: Floats, shift: Floats, carried: Floats, factor: 
 
 
 def _retrace(before: Floats, after: Floats, work: Any, turned: Floats, _: Floats) -> bool:
-    """Of what a prediction leaves: G S- in `work.product`, the factor of P - G D' in `work.rest`."""
+    """Go back over a prediction by what it left: G S- in `work.product`, P - G D' in `work.rest`."""
     t = len(before)
     for row in range(t):
         for column in range(t - 1, -1, -1):

@@ -4,7 +4,7 @@ Means lie in the state's own space, covariances in its tangent space and are sym
 Sarkka and Svensson, Bayesian Filtering and Smoothing, 2nd edition, 2023.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,7 +62,10 @@ def cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
 def semidefinite_cholesky(factor: Floats, matrix: Floats, size: int) -> bool:
     """Fill the lower factor of a positive semidefinite block: below a pivot of about zero it is zero.
 
-    Args as for `cholesky`. Returns False where the block is indefinite (or NaN).
+    Args:
+        factor, matrix, size: as for `cholesky`.
+
+    Returns False where the block is indefinite (or NaN).
     """
     for column in range(size):
         smallest = 1e-15 * size * matrix[column, column]
@@ -198,49 +201,6 @@ def whiten_by(factor: Floats, difference: Floats, size: int) -> tuple[float, flo
     return squared, 2.0 * np.log(determinant)
 
 
-def inflation(squared: float, size: int, parameters: Any) -> float:
-    """Compute how many times larger the covariance of an innovation counts, from its NIS and size.
-
-    To S is added what makes it that much larger, as if to the measurement's noise, so that the update is
-    a Kalman update still. 1 where no option of `replay.inference.model.parameters.ModelParameters` is
-    given: those are NaN then. The largest of those given holds:
-
-    - `inflate_nis` = b: NIS / b above b, so that the NIS becomes b;
-    - `student_freedom` = f: (f + NIS) / (f + m), the weight of Student's distribution; Roth, Ozkan,
-      Gustafsson, ICASSP 2013. No less than 1: a small innovation makes no noise smaller;
-    - `switch_nis` = b: ((b + NIS) / 2 b)^2 above b; Agarwal et al., ICRA 2013, (15) with s^-2.
-
-    Args:
-        squared: the NIS.
-        size: how many components the innovation has.
-        parameters: with the three options.
-
-    >>> from types import SimpleNamespace
-    >>> given = dict(inflate_nis=9.0, student_freedom=np.nan, switch_nis=np.nan)
-    >>> inflation(36.0, 1, SimpleNamespace(**given)), inflation(8.0, 1, SimpleNamespace(**given))
-    (4.0, 1.0)
-    """
-    factor = 1.0
-    if squared > parameters.inflate_nis:
-        factor = squared / parameters.inflate_nis
-    if parameters.student_freedom > 0.0:
-        freedom = parameters.student_freedom
-        factor = max(factor, (freedom + squared) / (freedom + size))
-    if squared > parameters.switch_nis:
-        half = 0.5 * (1.0 + squared / parameters.switch_nis)
-        factor = max(factor, half * half)
-    return factor
-
-
-def inflate(innovation: Innovation, size: int, factor: float) -> None:
-    """Multiply the covariance of a whitened innovation of `size` components by a factor, in place."""
-    root = np.sqrt(factor)
-    for i in range(size):
-        innovation.difference[i] /= root
-        for k in range(i + 1):
-            innovation.covariance[i, k] *= root
-
-
 def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
     """Fill `step` (t,) with K v of a whitened innovation; its cross-covariance C becomes W = C L^-T.
 
@@ -263,7 +223,13 @@ def kalman_step(innovation: Innovation, size: int, step: Floats) -> None:
 
 
 def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
-    """Downdate P (t, t) to P - W W', with the first columns of W (t, m) as `kalman_step` leaves it."""
+    """Downdate P to P - W W', in place.
+
+    Args:
+        covariance: P (t, t).
+        weighted: W (t, m), as `kalman_step` leaves it.
+        size: how many columns of W count.
+    """
     for row in range(len(covariance)):
         for column in range(row + 1):
             entry = covariance[row, column]
@@ -275,7 +241,13 @@ def downdate(covariance: Floats, weighted: Floats, size: int) -> None:
 def scalar_update(
     mean: Floats, covariance: Floats, cross: Floats, variance: float, difference: float
 ) -> None:
-    """Update by one number: x + C v / s and P - C C' / s, with C (t,) of the state with v."""
+    """Update by one number v, in place: x + C v / s and P - C C' / s.
+
+    Args:
+        mean, covariance: x (n,) in a flat space, P (n, n).
+        cross: C (n,), the covariance of the state with v.
+        variance, difference: s and v.
+    """
     share = difference / variance
     for row in range(len(cross)):
         mean[row] += cross[row] * share
@@ -286,7 +258,11 @@ def scalar_update(
 
 
 def multiply(left: Floats, right: Floats, product: Floats) -> None:
-    """Fill `product` (n, n) with that of two square matrices."""
+    """Fill the product of two square matrices.
+
+    Args:
+        left, right, product: (n, n); the last is none of the others.
+    """
     for row in range(len(product)):
         for column in range(len(product)):
             entry = 0.0
@@ -296,7 +272,11 @@ def multiply(left: Floats, right: Floats, product: Floats) -> None:
 
 
 def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
-    """Multiply A (n, n) by F from the left in place, by way of `product`."""
+    """Multiply A by F from the left, F A, in place.
+
+    Args:
+        left, matrix, product: F, A and what is worked in, (n, n).
+    """
     multiply(left, matrix, product)
     for row in range(len(matrix)):
         for column in range(len(matrix)):
@@ -304,7 +284,12 @@ def multiply_into(left: Floats, matrix: Floats, product: Floats) -> None:
 
 
 def propagate_covariance(covariance: Floats, transition: Floats, product: Floats) -> None:
-    """Propagate P (t, t) to F P F' in place, by way of `product`, which becomes F P."""
+    """Propagate P to F P F' in place.
+
+    Args:
+        covariance, transition: P and F, (t, t).
+        product: (t, t), which becomes F P.
+    """
     size = len(covariance)
     multiply(transition, covariance, product)
     for row in range(size):
@@ -373,7 +358,13 @@ def predict_constant_velocity(
 
 
 def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
-    """Add G diag(variances) G' to P (t, t), for a gain G (t, k) and variances (k,) of its columns."""
+    """Add G diag(variances) G' to P, in place.
+
+    Args:
+        covariance: P (t, t).
+        gain: G (t, k).
+        variances: (k,), of its columns.
+    """
     for row in range(len(covariance)):
         for column in range(row + 1):
             entry = covariance[row, column]
@@ -383,7 +374,12 @@ def add_through(covariance: Floats, gain: Floats, variances: Floats) -> None:
 
 
 def copy_gaussian(mean: Floats, covariance: Floats, to_mean: Floats, to_covariance: Floats) -> None:
-    """Copy a mean and its covariance."""
+    """Copy a mean and its covariance.
+
+    Args:
+        mean, covariance: (n,), (t, t).
+        to_mean, to_covariance: overwritten, as large.
+    """
     for i in range(len(mean)):
         to_mean[i] = mean[i]
     for i in range(len(covariance)):

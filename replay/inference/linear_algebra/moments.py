@@ -56,7 +56,7 @@ def moments_of(states: int, values: int) -> Function:
 
 
 def _in_parts(states: int, values: int) -> list[range]:
-    """The values in parts: each has sums for as many registers as there are, or is one value."""
+    """Split the values in parts: each has sums for as many registers as there are, or is one value."""
     parts = [range(0)]
     for i in range(values):
         own = range(parts[-1].start, i + 1)

@@ -78,7 +78,7 @@ def propagating_covariance(pattern: Pattern | None) -> Function:
 
 
 def measuring_covariance(pattern: Pattern | None) -> Function:
-    """`measure(covariance, rows, cross, spread)`: C = P H' and S = H C, with H in `rows`."""
+    """Make `measure(covariance, rows, cross, spread)`: C = P H' and S = H C, with H in `rows`."""
     if pattern is None:
         return measured_covariance
     rows_of = tuple(enumerate(pattern))

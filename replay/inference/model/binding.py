@@ -176,7 +176,7 @@ def _serves(model: Model, name: str, topic: Topic) -> bool:
 
 
 def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
-    """The topics of any namespace that end with this name, and serve as messages of the schema."""
+    """List the topics of any namespace that end with this name, and serve as messages of the schema."""
     end = f"/{name.removeprefix('/')}"
     return [
         each
@@ -186,7 +186,7 @@ def _named(topics: Mapping[str, Topic], name: str, schema: Schema) -> list[str]:
 
 
 def _common(spaces: Collection[str]) -> str:
-    """The namespace that all of these are in."""
+    """Return the namespace that all of these are in."""
     parts = zip(*(space.split("/") for space in spaces), strict=False)
     alike = takewhile(lambda each: len(set(each)) == 1, parts)
     return "/".join(each[0] for each in alike)

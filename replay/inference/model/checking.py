@@ -174,7 +174,7 @@ def _sensor_call(model: Model, sensor: Sensor, numbers: Any, rng: np.random.Gene
 
 
 def _states(kinds: Sequence[str], rng: np.random.Generator) -> Floats:
-    """Random states (n, components): numbers of order one, angles of all turns, unit vectors."""
+    """Draw random states (n, components): numbers of order one, angles of all turns, unit vectors."""
     columns = []
     for kind, *_ in manifold_blocks(kinds):
         drawn = rng.normal(size=(STATES, WIDTHS[kind]))
@@ -385,7 +385,7 @@ def _check_period(name: str, index: int, model: Model, calls: list[_Call], state
 
 
 def _check_noise(noise: Function | None, arguments: tuple[Any, ...], size: int, block: int = 0) -> None:
-    """Variances, or the rows of a lower triangle."""
+    """Check variances, or the rows of a lower triangle."""
     if noise is None:
         return
     numbers = np.array(noise(*arguments), dtype=float)

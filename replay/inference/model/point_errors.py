@@ -146,7 +146,7 @@ def sensor_with_errors(model: Model, sensor: Sensor, errors: Errors) -> Sensor:
 
 
 def _same(reference: Any, numbers: Sequence[int]) -> Any:
-    """1 where a message is about these points, 0 where not."""
+    """Return 1 where a message is about these points, 0 where not."""
     found: Any = 1.0
     for index, number in enumerate(numbers):
         found = found * (reference[index] == number)

@@ -250,6 +250,11 @@ def widest(kinds: Sequence[str], covariance: Floats) -> tuple[Floats, float]:
 def split(kinds: tuple[str, ...], mean: Floats, covariance: Floats, members: int) -> tuple[Floats, ...]:
     """Return a Gaussian as a row of narrower ones, across its widest turn.
 
+    Args:
+        kinds: of the state's components.
+        mean, covariance: (n,), (t, t).
+        members: how many at most, spread over a whole turn.
+
     Returns:
         the weights (members,), zero where there is no member; the means (members, n); the covariance
         (t, t) of each. That of the mixture is the Gaussian's own, but for what is beyond a half turn.

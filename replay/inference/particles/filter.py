@@ -170,7 +170,7 @@ class ParticleFilter(Filter):
         return after, [*made, *self.cautions(events.time_ns, first, len(place) - 1)]
 
     def cautions(self, time_ns: Integers, first: Mapping[int, int], runs: int) -> list[Ragged]:
-        """On the topic `started` of runs that begin at these rows: which parameters cannot change."""
+        """Say on the topic `started` of runs that begin at these rows which parameters cannot change."""
         options = self.parameters
         moving = {*(options.estimate_time_s or ())}
         moving |= {name for name, drift in (options.estimate_drift or {}).items() if drift}
@@ -222,7 +222,7 @@ class ParticleFilter(Filter):
     def no_results(
         self, due: Integers, recorded: Integers, innovation_size: int
     ) -> tuple[Any, Innovations]:
-        """Estimates, with particles where they are wanted, and innovations to be filled in."""
+        """Make estimates, with particles where they are wanted, and innovations to be filled in."""
         (end, times, mean, covariance), innovations = super().no_results(due, recorded, innovation_size)
         rows, particles = len(times), self.parameters.particles * self.parameters.cloud
         states = np.empty((rows, particles, self.stage.model.size))

@@ -202,10 +202,17 @@ def effective_number(weight: Floats) -> float:
 
 
 def reweigh(weight: Floats, likelihood: Floats, power: float) -> float:
-    """Multiply weights (N,) of sum 1 by a power of likelihoods, and norm them.
+    """Multiply weights of sum 1 by a power of likelihoods, and norm them.
 
-    The likelihoods are given as logarithms. Returns log sum w p^power. Where a likelihood is NaN, the
-    particle gets the mean of the others. NaN, and weights of no use, where none is above zero.
+    Where a likelihood is NaN, the particle gets the mean of the others.
+
+    Args:
+        weight: (N,), changed in place.
+        likelihood: (N,), logarithms.
+        power: of the likelihoods.
+
+    Returns:
+        log sum w p^power; NaN, and weights of no use, where none is above zero.
     """
     best = -np.inf
     for i in range(len(weight)):

@@ -136,7 +136,7 @@ def taking_in_parts(model: Model, look: Function, likelihood: Function) -> Funct
 
 
 def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemory) -> float:
-    """The largest power up to what is left that leaves enough particles effective."""
+    """Find the largest power up to what is left that leaves enough particles effective."""
     least = memory.least_effective
     if not effective_after(weight, likelihood, left, memory.kernel.trial) < least:
         return left
@@ -153,7 +153,12 @@ def _power(weight: Floats, likelihood: Floats, left: float, memory: ParticleMemo
 
 
 def effective_after(weight: Floats, likelihood: Floats, power: float, trial: Floats) -> float:
-    """Count the effective particles after a power of the likelihoods; `trial` (N,) is to work in."""
+    """Count the effective particles after a power of the likelihoods.
+
+    Args:
+        weight, likelihood, power: as for `reweigh`, but the weights stay.
+        trial: (N,), to work in.
+    """
     for i in range(len(weight)):
         trial[i] = weight[i]
     reweigh(trial, likelihood, power)

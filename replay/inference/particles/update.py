@@ -24,10 +24,10 @@ from replay.inference.linear_algebra.gaussian import (
     LOG_TWO_PI,
     cholesky,
     drop_missing,
-    inflation,
     whiten,
     wrap,
 )
+from replay.inference.linear_algebra.inflation import inflation
 from replay.inference.linear_algebra.linearization import Input, derivative
 from replay.inference.linear_algebra.tuples import filling, tuple_of
 from replay.inference.model.stage import Stage

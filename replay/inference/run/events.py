@@ -83,7 +83,11 @@ def data_columns(stage: Stage) -> tuple[int, int]:
 def events_of(
     stage: Stage, found: Found, block: Block, context: Context, settings: Floats
 ) -> tuple[FilterEvents, Booleans]:
-    """Return what `filter_events` does, which may be known from an earlier replay of the block."""
+    """Return what `filter_events` does, which may be known from an earlier replay of the block.
+
+    Args:
+        stage, found, block, context, settings: as for `filter_events`.
+    """
     drives = () if found.control is None else (found.control.name,)
     read = (topic.name for _, topic in (*found.fallbacks, *found.sensors))
     origins = None if context.origins is None else context.origins.tobytes()

@@ -98,7 +98,12 @@ def first_of_runs(
 
 
 def of_runs(stream: Stream, has_one: Booleans) -> Ragged:
-    """Lay out a stream of one message for each of some runs."""
+    """Lay out a stream of one message for each of some runs.
+
+    Args:
+        stream: these messages, in the order of their runs.
+        has_one: (runs,), which runs have one.
+    """
     return Ragged(stream, np.append(0, np.cumsum(has_one)))
 
 

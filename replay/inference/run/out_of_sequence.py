@@ -276,7 +276,13 @@ class OutOfSequenceFilter:
 
 
 def rewound(name: str, events: FilterEvents, repeated: Integers) -> Ragged:
-    """List the late messages, and how many updates (n,) each had repeated."""
+    """List the late messages, and how many updates each had repeated.
+
+    Args:
+        name: of the estimator.
+        events: of the block, n of them.
+        repeated: (n,), zero for a message that was not late.
+    """
     is_late = repeated > 0
     stream = make_stream(
         f"/estimates/{name}/rewound",

@@ -128,7 +128,15 @@ class RunResults(NamedTuple):
 def recorded_innovations(
     topic: str, components: Mapping[str, str], truth: str, innovations: Innovations, offsets: Integers
 ) -> Ragged:
-    """Make the stream of innovations that a recursion filled in; run r has offsets[r]:offsets[r + 1]."""
+    """Make the stream of innovations that a recursion filled in.
+
+    Args:
+        topic: of the estimator.
+        components: what is measured, with kinds.
+        truth: the topic that the estimates are judged by.
+        innovations: (n, ...), laid end to end, see `filled`.
+        offsets: (runs + 1,), where those of each run begin.
+    """
     _, time_ns, target_id, difference, covariance, numbers = innovations
     columns: dict[str, NDArray] = {
         "sensor_time_ns": time_ns,

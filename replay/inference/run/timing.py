@@ -113,7 +113,12 @@ def _with_arrivals(events: FilterEvents, other: FilterEvents) -> FilterEvents:
 
 
 def select_events(events: FilterEvents, chosen: Booleans) -> FilterEvents:
-    """Select some of the events."""
+    """Select some of the events.
+
+    Args:
+        events: n of them, of all runs.
+        chosen: (n,).
+    """
     columns: Any = (column[chosen] for column in events[1:])
     return FilterEvents(ragged_rows(chosen, events.offsets), *columns)
 

@@ -115,7 +115,13 @@ def affine_steps(stage: Stage) -> Steps:
 
 
 def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) -> None:
-    """Measure every component of the state as it stands, one after the other."""
+    """Measure every component of the state as it stands, one after the other, in place.
+
+    Args:
+        mean, covariance: (t,), about the trajectory's state in its tangent space; (t, t).
+        trajectory: with the damping, and the variances of the start.
+        node: where the state is.
+    """
     damping, column = trajectory.damping[0], trajectory.column
     if damping == 0.0:
         return
@@ -128,7 +134,7 @@ def damped(mean: Floats, covariance: Floats, trajectory: Trajectory, node: int) 
 
 
 def affine_motion(stage: Stage) -> Function:
-    """Prediction of the tangent vector at one stamp to that at the next."""
+    """Make the prediction of the tangent vector at one stamp to that at the next."""
     model, motion = stage.model, stage.motion
     linearise = motion_derivative(model, motion, by_state=True)
     add_noise, reach = motion_noise(model, motion), reaching(model.kinds)
@@ -239,10 +245,19 @@ def whitened_square(offset: Floats, factors: Factors, step: int, whitened: Float
 
 
 def factor_by_pivots(matrix: Floats, factor: Floats, order: Integers, left: Floats) -> int:
-    """Factor a positive semidefinite matrix by Cholesky, pivoted: its rank, or -1 where it is none.
+    """Factor a positive semidefinite matrix by Cholesky, pivoted.
 
     The row with the largest share of its diagonal entry left comes next; shares below NOTHING_LEFT are
-    round-off. Fills `order`, and `factor` (t, rank), whose row order[k] ends in column k.
+    round-off.
+
+    Args:
+        matrix: (t, t).
+        factor: (t, t), filled in its first columns, as many as the rank.
+        order: (t,), filled: row order[k] of the factor ends in column k.
+        left: (t,), to work in.
+
+    Returns:
+        The rank, or -1 where the matrix is not positive semidefinite.
     """
     size = len(matrix)
     for row in range(size):

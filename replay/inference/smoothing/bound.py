@@ -71,9 +71,16 @@ def smooth(
     covariance: Floats,
     memory: BackMemory,
 ) -> None:
-    """Make covariances (nodes, t, t) of a filter those of its smoother along one trajectory, in place.
+    """Make covariances of a filter those of its smoother along one trajectory, in place.
 
     With the gain G = P F' P-^-1, each is P + G (Ps - P-) G', Ps being that of the node after it.
+
+    Args:
+        run: which.
+        offsets: (runs + 1,), where the nodes of each run begin.
+        transition, noise: F and Q of the step to each node, (nodes, t, t).
+        covariance: (nodes, t, t), changed; NaN at its first place where P- is none.
+        memory: to work in.
     """
     predicted, turned, factor, product = memory
     for node in range(offsets[run + 1] - 2, offsets[run] - 1, -1):

@@ -208,7 +208,12 @@ def search(stage: Stage, steps: Steps, settings_of: Function) -> Function:
 
 
 def copy_rows(these: Floats, there: Floats, begin: int, end: int) -> None:
-    """Copy some rows of one array to the same of another."""
+    """Copy some rows of one array to the same of another.
+
+    Args:
+        these, there: (n, k), the first to the second.
+        begin, end: the rows.
+    """
     for row in range(begin, end):
         for column in range(these.shape[1]):
             there[row, column] = these[row, column]

@@ -90,7 +90,7 @@ class Bounds:
         return self
 
     def _steps_of(self, output: Output) -> Integers:
-        """The steps' numbers in their runs; says where a run's stamps are not those of the others."""
+        """Return the steps' numbers in their runs; says where a run's stamps are not those of others."""
         rows, numbers = output.rows, []
         for run in range(rows.runs):
             begin, end = rows.offsets[run], rows.offsets[run + 1]
@@ -131,7 +131,7 @@ class Bounds:
         return UNALIKE if len(set(self.steps.values())) > 1 else ""
 
     def covariances(self) -> Floats | None:
-        """The bounds (steps, t, t) after the prior's; None where there are none of the ensemble."""
+        """Return the bounds (steps, t, t) after the prior's; None where the ensemble has none."""
         if self.complaint or self.sums is None:
             return None
         _, count, sums = self.sums.filled()
@@ -161,7 +161,7 @@ def products_of(rows: Ragged, size: int) -> Products | None:
 
 
 def filter_information(mean: Products) -> Floats:
-    """J (steps, t, t): the recursion from the first step, which comes from nothing."""
+    """Compute J (steps, t, t): the recursion from the first step, which comes from nothing."""
     found = mean.after + mean.measured
     for step in range(1, len(found)):
         left = mean.across[step].T @ np.linalg.solve(
@@ -172,7 +172,7 @@ def filter_information(mean: Products) -> Floats:
 
 
 def later_information(mean: Products) -> Floats:
-    """L (steps, t, t): what all later steps say of each."""
+    """Compute L (steps, t, t): what all later steps say of each."""
     found = np.zeros_like(mean.after)
     for step in range(len(found) - 2, -1, -1):
         after = mean.after[step + 1] + mean.measured[step + 1] + found[step + 1]

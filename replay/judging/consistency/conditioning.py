@@ -78,7 +78,7 @@ def conditioning_of(rows: Ragged, epochs_ns: NDArray[np.int64], first_run: int =
 
 @lru_cache(maxsize=64)
 def _sampled(count: int) -> NDArray[np.int64]:
-    """The rows that are looked at, of so many."""
+    """Return the rows that are looked at, of so many."""
     most = min(count, max(FEWEST, min(count // EACH, MOST)))
     return np.arange(most) * (count - 1) // max(1, most - 1)
 
@@ -106,7 +106,7 @@ def least_pivots(covariances: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _least_pivot(left: NDArray[np.float64]) -> float:
-    """That of one matrix (n, n), which is spent; it ends at a pivot that is not positive."""
+    """Find that of one matrix (n, n), which is spent; it ends at a pivot that is not positive."""
     least = 1.0
     for place in range(len(left)):
         pivot = float(left[place, place])

@@ -19,7 +19,7 @@ def component_error_squared(error: Array, covariance: Array) -> Array:
 
 
 def ellipse_area(covariance: Array, probability: float = 0.95) -> Array:
-    """Area of the error ellipse of covariances (..., 2, 2) that holds this probability.
+    """Compute the area of error ellipses of covariances (..., 2, 2) that hold this probability.
 
     Zero where rounding makes the determinant of a singular one negative.
     """

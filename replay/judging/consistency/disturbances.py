@@ -23,7 +23,7 @@ class Disturbances(NamedTuple):
 
 
 def disturbances(samples: Stream, estimates: Stream, limit_ut: float = 8.0) -> Disturbances:
-    """The seconds in which the mean deviation of the field is longer than a limit, joined to spans.
+    """Find the seconds in which the field's mean deviation is longer than a limit, joined to spans.
 
     Args:
         samples: of an inertial unit with a magnetometer.

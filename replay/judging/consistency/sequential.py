@@ -41,7 +41,7 @@ class Decisions(NamedTuple):
 
 
 def thresholds(rates: Rates) -> tuple[float, float]:
-    """Between which sums of log-likelihood ratios there is no decision: below reject, above accept.
+    """Return the sums of log-likelihood ratios below which one rejects, and above which one accepts.
 
     Raises BadInput where a rate is not above zero, or their sum not below one.
     """
@@ -60,7 +60,7 @@ def wald_bounds(rates: Rates) -> Rates:
 
 
 def wald_probes(rates: Rates, mean_ratio: float, *, genuine: bool) -> float:
-    """The mean number of probes by Wald's approximation (4.8): the sum ends on a threshold exactly.
+    """Compute the mean number of probes by Wald (4.8), as if the sum ended on a threshold exactly.
 
     `mean_ratio` is the mean log-likelihood ratio of a probe, of the person (`genuine`) or of impostors.
     """

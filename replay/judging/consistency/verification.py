@@ -87,7 +87,12 @@ def roc(score: Floats, genuine: NDArray[np.bool_], weight: Floats | None = None)
 
 
 def genuine_accept_at(curve: Roc, false_accept: ArrayLike) -> Floats:
-    """Return the greatest genuine accept rate whose false accept rate is not above that given."""
+    """Return the greatest genuine accept rate whose false accept rate is not above that given.
+
+    Args:
+        curve: of a fusion.
+        false_accept: rates (...), between 0 and 1.
+    """
     last = np.searchsorted(curve.false_accept, false_accept, side="right") - 1
     return curve.genuine_accept[last]
 
@@ -121,7 +126,7 @@ def identified(scores: Floats) -> int:
 
 
 def verification_rate(fused: Fused) -> float:
-    """The share of right decisions (genuine is above the threshold), averaged over the folds.
+    """Compute the share of right decisions (genuine is above the threshold), averaged over the folds.
 
     The threshold is 0, as of a log-likelihood ratio, where the fusion states none.
     """
@@ -134,14 +139,19 @@ def verification_rate(fused: Fused) -> float:
 
 
 def relative_rate_increase(fused_rate: float, rates: ArrayLike) -> tuple[float, float]:
-    """Compute how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3)."""
+    """Compute how much a rate exceeds the single matchers' mean, absolutely and relatively (eq. 3).
+
+    Args:
+        fused_rate: between 0 and 1.
+        rates: of the single matchers, (n,).
+    """
     mean = float(np.mean(np.asarray(rates, float)))
     increase = fused_rate - mean
     return increase, increase / (1 - mean)
 
 
 def bootstrap_users(fused: Fused, replicates: int, rng: np.random.Generator) -> Floats:
-    """GAR at the three FARs, and EER, (replicates, 4), of users drawn again with replacement.
+    """Compute GAR at the three FARs, and EER, (replicates, 4), of users drawn again with replacement.
 
     A comparison counts as often as its probe's user was drawn times its gallery's; the user alone for
     a genuine one. So the dependence of scores of one user is kept (Bolle, Ratha & Pankanti 2004).
@@ -163,7 +173,7 @@ Runs = dict[int, list[Stream]]
 
 
 def _add(state: Runs, output: Output) -> Runs:
-    """The fused scores of every run; nothing of other outputs."""
+    """Keep the fused scores of every run; nothing of other outputs."""
     if output.rows.stream.schema.full_name == schemas.SCORE_VECTOR.full_name and output.leaf == "fused":
         for run in range(output.rows.runs):
             state.setdefault(output.first_run + run, []).append(output.rows.of_run(run))
@@ -171,7 +181,7 @@ def _add(state: Runs, output: Output) -> Runs:
 
 
 def _means(state: Runs) -> dict[str, float]:
-    """Rates of a fusion, means over the runs."""
+    """Return the rates of a fusion, means over the runs."""
     runs = [_rates(fused_of(concatenate(parts))) for parts in state.values()]
     return {name: float(np.mean([run[name] for run in runs])) for name in runs[0]} if runs else {}
 

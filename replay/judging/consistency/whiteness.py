@@ -43,7 +43,7 @@ class Whiteness(NamedTuple):
 
 
 def whitened(innovations: Stream) -> Floats:
-    """Normalised innovations e = L^-1 v (n, m) of an innovation stream, where S = L L'.
+    """Return normalised innovations e = L^-1 v (n, m) of an innovation stream, where S = L L'.
 
     A component is made independent of those before it; one that is missing is NaN, and left out of the
     others. A covariance that is none makes a row of NaN.
@@ -67,9 +67,13 @@ def whitened(innovations: Stream) -> Floats:
 
 
 def whiteness(series: Sequence[Floats], lags: int = LAGS) -> Whiteness:
-    """Measure the whiteness of normalised innovations (n,) of one component, of one run or several.
+    """Measure the whiteness of normalised innovations of one component.
 
     Fewer than `lags` + 2 tell nothing: all but their count is NaN.
+
+    Args:
+        series: of one run or several, (n,) each; what is not finite is left out.
+        lags: up to which the correlation is looked at.
     """
     known = [each[np.isfinite(each)] for each in series]
     count = sum(map(len, known))

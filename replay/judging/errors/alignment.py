@@ -91,7 +91,7 @@ def aligned(trajectory: Trajectory, alignment: Alignment) -> Trajectory:
 
 
 def aligned_estimates(estimates: Stream, alignment: Alignment) -> Stream:
-    """Gaussian estimates in the truth's frame with their covariances: NEES is of the aligned errors.
+    """Return Gaussian estimates in the truth's frame with their covariances: NEES is of aligned errors.
 
     Positions and velocities turn, headings and orientations as well; the latter have their covariance in
     the body's frame, where it stays. All other components are taken to be of the body.
@@ -124,7 +124,7 @@ class AlignedEstimates(LogSource):
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Blocks of the log, estimates aligned."""
+        """Yield blocks of the log, estimates aligned."""
         for block in super().blocks(topics, order, block_messages):
             yield {
                 topic: aligned_estimates(stream, self.alignments[topic])

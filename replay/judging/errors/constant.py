@@ -76,7 +76,7 @@ class FrameSums:
             setattr(self, name, getattr(self, name) + value)
 
     def constant(self, *, turns: bool) -> Constant | None:
-        """The mean error, where it makes most of the error, is constant, and NEES tells it."""
+        """Return the mean error, where it makes most of the error, is constant, and NEES tells it."""
         if not self.count or not self.squared:
             return None
         mean = self.error / self.count
@@ -124,7 +124,7 @@ class ConstantSums:
         self.turned.merge(other.turned)
 
     def found(self) -> Constant | None:
-        """The error that stays, if there is one; of both frames that in which it makes more of it.
+        """Find the error that stays, if there is one; of both frames that in which it makes more of it.
 
         Of a body that never turns it is not known, and counts as that of another origin.
         """
@@ -135,7 +135,7 @@ class ConstantSums:
 
 
 def _inverse(covariance: Floats) -> Floats:
-    """The inverses of covariances (axes, axes, n); an infinite variance weighs nothing."""
+    """Return the inverses of covariances (axes, axes, n); an infinite variance weighs nothing."""
     if len(covariance) > 2:
         finite = np.where(np.isfinite(covariance), covariance, 1e300)
         return np.moveaxis(np.linalg.inv(np.moveaxis(finite, 2, 0)), 0, 2)
@@ -147,7 +147,7 @@ def _inverse(covariance: Floats) -> Floats:
 
 
 def _turned(vector: Floats, cosine: Floats, sine: Floats) -> Floats:
-    """Vectors (axes, ..., n) as seen from bodies with these headings (n,)."""
+    """Return vectors (axes, ..., n) as seen from bodies with these headings (n,)."""
     turned = vector.copy()
     turned[0] = cosine * vector[0] + sine * vector[1]
     turned[1] = cosine * vector[1] - sine * vector[0]

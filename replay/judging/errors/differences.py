@@ -126,7 +126,7 @@ def _difference(first: Floats, second: Floats, axis: int = -1) -> Floats:
 def _interval(
     first: Floats, second: Floats, statistic: Callable[..., Floats]
 ) -> tuple[float, float, Floats]:
-    """Where a statistic of the pairs lies with 95 %, and its resamples."""
+    """Find where a statistic of the pairs lies with 95 %, and its resamples."""
     runs = len(first)
     from scipy.stats import bootstrap, norm, t  # which takes long to import
 
@@ -146,7 +146,7 @@ def _interval(
 
 
 def _direction(first: Floats, second: Floats, target: Target, difference: float) -> Verdict:
-    """What a difference means; of two on either side of their aim, maybe only which is higher."""
+    """Say what a difference means; of two on either side of their aim, maybe only which is higher."""
     if target in ("low", "high"):
         return "worse" if (difference > 0) == (target == "low") else "better"
     if isinstance(target, float):
@@ -173,7 +173,7 @@ def mean_interval(values: NDArray[Any]) -> tuple[float, float]:
 
 
 def rms_interval(values: NDArray[Any]) -> tuple[float, float]:
-    """Where the root mean square of runs (n,) lies with 95 %, by the bootstrap; NaN of few runs."""
+    """Find where the root mean square of runs (n,) lies with 95 %, by bootstrap; NaN of few runs."""
     from scipy.special import ndtr, stdtrit
 
     runs, squares = len(values), values**2

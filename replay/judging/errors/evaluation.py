@@ -122,7 +122,12 @@ PER_ROW = ("run", "step", "time_ns", "elapsed_s", "error", "covariance", "nees")
 
 
 def errors_at(errors: Errors, rows: NDArray[np.bool_]) -> Errors:
-    """Select some rows of errors."""
+    """Select some rows of errors.
+
+    Args:
+        errors: of an ensemble.
+        rows: (n,), which of them.
+    """
     columns = {name: getattr(errors, name)[rows] for name in PER_ROW}
     heading_rad = None if errors.heading_rad is None else errors.heading_rad[rows]
     return replace(errors, **columns, heading_rad=heading_rad)
@@ -153,7 +158,7 @@ class Innovations(NamedTuple):
 
 
 def split_topic(topic: str) -> tuple[str, str]:
-    """Estimator and case of an estimate topic: /estimates/ESTIMATOR/CASE.../LEAF."""
+    """Return estimator and case of an estimate topic: /estimates/ESTIMATOR/CASE.../LEAF."""
     parts = topic.removeprefix("/estimates/").split("/")
     return parts[0], "/".join(parts[1:-1])
 
@@ -203,7 +208,7 @@ def errors_of(
     first_run: int = 0,
     first_fixes: FirstFixes | None = None,
 ) -> Errors | None:
-    """Errors of a Gaussian estimate stream of an ensemble, in the components that all truths have.
+    """Compute the errors of an ensemble's Gaussian estimates, in the components that all truths have.
 
     An axis or a quaternion is judged whole or not at all. None where a run has no truth topic, the
     truths have nothing in common with the estimates (see `components_without_truth`), or their planes
@@ -274,7 +279,7 @@ def errors_of(
 
 
 def _heading_of(state: Floats, components: Components) -> Floats | None:
-    """The heading (n,) in a state (n, components); None where it has none."""
+    """Return the heading (n,) in a state (n, components); None where it has none."""
     names, kinds = list(components), list(components.values())
     if components.get(HEADING) == "angle":
         return state[:, names.index(HEADING)]
@@ -331,7 +336,7 @@ def unjudged_sentence(estimates: Ragged, sources: Sequence[Source], first: First
 
 
 def _components(stream: Stream) -> dict[str, Any]:
-    """Names and kinds of an estimate's components; raises BadInput where it does not state them."""
+    """Return names and kinds of an estimate's components; raises BadInput where it states none."""
     names = stream.components
     kinds = stream.metadata.get("kinds", "").split(",")
     if len(set(names)) != len(kinds) or len(names) != len(kinds) or not are_kinds(kinds):

@@ -16,7 +16,7 @@ MOST_PERMUTED = 6
 
 
 def total_error(squared: Floats) -> Floats:
-    """(20): the root of the mean over steps of all things' squared errors together, (..., steps).
+    """Compute (20): the root of the mean over steps of all things' squared errors, (..., steps).
 
     It is the root of a sum; the paper's words have a sum of roots.
     """

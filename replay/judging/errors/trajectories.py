@@ -177,7 +177,7 @@ def associate(
 
 
 def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, Integers]:
-    """The times with one of the others within a limit, and the nearest of these; of two the first."""
+    """Find the times with one of the others within a limit, and their nearest; of two the first."""
     right = np.searchsorted(among, times, side="right").clip(0, len(among) - 1)
     left = (right - 1).clip(0)
     nearest = np.where(np.abs(times - among[left]) <= np.abs(among[right] - times), left, right)
@@ -188,7 +188,7 @@ def _nearest(times: Integers, among: Integers, most_ns: int) -> tuple[Integers, 
 def _interpolated(
     truth: Trajectory, time_ns: Integers, gap_limit_s: float
 ) -> tuple[Trajectory, NDArray[np.bool_]]:
-    """The truth at those stamps that it is known at, and which these are."""
+    """Return the truth at those stamps that it is known at, and which these are."""
     poses = truth.position_m
     if truth.rotation is not None:
         quaternion = Rotation.from_matrix(truth.rotation).as_quat(scalar_first=True)
@@ -203,14 +203,14 @@ def _interpolated(
 
 
 def _stamps(trajectory: Trajectory) -> Integers:
-    """The stamps of a trajectory that needs some."""
+    """Return the stamps of a trajectory that needs some."""
     if trajectory.time_ns is None:
         raise BadInput(f"{trajectory.name}: has no stamps; give a trajectory with stamps, such as TUM")
     return trajectory.time_ns
 
 
 def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> tuple[Integers, Integers]:
-    """First and last poses of consecutive parts of the way, each just over the delta."""
+    """Find first and last poses of consecutive parts of the way, each just over the delta."""
     unit, delta = comparison.delta_unit, comparison.delta
     steps: NDArray = np.ones(len(estimate) - 1)
     if unit == "m":
@@ -234,20 +234,20 @@ def _pairs(estimate: Trajectory, truth: Trajectory, comparison: Comparison) -> t
 
 
 def _way(trajectory: Trajectory, first: Integers, last: Integers) -> Floats:
-    """The ways (k, 3) of pairs, each seen from its first pose where that is known."""
+    """Return the ways (k, 3) of pairs, each seen from its first pose where that is known."""
     way = trajectory.position_m[last] - trajectory.position_m[first]
     rotation = trajectory.rotation
     return way if rotation is None else np.einsum("kji,kj->ki", rotation[first], way)
 
 
 def _turn(trajectory: Trajectory, first: Integers, last: Integers) -> Floats | None:
-    """The rotations (k, 3, 3) of pairs, each seen from its first pose."""
+    """Return the rotations (k, 3, 3) of pairs, each seen from its first pose."""
     rotation = trajectory.rotation
     return None if rotation is None else rotation[first].transpose(0, 2, 1) @ rotation[last]
 
 
 def _angle_deg(left: Floats | None, right: Floats | None) -> Floats | None:
-    """Angles (n,) of the rotations from one matrix (n, 3, 3) to the other."""
+    """Compute the angles (n,) of the rotations from one matrix (n, 3, 3) to the other."""
     if left is None or right is None:
         return None
     return np.degrees(Rotation.from_matrix(left.transpose(0, 2, 1) @ right).magnitude())
@@ -266,7 +266,7 @@ def statistics(error: Floats) -> dict[str, float]:
 
 
 def trajectory_metrics(runs: Sequence[Compared]) -> dict[str, float]:
-    """APE and RPE over all poses of runs, as `ape_translation_rmse_m`; how many poses and pairs."""
+    """Return APE and RPE over all poses of runs, as `ape_translation_rmse_m`, and how many there are."""
     errors: dict[tuple[str, str], list] = {
         ("ape_translation", "m"): [run.absolute_m for run in runs],
         ("ape_rotation", "deg"): [run.absolute_deg for run in runs],
@@ -351,7 +351,7 @@ def estimated_offset_s(estimate: Trajectory, truth: Trajectory, align: Align) ->
 
 
 def _best_lags(estimate: Floats, truth: Floats) -> Integers:
-    """How many places later the first signal correlates most with the other: the highest peaks.
+    """Find how many places later the first signal correlates most with the other: the highest peaks.
 
     Pearson's correlation of what overlaps, which is half of the shorter one at least.
     """

@@ -14,7 +14,7 @@ from replay.judging.errors.trajectories import POSE_KINDS
 
 
 def trajectory_of(stream: Stream) -> Trajectory | None:
-    """The poses that a truth, an estimate or a Pose stream states; None where it states no position.
+    """Return the poses that a truth, an estimate or a Pose stream states; None where it has no position.
 
     What the position lacks is zero, as the height of a robot in the plane; a heading is a rotation about
     the vertical. Poses that are not finite are left out.
@@ -42,7 +42,7 @@ def trajectory_of(stream: Stream) -> Trajectory | None:
 
 
 def _of_poses(stream: Stream) -> Trajectory:
-    """Positions with unit quaternions; what is not finite is left out."""
+    """Return positions with unit quaternions; what is not finite is left out."""
     position_m, quaternion = (
         stream[name].reshape(len(stream), width)
         for name, width in (("position_m", 3), ("quaternion", 4))

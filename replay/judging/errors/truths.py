@@ -121,7 +121,7 @@ class Truths:
             self._read_to_ns = max(self._read_to_ns, int(stream.publish_time_ns[-1]))
 
     def _current(self, topic: str) -> Stream:
-        """What is held of a topic, from the last message that some reader may still need."""
+        """Return what is held of a topic, from the last message that some reader may still need."""
         held = self._parts[topic]
         readers = [at_ns for (of, _), at_ns in self._reached.items() if of == topic]
         passed_ns = min(readers or self._reached.values(), default=-1)
@@ -133,7 +133,7 @@ class Truths:
 
 
 def _states(truth: Stream) -> dict[str, Floats]:
-    """The linear components (n,) of a truth, by their names."""
+    """Return the linear components (n,) of a truth, by their names."""
     names = truth.components
     kinds = truth.metadata.get("kinds", "").split(",") if truth.metadata.get("kinds") else []
     columns = truth["state"].reshape(len(truth), -1).T
@@ -142,7 +142,7 @@ def _states(truth: Stream) -> dict[str, Floats]:
 
 
 def _apart(truth: Stream, other: Stream) -> dict[str, Floats]:
-    """How far two truths are apart, by component, at the first's stamps that lie among the other's."""
+    """Compute how far two truths are apart, by component, at the first's stamps among the other's."""
     time_ns, there_ns = truth.publish_time_ns, other.publish_time_ns
     both = (time_ns >= there_ns[0]) & (time_ns <= there_ns[-1])
     own, others = _states(truth), _states(other)

@@ -66,7 +66,7 @@ def diagnostics_of(output: Output) -> OutputDiagnostics | None:
 
 
 def _late_s(stream: Stream) -> Floats:
-    """How long after they were measured messages (n,) were taken."""
+    """Compute how long after they were measured messages (n,) were taken."""
     return (stream.log_time_ns - stream.publish_time_ns).astype(np.float64) * 1e-9
 
 
@@ -134,7 +134,7 @@ class MeansOfAll:
                 self._of[topic] = means
 
     def _tables(self, *wanted: str) -> "Iterator[tuple[str, pd.DataFrame]]":
-        """What is told and its table, of every stream that tells one of what is wanted."""
+        """Yield what is told and its table, of every stream that tells one of what is wanted."""
         for means in self._of.values():
             if means.what in wanted and len(table := means.table):
                 yield means.what, table
@@ -155,7 +155,7 @@ class MeansOfAll:
             yield table.rename(columns={"messages": "estimates"})
 
     def late(self) -> "Iterator[pd.DataFrame]":
-        """Messages that came late: a row per span of time and what became of them.
+        """Yield the messages that came late: a row per span of time and what became of them.
 
         `late_s` is their mean delay, `repeated` how many others were used again for one on average.
         """

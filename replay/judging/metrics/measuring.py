@@ -103,7 +103,7 @@ def metric_of_sums(
 
 
 def plus(first: Sums, second: Mapping[str, Any]) -> Sums:
-    """Sums of both by name: numbers and arrays add up, sets unite."""
+    """Add sums of both by name: numbers and arrays add up, sets unite."""
     total = dict(first)
     for name, value in second.items():
         if name not in total:
@@ -114,7 +114,7 @@ def plus(first: Sums, second: Mapping[str, Any]) -> Sums:
 
 
 def find_metrics(names: Sequence[str] = ()) -> dict[str, Metric[Any, Any]]:
-    """The registered metrics of these names, of all where none is given; BadInput for an unknown one."""
+    """Return the metrics of these names, of all where none is given; BadInput for an unknown one."""
     return {name: load("metrics", name, Metric) for name in names or available("metrics")}
 
 
@@ -146,7 +146,7 @@ class Measurement:
                     states[name] = metric.add(state, judged)
 
     def __getstate__(self) -> dict[str, Any]:
-        """As it is pickled: metrics are found again by their names."""
+        """Return it as it is pickled: metrics are found again by their names."""
         return {**vars(self), "_metrics": list(self._metrics)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -16,7 +16,7 @@ from replay.judging.metrics.sums import BinnedSums
 
 
 def squares(errors: Errors) -> Sums:
-    """Sums of squared errors by the name of their RMSE: of the position, and of other components."""
+    """Sum squared errors by the name of their RMSE: of the position, and of other components."""
     found: Sums = {"estimates": len(errors.error), "estimates_without_truth": errors.without_truth}
     found |= squares_by_name(errors.squared, errors.components, errors.kinds)
     return found | {rmse_of(name): np.nan for name in errors.components_without_truth}
@@ -45,7 +45,7 @@ def squares_by_name(squared: Floats, components: Sequence[str], kinds: Sequence[
 
 
 def accuracy(sums: Sums) -> dict[str, float]:
-    """RMSE of position, orientation and every other component over all runs and steps.
+    """Compute the RMSE of position, orientation and every other component over all runs and steps.
 
     NaN, which is written as null, for a component that the truth lacks.
     """
@@ -121,7 +121,7 @@ def _merge_nees(first: Consistent, second: Consistent) -> Consistent:
 
 
 def consistency(state: Consistent) -> dict[str, float]:
-    """Mean NEES of state and position, and the share of steps whose mean over the runs is in bounds."""
+    """Compute mean NEES of state and position, and the share of steps whose mean is in bounds."""
     if state.count == 0:
         return {}
     values = {"nees": state.total / state.count}
@@ -137,7 +137,13 @@ def consistency(state: Consistent) -> dict[str, float]:
 
 
 def step_bounds(runs: Floats, size: int, probability: float = 0.95) -> tuple[Floats, Floats]:
-    """Compute where the mean NEES of `size` components lies over so many runs (n,): low, high (n,)."""
+    """Compute where the mean NEES lies over so many runs: the lower and the upper bound, (n,) each.
+
+    Args:
+        runs: (n,), how many there are at each step.
+        size: components of the error.
+        probability: with which it lies there.
+    """
     counts, place = np.unique(runs, return_inverse=True)
     bounds = np.array([chi_square_interval(size, int(count), probability) for count in counts])
     return bounds.reshape(-1, 2)[place, 0], bounds.reshape(-1, 2)[place, 1]
@@ -153,7 +159,7 @@ def _nis(innovations: Innovations) -> Sums:
 
 
 def innovation(sums: Sums) -> dict[str, float]:
-    """Mean NIS per measured component (1 when all is well) and the share that the gate kept out."""
+    """Compute mean NIS per measured component (1 when all is well) and the share that a gate stopped."""
     if not sums.get("messages"):
         return {}
     gated = {"gated_share": 1 - sums["accepted"] / sums["messages"]}
@@ -163,14 +169,14 @@ def innovation(sums: Sums) -> dict[str, float]:
 
 
 def _log_likelihoods(innovations: Innovations) -> Sums:
-    """NaN where one of what was let in is not stated."""
+    """Sum log-likelihoods; NaN where one of what was let in is not stated."""
     stated = innovations.log_likelihood
     let_in = np.array([np.nan]) if stated is None else stated[innovations.accepted]
     return {"log_likelihood": float(let_in.sum()), "runs": set(np.unique(innovations.run).tolist())}
 
 
 def likelihood(sums: Sums) -> dict[str, float]:
-    """The log-likelihood of a run's measurements as the filter predicted them: the mean over the runs.
+    """Compute the log-likelihood of a run's measurements as the filter predicted them: the runs' mean.
 
     Of the measurements that a gate let in alone, so that it is no measure to tune a gate by. Nothing
     where the estimator does not state it of all of them.

@@ -32,7 +32,7 @@ class Quantities:
 
 
 def columns_of(errors: Errors) -> Floats:
-    """Rows (n, 6 + d) of what is summed; see `Quantities`."""
+    """Return rows (n, 6 + d) of what is summed; see `Quantities`."""
     squared = errors.squared
     main = errors.main.columns
     covariance = errors.covariance[:, main][:, :, main]

@@ -100,6 +100,6 @@ class BinnedSums:
 
 
 def _halved(sums: Floats) -> Floats:
-    """Two bins made one."""
+    """Add up two bins each."""
     even = np.pad(sums, ((0, 0), (0, sums.shape[1] % 2), (0, 0)))
     return even[:, 0::2] + even[:, 1::2]

@@ -87,7 +87,7 @@ def set_errors(
 
 
 def _targets(truths: Truths, components: Sequence[str]) -> list[str]:
-    """The topics of targets whose truths have exactly these components."""
+    """Return the topics of targets whose truths have exactly these components."""
     stated = truths.source.topics
     return [
         topic
@@ -105,7 +105,7 @@ def _judge_run(
     cutoff_m: float,
     gap_limit_s: float,
 ) -> Floats:
-    """Rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
+    """Return rows of OSPA, GOSPA, its three parts, the estimated and the true number (n, 7)."""
     place = [name for name in POSITION if name in sizes.components]
     state: Components = dict.fromkeys(place, "linear")
     states = [reference(truths, topic, state, sizes, gap_limit_s) for topic in targets]

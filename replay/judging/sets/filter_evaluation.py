@@ -84,7 +84,7 @@ def judge_filter(
 def _judge(
     steps: Stream, diagnosed: Stream, source: Source, inside: Booleans, gap_limit_s: float
 ) -> tuple[NDArray, ...]:
-    """The columns of JudgedFilter for one run, from `pose` on."""
+    """Return the columns of JudgedFilter for one run, from `pose` on."""
     pose = reference(Truths(source), steps.metadata["truth"], POSE, steps, gap_limit_s)
     stamps = steps.publish_time_ns
     anchor = np.searchsorted(stamps, steps["anchor_time_ns"])
@@ -140,13 +140,18 @@ def odometry_error(
 
 
 def bearing_errors(seen: Bearings, pose: Floats) -> Floats:
-    """Compute how far single bearings (n,) are off at a true pose (3,), rad."""
+    """Compute how far single bearings are off at a true pose, (n,) in rad.
+
+    Args:
+        seen: n bearings, and the places of what they are of.
+        pose: (3,), x, y in m, heading in rad.
+    """
     away = seen.place_m - pose[:2]
     return np.abs(wrap_angle(np.arctan2(away[:, 1], away[:, 0]) - pose[2] - seen.bearing_rad))
 
 
 def _bearings_hold(steps: Stream, source: Source, pose: Floats, bound_rad: float) -> Booleans:
-    """Whether the single bearings of each frame keep their bound."""
+    """Tell whether the single bearings of each frame keep their bound."""
     measured = steps.metadata["measured"]
     streams = source.read(["/landmarks", measured])
     row_of = {time_ns: row for row, time_ns in enumerate(steps.publish_time_ns.tolist())}

@@ -93,7 +93,7 @@ def trajectory_gospa(
 
 
 def _paired(gain: Floats, half_switch: float) -> Floats:
-    """The weights (steps, n, m) of pairs that the linear programme finds.
+    """Find the weights (steps, n, m) of pairs by a linear programme.
 
     Weights w >= 0 whose rows and columns sum up to 1 at most minimise sum w * gain, which is negative,
     and half_switch for all changes e >= |w[k + 1] - w[k]|. Pairs that never gain have no weight.
@@ -119,7 +119,7 @@ def _paired(gain: Floats, half_switch: float) -> Floats:
 
 
 def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
-    """The best pairs (steps, n, m), 0 or 1: the shortest way through the assignments of all steps."""
+    """Find the best pairs (steps, n, m), 0 or 1: the shortest way through all steps' assignments."""
     steps, n, m = gain.shape
     choices = _assignments(n, m)
     changes = np.abs(choices[:, None] - choices[None]).sum(axis=(2, 3)) * half_switch
@@ -140,7 +140,7 @@ def _paired_exactly(gain: Floats, half_switch: float) -> Floats:
 
 
 def _assignments(n: int, m: int) -> Floats:
-    """All ways (ways, n, m) to pair some of n with some of m."""
+    """List all ways (ways, n, m) to pair some of n with some of m."""
     found = []
     for count in range(min(n, m) + 1):
         for rows in combinations(range(n), count):
@@ -224,12 +224,12 @@ def _tracks(estimates: ArrayLike, truths: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def _present(tracks: Floats) -> NDArray[np.bool_]:
-    """At which steps each target is there, (targets, steps)."""
+    """Tell at which steps each target is there, (targets, steps)."""
     return np.asarray(np.isfinite(tracks).all(axis=2))
 
 
 def _distances(first: Floats, second: Floats) -> Floats:
-    """(steps, n, m), infinity where one is absent."""
+    """Compute distances (steps, n, m), infinity where one is absent."""
     difference = first[:, None] - second[None]
     distance = np.sqrt((difference**2).sum(axis=3))
     return np.where(np.isnan(distance), np.inf, distance).transpose(2, 0, 1)

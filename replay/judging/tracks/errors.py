@@ -66,7 +66,7 @@ class Judged(NamedTuple):
 
 
 def instants_of(source: Source, burn_in_s: float = BURN_IN_S, period_s: float = PERIOD_S) -> Judged:
-    """Instants from a while after the epoch to the end of the scans or of the first truth that ends.
+    """Return instants from a while after the epoch to the scans' end or that of the first truth to end.
 
     Truths are interpolated linearly. Raises BadInput where there are no scans or truths of places, or
     they are over before the first instant.
@@ -198,7 +198,7 @@ def track_figures(errors: TrackErrors, cutoff_m: float = CUTOFF_M) -> dict[str, 
 
 
 def as_trajectories(tracks: Sequence[TracksAt]) -> Floats:
-    """The tracks at k instants as (tracks, k, 2), NaN where one is absent; see `tracks.distances`."""
+    """Return the tracks at k instants as (tracks, k, 2), NaN where absent; see `tracks.distances`."""
     numbers = np.unique(np.concatenate([at.number for at in tracks] or [np.empty(0, np.int64)]))
     found = np.full((len(numbers), len(tracks), 2), np.nan)
     for instant, at in enumerate(tracks):

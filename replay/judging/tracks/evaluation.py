@@ -48,7 +48,7 @@ class TrackBlock(NamedTuple):
 
 
 def targets_of(source: Source) -> Judged | None:
-    """The targets in the plane at the instants of a run, NaN where one is not there; None without any.
+    """Return a run's targets in the plane at its instants, NaN where one is not there; None without any.
 
     A target is a truth with `x_m` and `y_m`. Instants are PERIOD_S apart, from BURN_IN_S after the epoch
     to the end of the last truth.
@@ -70,7 +70,7 @@ def targets_of(source: Source) -> Judged | None:
 
 
 def _places(truth: Stream, at_ns: Integers) -> Floats:
-    """Where a target is at instants, (k, 2); NaN before its first stamp and after its last one."""
+    """Find where a target is at instants, (k, 2); NaN before its first stamp and after its last one."""
     place, begin_ns = read_vectors(truth, "state", PLANE), truth.publish_time_ns[0]
     stamps = truth.publish_time_ns - begin_ns
     axes = [np.interp(at_ns - begin_ns, stamps, axis, left=np.nan, right=np.nan) for axis in place.T]
@@ -80,7 +80,7 @@ def _places(truth: Stream, at_ns: Integers) -> Floats:
 def track_blocks(
     outputs: Mapping[str, Ragged], targets: Sequence[Judged | None], first_run: int
 ) -> dict[str, TrackBlock]:
-    """The sets of tracks among a replay's outputs, or a block of them, by the topic of their sizes."""
+    """Return the sets of tracks among a replay's outputs, or a block of them, by the topic of sizes."""
     found = {}
     for topic, tracks in outputs.items():
         sizes = outputs.get(f"{topic.rpartition('/')[0]}/set")
@@ -128,7 +128,7 @@ class Followed:
 
     @property
     def figures(self) -> dict[str, float]:
-        """What the tracks are worth, at the instants told of; {} where there are none, or no target."""
+        """Return what the tracks are worth, at the instants told of; {} without tracks or a target."""
         from replay.judging.tracks.distances import hota, idf1  # their assignments take long to import
 
         begin = self.first or 0
@@ -153,7 +153,7 @@ class Followed:
 
 
 def _near(sets: Sequence[TracksAt], truths: Floats) -> Floats:
-    """The tracks (tracks, k, 2) that are ever within the cutoff of a target."""
+    """Return the tracks (tracks, k, 2) that are ever within the cutoff of a target."""
     near: set[int] = set()
     for at, true in zip(sets, truths.transpose(1, 0, 2), strict=True):
         away = np.linalg.norm(at.place[:, None] - true[None], axis=2)
@@ -187,7 +187,7 @@ def _figures(state: State) -> dict[int, dict[str, float]]:
 
 
 def _finish(state: State) -> dict[str, float]:
-    """The means over the runs of which they are known."""
+    """Return the means over the runs of which they are known."""
     runs = [figures for figures in _figures(state).values() if figures]
     found = {}
     for name in runs[0] if runs else ():

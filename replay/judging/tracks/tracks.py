@@ -34,11 +34,14 @@ class KeptTracks(NamedTuple):
 
 
 def track_table(targets: Integers, tracks: Integers) -> "pd.DataFrame":
-    """Return one row per target of reports (n,), most reports first.
+    """Return one row per target of reports, most reports first.
 
     Columns: target, reports; track, its own, -1 for none; share of its reports in that; largest_share in
     any track; tracks, how many have a report of it; switches, how often successive reports of it are in
     different ones; others, how many reports of other targets its own track has.
+
+    Args:
+        targets, tracks: of every report, in order of time, the numbers of its target and track, (n,).
     """
     import pandas as pd  # these take long to import
     from scipy.optimize import linear_sum_assignment

@@ -23,7 +23,7 @@ from replay.estimators.models.ranging import (
     see,
     see_by_tag,
 )
-from replay.inference.linear_algebra.gaussian import inflation
+from replay.inference.linear_algebra.inflation import inflation
 from replay.inference.model.augmentation import augmented
 from replay.inference.model.checking import check_model
 from replay.inference.model.point_errors import PointError
