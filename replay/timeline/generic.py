@@ -72,7 +72,7 @@ Board = rrb.Container | rrb.View
 
 
 def draw(canvas: Canvas, scene: Scene) -> Board:
-    """Planes, maps, plots and events for each case.
+    """Draw planes, maps, plots and events for each case.
 
     Raises BadInput where there is nothing to draw.
     """
@@ -115,7 +115,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> Board:
 
 
 def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
-    """What has no drawing, by topic, and why."""
+    """Tell what has no drawing, by topic, and why."""
     shown_elsewhere = NOT_SENSED - {schemas.LINK_EVENT.full_name}
     return {
         stream.topic: "none of its fields is a quantity over time"
@@ -125,7 +125,7 @@ def _not_drawn(sensed: list[Stream]) -> dict[str, str]:
 
 
 def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) -> list[rrb.Container]:
-    """Everything that has a place, side by side for each frame: no board where nothing has."""
+    """Draw everything that has a place, side by side for each frame: no board where nothing has."""
     by_frame: dict[str, list[Stream]] = {"": []}
     for stream in sensed:
         if stream.schema.full_name in {*FIXES, LANDMARK} and stream["position_m"].shape[1] >= 2:
@@ -143,7 +143,7 @@ def _draw_planes(canvas: Canvas, scene: Scene, case: str, sensed: list[Stream]) 
 def _draw_plane(
     canvas: Canvas, scene: Scene, case: str, frame: str, sensed: list[Stream]
 ) -> list[rrb.Spatial2DView]:
-    """The places of one frame; truths and estimates are in the log's own, which has no name."""
+    """Draw the places of one frame; truths and estimates are in the log's own, which has no name."""
     root, shown, paths = entity_path(ROOT, case), [], []
     if frame:
         root = entity_path("frames", frame, case)
@@ -179,7 +179,7 @@ def _draw_plane(
 
 
 def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]) -> list[rrb.MapView]:
-    """Geodetic fixes on a map of the earth, and the ways of estimates where an origin is stated."""
+    """Draw geodetic fixes on a map of the earth, and estimates' ways where an origin is stated."""
     root = entity_path("geodetic", case)
     origin = stated_origin({each.topic: scene.source.topics[each.topic] for each in fixes[:1]})
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
@@ -196,7 +196,7 @@ def _draw_earth(canvas: Canvas, scene: Scene, case: str, fixes: Sequence[Stream]
 
 
 def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb.Spatial3DView]:
-    """Orientations as triads about one origin."""
+    """Draw orientations as triads about one origin."""
     root = entity_path("space", case)
     for stream, colour in zip(sensed, cycle(PALETTE), strict=False):
         rows = thin(stream.publish_time_ns)
@@ -207,7 +207,7 @@ def _draw_space(canvas: Canvas, case: str, sensed: Sequence[Stream]) -> list[rrb
 
 
 def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[rrb.Container]:
-    """What a sensor sees about it, and a plot for each number that it measures, unless covariances."""
+    """Draw what a sensor sees about it, and plot each number that it measures, unless covariances."""
     for stream in sensed:
         if stream.schema.full_name in NOT_SENSED:
             continue
@@ -224,7 +224,7 @@ def _draw_sensors(canvas: Canvas, case: str, sensed: list[Stream]) -> Iterator[r
 def _draw_field(
     canvas: Canvas, case: str, stream: Stream, field: Field, curves: Floats
 ) -> rrb.TimeSeriesView:
-    """The plot of a field's curves (curves, n); rotations are shown as angles."""
+    """Plot a field's curves (curves, n); rotations are shown as angles."""
     quantity, unit, scale = shown_unit(field.name)
     plot = entity_path("plots", case, _name(stream, case), field.name)
     named: Sequence[str] = [str(element) for element in range(len(curves))]
@@ -242,7 +242,7 @@ def _draw_field(
 
 
 def _euler_deg(quaternions: Floats) -> Floats:
-    """Roll, pitch and yaw (n, 3), turned about z, y, x in this order; NaN where there is no rotation."""
+    """Return roll, pitch, yaw (n, 3), turned about z, y, x in this order; NaN where no rotation is."""
     angles = np.full((len(quaternions), 3), np.nan)
     known = np.linalg.norm(quaternions, axis=1) > 0.0
     turned = Rotation.from_quat(quaternions[known], scalar_first=True)
@@ -251,7 +251,7 @@ def _euler_deg(quaternions: Floats) -> Floats:
 
 
 def _name(stream: Stream, case: str) -> str:
-    """A topic as it is called within its case."""
+    """Name a topic as it is called within its case."""
     return stream.topic.removeprefix(f"/{case}").removeprefix("/")
 
 

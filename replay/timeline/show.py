@@ -187,7 +187,7 @@ def _canvas(
 
 
 def _identity(outputs: Mapping[str, Stream]) -> str:
-    """What was estimated, in short."""
+    """Say in short what was estimated."""
     digest = hashlib.sha256()
     for topic, stream in outputs.items():
         digest.update(topic.encode())

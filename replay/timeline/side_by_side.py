@@ -30,7 +30,7 @@ def draw_side_by_side(
 
 
 def _split(layout: Board, estimators: Sequence[str]) -> Board:
-    """The layout, with every view of a scene split by estimator."""
+    """Split every view of a scene in the layout by estimator."""
     if isinstance(layout, rrb.Container):
         layout.contents = [
             _split(each, estimators) if isinstance(each, rrb.Container | rrb.View) else each
@@ -43,7 +43,7 @@ def _split(layout: Board, estimators: Sequence[str]) -> Board:
 
 
 def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.View:
-    """A view of the same scene without the other estimators."""
+    """Return a view of the same scene without the other estimators."""
     shown = [str(each) for each in np.atleast_1d(np.asarray(view.contents))]
     roots = [each.removesuffix("/**") for each in shown if each.endswith("/**")]
     hidden = [
@@ -57,7 +57,7 @@ def _alone(view: rrb.View, estimator: str, estimators: Sequence[str]) -> rrb.Vie
 def _draw_differences(
     canvas: Canvas, scene: Scene, case: str, estimators: Sequence[str]
 ) -> list[rrb.TimeSeriesView]:
-    """By how much the errors of the others are larger than the first's, at the stamps that both have."""
+    """Plot how much larger the errors of others are than the first's, at the stamps that both have."""
     found = {errors.estimator: errors for errors in scene.errors_of(case)}
     first = found.get(estimators[0])
     plot, drawn = entity_path("plots", case, "difference"), False
@@ -75,7 +75,7 @@ def _draw_differences(
 
 
 def _sizes(errors: Errors) -> Floats:
-    """How large the error of the main quantity is (n,)."""
+    """Tell how large the error of the main quantity is (n,)."""
     _, columns, scale = errors.main
     sizes: Floats = scale * np.linalg.norm(errors.error[:, columns], axis=1)
     return sizes

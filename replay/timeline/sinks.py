@@ -91,7 +91,7 @@ def _finish(recording: rr.RecordingStream, connect: str) -> None:
 
 
 def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
-    """Disconnect; whether that ended: for a receiver that is silent, Rerun may wait forever."""
+    """Disconnect, and tell whether that ended: with a silent receiver, Rerun may wait forever."""
     closing = threading.Thread(target=recording.disconnect, daemon=True)
     closing.start()
     closing.join(limit_s)
@@ -99,7 +99,7 @@ def _close(recording: rr.RecordingStream, limit_s: float) -> bool:
 
 
 def _require_receiver(url: str) -> None:
-    """Raises BadInput unless a receiver answers there."""
+    """Raise BadInput unless a receiver answers there."""
     host, port = _address(url)
     if host is None or port is None:
         raise BadInput(
@@ -122,7 +122,7 @@ def _address(url: str) -> tuple[str | None, int | None]:
 
 
 def _answers(url: str) -> bool:
-    """Whether an HTTP/2 server, as Rerun's receivers are, greets back."""
+    """Tell whether an HTTP/2 server, as Rerun's receivers are, greets back."""
     try:
         with socket.create_connection(_address(url), timeout=_ANSWER_S) as connection:
             connection.sendall(_HTTP2_GREETING)

@@ -173,7 +173,7 @@ def _running(
 
 
 def _private_environment(folder: Path) -> dict[str, str]:
-    """Folders of its own, usage reports off; the check for updates meets a proxy that is not there."""
+    """Return folders of its own, usage reports off; the update check meets a proxy that is not there."""
     environment = {name: value for name, value in os.environ.items() if not _is_proxy(name)}
     for kind in ("CONFIG", "DATA", "CACHE"):
         environment[f"XDG_{kind}_HOME"] = str(folder / kind.lower())
@@ -209,7 +209,7 @@ def _await_port(process: subprocess.Popen[bytes], port: int) -> None:
 
 
 def _ended(process: subprocess.Popen[bytes]) -> bool:
-    """Whether the process is at its end, or soon will be: its port closes before it is gone."""
+    """Tell whether the process is at its end, or soon will be: its port closes before it is gone."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(_END_S)
     return process.poll() is not None

@@ -187,7 +187,7 @@ def truth_text(node: Node, inputs: Mapping[Any, str], precision: Precision) -> s
 
 
 def _real(node: Node, text: _Text, precision: Precision) -> _Text:
-    """A truth as a number."""
+    """Write a truth as a number."""
     return _Text(f"({precision.real}){text.within(_WHOLE)}", _SIGN) if node.is_truth else text
 
 
@@ -235,7 +235,7 @@ def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str], precisio
 
 
 def _power(base: str, exponent: int, precision: Precision) -> _Text:
-    """By squaring, as kernels do."""
+    """Write a power by squaring, as kernels do."""
     found, square, rest = "", base, abs(exponent)
     while rest:
         if rest & 1:

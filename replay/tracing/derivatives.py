@@ -99,7 +99,7 @@ def slopes_of(trace: Trace, outputs: Sequence[Node], seeds: Mapping[Node, Slopes
 
 
 def _chained(trace: Trace, node: Node, found: Mapping[Node, Slopes]) -> Slopes:
-    """The chain rule."""
+    """Apply the chain rule."""
     graph, zero = trace.graph, trace.graph.constant(0.0)
     if node.operation is CONSTANT or node.is_truth or node.operation in _STEPS:
         return {}

@@ -53,7 +53,7 @@ class _Text(NamedTuple):
     binds: int
 
     def within(self, binds: int) -> str:
-        """It as a part of what binds so tightly, in parentheses where they are needed."""
+        """Return it as a part of what binds so tightly, in parentheses where they are needed."""
         return self.text if self.binds >= binds else f"({self.text})"
 
 
@@ -63,7 +63,7 @@ def formulas_of(
     outputs: Mapping[str, Node],
     by: Mapping[Any, str],
 ) -> list[str]:
-    """The lines `name = formula` of a function's outputs, and of their derivatives that are not zero.
+    """Return lines `name = formula` of a function's outputs, and of their derivatives that are not zero.
 
     Args:
         function: the function.
@@ -86,7 +86,7 @@ def formulas_of(
 
 
 def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str]:
-    """Every named node, each behind the lines that it needs."""
+    """Yield every named node, each behind the lines that it needs."""
     everything = needed(named.values())
     uses = Counter(argument for node in everything for argument in node.arguments)
     uses.update(named.values())
@@ -110,7 +110,7 @@ def _lines(named: Mapping[str, Node], inputs: Mapping[Any, str]) -> Iterator[str
 
 
 def _text_of(node: Node, given: list[_Text], inputs: Mapping[Any, str]) -> _Text:
-    """A node as a formula of those of its arguments."""
+    """Write a node as a formula of those of its arguments."""
     operation = node.operation
     if operation is INPUT:
         return _Text(inputs[node.value], _WHOLE)

@@ -160,7 +160,7 @@ class Derivative:
         return tuple(_called(program, emitter, self.function, self.outputs, arguments))
 
     def __call__(self, *arguments: Any) -> tuple[Any, ...]:
-        """The values as the function itself gives them, and the derivatives by the graph.
+        """Return the values as the function itself gives them, and the derivatives by the graph.
 
         Of traced numbers both by the graph, as a part of theirs.
         """
@@ -172,7 +172,7 @@ class Derivative:
 
     @cached_property
     def _computed(self) -> tuple[list[Any], Callable[[list[float]], list[float]]]:
-        """The places of the inputs that the derivatives need, and the derivatives of these in Python."""
+        """Return the places of inputs that the derivatives need, and the latter's function in Python."""
         nodes = list(self.entries.values())
         places = [node.value for node in needed(nodes) if node.operation == INPUT]
         names = {place: f"x{index}" for index, place in enumerate(places)}
@@ -201,7 +201,7 @@ def _called(
     outputs: Sequence[Node],
     arguments: Sequence[Any],
 ) -> list[Number]:
-    """The numbers of a graph's outputs: a function of its own, of the inputs that they need."""
+    """Return the numbers of a graph's outputs: a function of its own, of the inputs that they need."""
     places = [node.value for node in needed(outputs) if node.operation == INPUT]
     key = "graph", *places, *described(outputs)
     if key not in program.instances:
@@ -216,7 +216,7 @@ def _called(
 
 
 def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any], place: Any) -> Number:
-    """The number of an argument at a place."""
+    """Return the number of an argument at a place."""
     argument, entry = place
     value = arguments[argument]
     if isinstance(value, Array):
@@ -231,7 +231,7 @@ def _number(emitter: Emitter, kinds: Sequence[Argument], arguments: Sequence[Any
 
 
 def _at(arguments: Sequence[Any], place: Any) -> float:
-    """The number of an argument at a place, in Python."""
+    """Return the number of an argument at a place, in Python."""
     argument, entry = place
     value = arguments[argument]
     if entry is None:
@@ -285,7 +285,7 @@ def trace(graph: Graph, function: Callable[..., Any], arguments: Sequence[Argume
 
 
 def _reason(error: Exception) -> str:
-    """What stopped a function; what NumPy says of traced numbers in our words."""
+    """Say what stopped a function; what NumPy says of traced numbers in our words."""
     if isinstance(error, CannotTrace | BadInput):
         return str(error)
     no_method = re.search(r"which has no callable (\w+) method", str(error))
@@ -349,7 +349,7 @@ def place_of(function: Callable[..., Any], error: Exception | None = None) -> st
 
 
 def _digest(words: Sequence[str]) -> str:
-    """The digest of a graph and of how its instructions are written."""
+    """Return the digest of a graph and of how its instructions are written."""
     return sha256("\n".join([digest_of("replay.tracing"), *words]).encode()).hexdigest()
 
 

@@ -168,7 +168,7 @@ def evaluated(operation: Any, *values: Any) -> Any:
 
 
 def _power(base: float, exponent: int) -> float:
-    """As compiled code multiplies: by squaring."""
+    """Multiply as compiled code does: by squaring."""
     found, square, rest = None, base, abs(exponent)
     while rest:
         if rest & 1:

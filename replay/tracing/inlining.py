@@ -29,7 +29,7 @@ _AT_WORK: list[Trace] = []
 
 @contextmanager
 def tracing(trace: Trace) -> Iterator[None]:
-    """Functions that are called meanwhile may be given numbers of this trace."""
+    """Let functions that are called meanwhile be given numbers of this trace."""
     _AT_WORK.append(trace)
     try:
         yield

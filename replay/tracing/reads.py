@@ -104,7 +104,7 @@ def _sees(reads: Reads, value: Any) -> bool:
 
 
 def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
-    """What a chain of names such as `np.linalg.norm` leads to, in modules; each step is noted."""
+    """Return what a chain of names such as `np.linalg.norm` leads to, in modules; each step is noted."""
     name, *attributes = chain
     scope: Any = function.__globals__
     if name not in scope:
@@ -123,7 +123,7 @@ def _found(reads: Reads, function: FunctionType, chain: tuple[str, ...]) -> Any:
 
 @lru_cache(maxsize=1024)
 def _chains(code: CodeType) -> tuple[tuple[str, ...], ...] | None:
-    """The globals that code names, with the attributes behind them; None where it does more with names.
+    """Return globals that code names, with attributes behind them; None if it does more with names.
 
     So do imports, classes, what sets a global or an attribute, and `__attributes__`.
     """

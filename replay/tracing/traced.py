@@ -147,7 +147,7 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
 
 
 def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None) -> Any:
-    """`np.interp` over a table that is known: the straight line of the last knot before x."""
+    """Trace `np.interp` over a known table: the straight line of the last knot before x."""
     known_x, known_y = (_known("np.interp", each) for each in (xp, fp))
     found = where(np.isnan(x), x, known_y[0] if left is None else left)
     for k in range(len(known_x) - 1):
@@ -158,7 +158,7 @@ def _interpolated(x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None)
 
 
 def _sorted_in(a: Any, v: Any, side: str = "left") -> Any:
-    """`np.searchsorted` in a table that is known: how many of its numbers are less."""
+    """Trace `np.searchsorted` in a table that is known: how many of its numbers are less."""
     count: Any = 0.0
     for each in _known("np.searchsorted", a):
         count = count + where(v > each if side == "left" else v >= each, 1.0, 0.0)
@@ -166,7 +166,7 @@ def _sorted_in(a: Any, v: Any, side: str = "left") -> Any:
 
 
 def _chosen(a: Any, choices: Any) -> Any:
-    """`np.choose`; `np.take` does not tell NumPy's functions of its index."""
+    """Trace `np.choose`; `np.take` does not tell NumPy's functions of its index."""
     found, *others = choices
     for place, each in enumerate(others, 1):
         found = where(a >= float(place), each, found)
@@ -174,26 +174,26 @@ def _chosen(a: Any, choices: Any) -> Any:
 
 
 def _known(what: str, table: Any) -> list[float]:
-    """The numbers of a table."""
+    """Return the numbers of a table."""
     if any(isinstance(each, Traced) for each in np.ravel(np.asarray(table, object))):
         raise CannotTrace(f"it uses {what} of a table that is not known before; write np.where")
     return np.asarray(table, float).tolist()
 
 
 def _clipped(x: Any, a_min: Any = None, a_max: Any = None, **named: Any) -> Any:
-    """`np.clip`."""
+    """Trace `np.clip`."""
     low, high = named.get("min", a_min), named.get("max", a_max)
     x = x if low is None else np.maximum(x, low)
     return x if high is None else np.minimum(x, high)
 
 
 def _rounded(x: Any, decimals: int = 0) -> Any:
-    """`np.round`."""
+    """Trace `np.round`."""
     return np.rint(x * 10.0**decimals) / 10.0**decimals if decimals else np.rint(x)
 
 
 def _log_of_sum(x: Any, y: Any) -> Any:
-    """`np.logaddexp`."""
+    """Trace `np.logaddexp`."""
     larger, less = where(x > y, x, y), where(x > y, y, x)
     return where(x == y, x + np.log(2.0), larger + np.log1p(np.exp(less - larger)))
 
@@ -279,7 +279,7 @@ def apply(function: Any, inputs: tuple[Any, ...], options: dict[str, Any] | None
 
 
 def _power(trace: Trace, base: Any, exponent: Any) -> Any:
-    """A power; of an integer by multiplication, as in Python's source."""
+    """Trace a power; of an integer by multiplication, as in Python's source."""
     if isinstance(exponent, int | np.integer):
         return trace.number(trace.graph.power(trace.node_of(base), int(exponent)))
     return trace.number(trace.graph.apply(np.power, trace.node_of(base), trace.node_of(exponent)))
@@ -302,7 +302,7 @@ def _over_arrays(function: Any, inputs: tuple[Any, ...]) -> Any:
 
 
 def _methods() -> None:
-    """What NumPy calls of the objects in an array, such as `x.sin()`."""
+    """Define what NumPy calls of the objects in an array, such as `x.sin()`."""
 
     def method(function: Any) -> Callable[..., Any]:
         return lambda *inputs: apply(function, inputs)

@@ -161,7 +161,7 @@ def _mixtures(model: MixtureHmm, vectors: Floats, responsibility: Floats, floor:
 
 
 def _log_components(model: MixtureHmm, vectors: Floats) -> Floats:
-    """Log of weight times density (count, s, g) of vectors (count, m); m may be zero."""
+    """Return log of weight times density (count, s, g) of vectors (count, m); m may be zero."""
     size = vectors.shape[-1]
     whiten = np.linalg.inv(np.linalg.cholesky(model.covariances))
     shape = (len(vectors), *model.weights.shape, size)
@@ -173,7 +173,7 @@ def _log_components(model: MixtureHmm, vectors: Floats) -> Floats:
 
 
 def _forward(model: MixtureHmm, states: Floats) -> Floats:
-    """Log of the joint probability (count, n, s) of the vectors so far and the state."""
+    """Compute the log of the joint probability (count, n, s) of the vectors so far and the state."""
     forward = np.empty_like(states)
     forward[:, 0] = _log(model.initial) + states[:, 0]
     transition = _log(model.transition)
@@ -184,7 +184,7 @@ def _forward(model: MixtureHmm, states: Floats) -> Floats:
 
 
 def _backward(model: MixtureHmm, states: Floats) -> Floats:
-    """Log of the probability (count, n, s) of the vectors to come, given the state."""
+    """Compute the log of the probability (count, n, s) of the vectors to come, given the state."""
     backward = np.zeros_like(states)
     transition = _log(model.transition)
     for time in range(states.shape[1] - 2, -1, -1):
@@ -200,7 +200,7 @@ def _log(probability: Floats) -> Floats:
 
 
 def _log_sum(values: Floats, axis: int) -> Floats:
-    """Log of the sum of exponentials; SciPy's takes several times as long."""
+    """Compute the log of the sum of exponentials; SciPy's takes several times as long."""
     top = np.max(values, axis=axis, keepdims=True)
     top[np.isneginf(top)] = 0.0
     return _log(np.exp(values - top).sum(axis=axis)) + np.squeeze(top, axis)

@@ -247,7 +247,7 @@ def _schedule(
 
 
 def _events(parts: Sequence[Ragged]) -> tuple[Integers, Integers, Integers]:
-    """Run, stamp and index of the part, of all messages, part by part."""
+    """Return run, stamp and index of the part, of all messages, part by part."""
     run = [np.repeat(np.arange(part.runs), np.diff(part.offsets)) for part in parts]
     index = [np.full(len(part), number) for number, part in enumerate(parts)]
     time_ns = [part.stream.publish_time_ns for part in parts]

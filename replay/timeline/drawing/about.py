@@ -40,14 +40,14 @@ def draw_about(canvas: Canvas, root: str, stream: Stream) -> list[rrb.Spatial2DV
 
 
 def _circles(stream: Stream) -> Floats:
-    """The circles (n, corners, 2) on which targets lie."""
+    """Return the circles (n, corners, 2) on which targets lie."""
     angle = np.linspace(0.0, 2.0 * np.pi, CORNERS)
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return stream["range_m"][:, None, None] * around
 
 
 def _rays(angle_rad: Floats, length_m: Floats | float) -> Floats:
-    """Lines (n, 2, 2) from the sensor at these angles (n,)."""
+    """Return lines (n, 2, 2) from the sensor at these angles (n,)."""
     ends = np.stack([length_m * np.cos(angle_rad), length_m * np.sin(angle_rad)], axis=1)
     return np.stack([np.zeros_like(ends), ends], axis=1)
 

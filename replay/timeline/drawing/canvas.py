@@ -125,7 +125,7 @@ class Scene:
 
     @property
     def dates(self) -> "Dates | None":
-        """Date stamps by the topic with most messages; None where they are dates."""
+        """Return date stamps by the topic with most messages; None where stamps are dates."""
         streams = [self.read(topic) for topic in self.source.topics if topic not in self.unread]
         return dates_of(max(streams, key=len)) if streams else None
 
@@ -140,7 +140,7 @@ def _prefix(topic: str) -> str:
 
 
 def _natural(name: str) -> list[tuple[str, int]]:
-    """The key that puts robot2 before robot10."""
+    """Return the key that puts robot2 before robot10."""
     return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 
@@ -247,12 +247,17 @@ def entity_path(*parts: str) -> str:
 
 
 def escaped(entity: str) -> str:
-    """An entity as Rerun wants it written, whatever is in its parts: an estimator `ukf:2`, say."""
+    """Write an entity as Rerun wants it, whatever is in its parts: an estimator `ukf:2`, say."""
     return "/".join(rr.escape_entity_path_part(part) for part in entity.split("/"))
 
 
 def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows to draw: all, or the last of each of `rows` equal spans of time."""
+    """Return the rows to draw: all, or the last of each of `rows` equal spans of time.
+
+    Args:
+        time_ns: (n,), in order.
+        rows: how many at most.
+    """
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     of_span = _spans(time_ns, rows)
@@ -260,7 +265,12 @@ def thin(time_ns: Times, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
 
 
 def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArray[np.int64]:
-    """Return the rows of a curve to draw: all, or the least and the greatest of each span of time."""
+    """Return the rows of a curve to draw: all, or the least and the greatest of each span of time.
+
+    Args:
+        time_ns, values: (n,), in order of time.
+        rows: how many at most, about.
+    """
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
     return extremes(_spans(time_ns, rows // 2), values)
@@ -269,7 +279,9 @@ def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArra
 def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
     """Return the rows of the least and of the greatest value of every span, the first where several are.
 
-    `of_span` (n,) is the number of each value's span, from zero on and sorted; NaN is no extreme.
+    Args:
+        of_span: (n,), the number of each value's span, from zero on and sorted.
+        values: (n,); NaN is no extreme.
     """
     first = np.flatnonzero(np.diff(of_span, prepend=-1))
     sizes = np.diff(first, append=len(of_span))
@@ -281,7 +293,7 @@ def extremes(of_span: NDArray[np.int64], values: Floats) -> NDArray[np.int64]:
 
 
 def _spans(time_ns: Times, spans: int) -> NDArray[np.int64]:
-    """In which of so many equal spans of time each stamp is, from zero on."""
+    """Tell in which of so many equal spans of time each stamp is, from zero on."""
     span_ns = max((time_ns[-1] - time_ns[0]) / spans, 1.0)
     return np.minimum((time_ns - time_ns[0]) / span_ns, spans - 1).astype(np.int64)
 

@@ -54,14 +54,14 @@ def _view(canvas: Canvas, root: str, panel: CurvePanel) -> rrb.Spatial2DView:
 
 
 def _drawn(places: Floats) -> Floats:
-    """The decimal logarithms of places (n, 2), those left out that are not positive numbers."""
+    """Return the decimal logarithms of places (n, 2), those left out that are not positive numbers."""
     is_there = (np.isfinite(places) & (places > 0)).all(axis=1)
     found: Floats = np.log10(places[is_there])
     return found
 
 
 def _draw_decades(canvas: Canvas, entity: str, low: Floats, high: Floats) -> None:
-    """Lines at the powers of ten, each with its number at the lower or left end."""
+    """Draw lines at the powers of ten, each with its number at the lower or left end."""
     lines, at, labels = [], [], []
     for axis, power in product(range(2), range(-30, 31)):
         if low[axis] <= power <= high[axis]:

@@ -81,7 +81,12 @@ def draw_events(
 
 
 def stamped(canvas: Canvas, time_ns: Times, texts: Sequence[str]) -> list[str]:
-    """Texts with their times in the run: the viewer's own column of stamps is narrow, and cuts them."""
+    """Put the time in the run before each text: the viewer's own column of stamps is narrow, and cuts.
+
+    Args:
+        canvas: with the run's epoch.
+        time_ns, texts: (n,), n of them.
+    """
     elapsed_s = ((time_ns - canvas.epoch_ns) * 1e-9).tolist()
     return [f"{at_s:.3f} s, {text}" for at_s, text in zip(elapsed_s, texts, strict=True)]
 
@@ -133,7 +138,7 @@ def _of_estimators(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
-    """What was kept out, by the sensors that have a message of its stamp, and of its target."""
+    """Tell what was kept out, by the sensors that have a message of its stamp, and of its target."""
     sensed = {
         _within(topic, case): scene.read(topic)
         for topic in scene.topics_near(case)
@@ -154,18 +159,18 @@ def _gated(scene: Scene, case: str, gated: Stream) -> list[str]:
 
 
 def _targets(stream: Stream) -> list[int]:
-    """What messages are about, 0 for nothing."""
+    """Return what messages are about, 0 for nothing."""
     none = np.zeros(len(stream), np.int64)
     return stream.columns.get("target_id", none).tolist()
 
 
 def _within(topic: str, case: str) -> str:
-    """A topic as it is called within its case."""
+    """Name a topic as it is called within its case."""
     return topic.removeprefix(f"/{case}").removeprefix("/")
 
 
 def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
-    """Spans in which a sensor was dead, stated by the log or seen as a gap; how good solutions are."""
+    """Yield spans in which a sensor was dead, as stated or seen as a gap; how good solutions are."""
     for topic in scene.topics_near(case):
         if scene.source.topics[topic].schema_name in NOT_SENSED:
             continue
@@ -182,7 +187,7 @@ def _of_sensors(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
-    """Where what a sensor says of its solution or its body changes, see STATES."""
+    """Yield where what a sensor says of its solution or its body changes, see STATES."""
     if stream.schema.full_name != schemas.VECTOR_MEASUREMENT.full_name:
         return
     for column, component in enumerate(stream.components):
@@ -194,7 +199,7 @@ def _changes(sensor: str, stream: Stream) -> Iterator[Happened]:
 
 
 def _gaps(stream: Stream) -> Times:
-    """Where a sensor was silent for much longer than usual: (n, 2), from and to."""
+    """Find where a sensor was silent for much longer than usual: (n, 2), from and to."""
     times = stream.publish_time_ns
     long = np.diff(times) > gap_limit_ns(times)
     return np.stack([times[:-1][long], times[1:][long]], axis=1)

@@ -30,12 +30,12 @@ MAP_PIXELS, TILE_PIXELS = 700.0, 256.0
 
 
 def degrees_of(stream: Stream) -> Floats:
-    """Latitude and longitude (n, 2) of geodetic fixes."""
+    """Return latitude and longitude (n, 2) of geodetic fixes."""
     return np.stack([stream["latitude_deg"], stream["longitude_deg"]], axis=1)
 
 
 def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> None:
-    """Geodetic fixes as points, and the whole way past them as a thin line; none that are far off.
+    """Draw geodetic fixes as points, and the way past them as a thin line; none that are far off.
 
     Points have the colour of the deviation that fixes state, else the one that is given.
     """
@@ -51,13 +51,24 @@ def draw_fixes(canvas: Canvas, entity: str, stream: Stream, colour: Colour) -> N
 
 
 def draw_way(canvas: Canvas, entity: str, degrees: Floats, colour: Colour) -> None:
-    """A whole way past places (n, 2) as a thin line."""
+    """Draw a whole way as a thin line.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        degrees: latitude and longitude of the places that it passes, (n, 2).
+        colour: of the line.
+    """
     way = rr.GeoLineStrings(lat_lon=[degrees], colors=[(*colour, 120)], radii=rr.Radius.ui_points(1.0))
     canvas.fix(entity, way)
 
 
 def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
-    """Colours (n, 3) of fixes with covariances (n, d * d), by their mean standard deviation."""
+    """Return colours (n, 3) of fixes, by their mean standard deviation.
+
+    Args:
+        covariance_m2: (n, d * d), row-major; d is 0 where fixes come without.
+        unknown: the colour where it is NaN.
+    """
     size = round(covariance_m2.shape[1] ** 0.5)
     sigma_m = np.full(len(covariance_m2), np.nan)
     if size:  # fixes may come without
@@ -71,9 +82,14 @@ def by_deviation(covariance_m2: Floats, unknown: Colour) -> NDArray[np.uint8]:
 def map_view(
     canvas: Canvas, root: str, degrees: Floats, paths: Sequence[str] = (), trail_s: float = TRAIL_S
 ) -> rrb.MapView:
-    """Return a map of all below `root` that shows at least the places (n, 2) that are not far off.
+    """Return a map that shows at least the places that are not far off.
 
-    Of the `paths` it shows what lies up to `trail_s` before the cursor.
+    Args:
+        canvas: what is drawn on.
+        root: of what is shown.
+        degrees: latitude and longitude of places, (n, 2).
+        paths: entities of which it shows what lies up to `trail_s` before the cursor.
+        trail_s: see there.
     """
     near = are_near(degrees)
     left_out = "" if near.all() else f", {(~near).sum()} far off left out"
@@ -100,7 +116,7 @@ def are_near(places: Floats) -> NDArray[np.bool_]:
 
 
 def _zoom(degrees: Floats) -> float:
-    """The zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
+    """Find the zoom at which all places fill the map: at zoom z the world is 2^z tiles wide."""
     low, high = degrees.min(axis=0), degrees.max(axis=0)
     latitude = np.radians(0.5 * (low[0] + high[0]))
     width = max(high[1] - low[1], (high[0] - low[0]) / max(np.cos(latitude), 0.1), 1e-3)

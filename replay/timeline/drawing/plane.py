@@ -67,9 +67,13 @@ def turn_up(canvas: Canvas, root: str = ROOT) -> None:
 
 
 def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places: Floats) -> None:
-    """Fixed points (n, 2) with their numbers; close ones share a label, below the lowest of them.
+    """Draw fixed points with their numbers; close ones share a label, below the lowest of them.
 
     A point that single precision, which viewers draw in, puts at infinity is nowhere to be drawn.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        numbers, places: (n,), and (n, 2) in m.
     """
     is_somewhere = (np.abs(places) <= np.finfo(np.float32).max).all(axis=1)
     numbers, places = numbers[is_somewhere], places[is_somewhere]
@@ -86,7 +90,7 @@ def draw_points(canvas: Canvas, entity: str, numbers: NDArray[np.int64], places:
 
 
 def _neighbours(places: Floats) -> list[NDArray[np.intp]]:
-    """The rows of the groups of points whose labels would overlap."""
+    """Group the rows of points whose labels would overlap."""
     if len(places) == 1:
         return [np.arange(1)]
     group = fcluster(linkage(places, "complete"), LABEL_SHARE * extent_of(places), "distance")
@@ -94,7 +98,14 @@ def _neighbours(places: Floats) -> list[NDArray[np.intp]]:
 
 
 def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
-    """A point (n, 2) at each time, such as a measurement."""
+    """Draw a point at each time, such as a measurement.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        time_ns: (n,).
+        places: (n, 2), in m.
+        stroke: its colour and width.
+    """
     canvas.send(entity, time_ns, rr.Points2D.columns(positions=places))
     canvas.fix(entity, rr.Points2D.from_fields(**stroke.fields(widen=2.0)))
 
@@ -102,7 +113,12 @@ def draw_dots(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 def draw_scans(
     canvas: Canvas, entity: str, time_ns: Times, places: Floats, colour: Colour, radius_px: float
 ) -> None:
-    """All points (n, 2) of a stamp together, until those of the next."""
+    """Draw all points of a stamp together, until those of the next.
+
+    Args:
+        canvas, entity, time_ns, places: as for `draw_dots`, in order of time.
+        colour, radius_px: of the points.
+    """
     times, sizes = np.unique(time_ns, return_counts=True)
     columns = rr.Points2D.columns(positions=places)
     canvas.send(entity, times, columns.partition(sizes))
@@ -144,13 +160,13 @@ def clouds_of(scene: Scene, case: str) -> Iterator[Cloud]:
 
 
 def draw_clouds(canvas: Canvas, scene: Scene, case: str, root: str) -> None:
-    """The particles of all estimators of a case; see `draw_cloud`."""
+    """Draw the particles of all estimators of a case; see `draw_cloud`."""
     for cloud in clouds_of(scene, case):
         draw_cloud(canvas, f"{root}/{cloud.estimator}/particles", cloud, scene.colour(cloud.estimator))
 
 
 def draw_cloud(canvas: Canvas, entity: str, cloud: Cloud, colour: Colour) -> None:
-    """All particles of a stamp until those of the next."""
+    """Draw all particles of a stamp until those of the next."""
     points = rr.Points2D.columns(
         positions=cloud.places.astype(np.float32), radii=-PARTICLE_PX * np.sqrt(cloud.weights)
     )
@@ -167,7 +183,13 @@ def draw_polygons(
     polygons: Sequence[Floats],
     stroke: Stroke,
 ) -> None:
-    """Closed polygons (vertices, 2), so many (n,) at each time; none is an empty set, not a gap."""
+    """Draw closed polygons at each time.
+
+    Args:
+        canvas, entity, time_ns, stroke: as for `draw_dots`.
+        sizes: (n,), how many there are at each time; none is an empty set, not a gap.
+        polygons: those of all times one after another, (vertices, 2) in m, each without its end.
+    """
     rows = thin(time_ns)
     first = np.cumsum(sizes) - sizes
     shown = [polygons[k] for row in rows for k in range(first[row], first[row] + sizes[row])]
@@ -179,7 +201,11 @@ def draw_polygons(
 
 
 def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, stroke: Stroke) -> None:
-    """The way of a point (n, 2): each row the segment from the place before."""
+    """Draw the way of a point: each row the segment from the place before.
+
+    Args:
+        canvas, entity, time_ns, places, stroke: as for `draw_dots`.
+    """
     segments = np.stack([places[:-1], places[1:]], axis=1).astype(np.float32)
     canvas.send(entity, time_ns[1:], rr.LineStrips2D.columns(strips=segments))
     canvas.fix(entity, rr.LineStrips2D.from_fields(**stroke.fields()))
@@ -188,7 +214,13 @@ def draw_path(canvas: Canvas, entity: str, time_ns: Times, places: Floats, strok
 def draw_poses(
     canvas: Canvas, entity: str, time_ns: Times, poses: Floats, stroke: Stroke, length_m: float
 ) -> None:
-    """An arrow from each pose (n, 3), x, y, heading, in the direction of the heading."""
+    """Draw an arrow from each pose in the direction of the heading.
+
+    Args:
+        canvas, entity, time_ns, stroke: as for `draw_dots`.
+        poses: (n, 3), x, y in m, heading in rad.
+        length_m: of the arrows.
+    """
     times, sizes = _until_stale(canvas, time_ns, np.ones_like(time_ns), gap_limit_ns(time_ns))
     vectors = length_m * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     columns = rr.Arrows2D.columns(origins=poses[:, :2], vectors=vectors)
@@ -199,12 +231,22 @@ def draw_poses(
 def draw_ellipses(
     canvas: Canvas, entity: str, time_ns: Times, means: Floats, covariances: Floats, stroke: Stroke
 ) -> None:
-    """The 95 % ellipse of each Gaussian (n, 2), (n, 2, 2)."""
+    """Draw the 95 % ellipse of each Gaussian.
+
+    Args:
+        canvas, entity, time_ns, stroke: as for `draw_dots`.
+        means, covariances: (n, 2), (n, 2, 2).
+    """
     draw_outlines(canvas, entity, time_ns, ellipses(means, covariances), stroke)
 
 
 def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats, stroke: Stroke) -> None:
-    """The outline of a thing at each time, closed or not: (n, vertices, 2), left out where NaN."""
+    """Draw the outline of a thing at each time, closed or not.
+
+    Args:
+        canvas, entity, time_ns, stroke: as for `draw_dots`.
+        outlines: (n, vertices, 2), in m, left out where NaN.
+    """
     good = np.isfinite(outlines).all(axis=(1, 2))
     times, sizes = _until_stale(canvas, time_ns[good], np.ones(good.sum(), int), gap_limit_ns(time_ns))
     columns = rr.LineStrips2D.columns(strips=outlines[good].astype(np.float32))
@@ -213,9 +255,11 @@ def draw_outlines(canvas: Canvas, entity: str, time_ns: Times, outlines: Floats,
 
 
 def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> Floats:
-    """Return the closed outlines (n, vertices + 1, 2) that hold Gaussians (n, 2), (n, 2, 2) so probably.
+    """Return closed outlines (n, vertices + 1, 2) of Gaussians, NaN where one is not positive definite.
 
-    NaN where a covariance is not positive definite.
+    Args:
+        means, covariances: (n, 2), (n, 2, 2).
+        probability: with which they hold the Gaussians.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, ELLIPSE_VERTICES + 1)
     circle = np.sqrt(chi2.ppf(probability, 2)) * np.stack([np.cos(angle), np.sin(angle)])
@@ -230,9 +274,14 @@ def ellipses(means: Floats, covariances: Floats, probability: float = 0.95) -> F
 def draw_lines(
     canvas: Canvas, entity: str, time_ns: Times, lines: Floats, colours: NDArray[np.uint8]
 ) -> None:
-    """Lines (n, points, 2) in colours (n, 4), sorted by time; those of one time, a look, show together.
+    """Draw the lines of one time, a look, together.
 
     They make way for the next look, and vanish where that comes later than usual.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        time_ns: (n,), sorted.
+        lines, colours: (n, points, 2) in m, (n, 4).
     """
     looks = np.unique(time_ns)
     looks = looks[thin(looks)]
@@ -248,7 +297,7 @@ def draw_lines(
 def _until_stale(
     canvas: Canvas, time_ns: Times, sizes: NDArray[np.int64], shown_ns: int
 ) -> tuple[Times, NDArray[np.int64]]:
-    """Rows of so many things each, and an empty row where one has no successor for `shown_ns`."""
+    """Return rows of so many things each, and an empty one where none comes for `shown_ns`."""
     ends = time_ns + shown_ns
     gone = ends < np.append(time_ns[1:], canvas.end_ns)[: len(time_ns)]
     times = np.concatenate([time_ns, ends[gone]])
@@ -266,9 +315,15 @@ def plane_view(
     *,
     name: str = "Map",
 ) -> rrb.Spatial2DView:
-    """Return a view of all below `root` and `others` that shows at least the places (n, 2), on a grid.
+    """Return a view, on a grid, that shows at least some places.
 
-    Of the `paths` it shows what lies up to `trail_s` before the cursor.
+    Args:
+        canvas: what is drawn on.
+        root, others: of what is shown.
+        paths: entities of which it shows what lies up to `trail_s` before the cursor.
+        places: (n, 2), in m.
+        trail_s: see there.
+        name: of the view.
     """
     extent = extent_of(places)
     low, high = bounds_of(places)
@@ -293,7 +348,13 @@ def bounds_of(places: Floats) -> tuple[Floats, Floats]:
 
 
 def draw_legend(canvas: Canvas, entity: str, entries: Mapping[str, Colour], places: Floats) -> None:
-    """What colours stand for in a view of places (n, 2): a dot with its name each, at the left edge."""
+    """Draw what colours stand for: a dot with its name each, at the left edge of a view.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        entries: colours by name.
+        places: that the view shows, (n, 2) in m.
+    """
     low, high = bounds_of(places)
     step = (high[1] - low[1]) / LEGEND_ROWS
     left = low[0] + LEGEND_INDENT * (high[0] - low[0])
@@ -325,7 +386,7 @@ def extent_of(places: Floats) -> float:
 
 
 def _draw_grid(canvas: Canvas, entity: str, low: Floats, high: Floats, step_m: float) -> None:
-    """Lines at the multiples of the step in x and in y."""
+    """Draw lines at the multiples of the step in x and in y."""
     lines = []
     for axis in range(2):
         at = step_m * np.arange(np.ceil(low[axis] / step_m), np.floor(high[axis] / step_m) + 1)

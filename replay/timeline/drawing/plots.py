@@ -61,13 +61,13 @@ class Squares(NamedTuple):
 
 
 def draw_quality(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Errors, NEES, NIS and effective particles of a case: no plots where there is nothing to judge."""
+    """Draw errors, NEES, NIS and effective particles of a case: no plots without anything to judge."""
     parts = (draw_errors, draw_nees, draw_nis, draw_effective)
     return [view for part in parts for view in part(canvas, scene, case)]
 
 
 def draw_quality_in_tabs(canvas: Canvas, scene: Scene, case: str) -> list[rrb.Tabs]:
-    """NEES and errors of a case of many components: of each kind of plot one at a time."""
+    """Draw NEES and errors of a case of many components: of each kind of plot one at a time."""
     kinds = (draw_nees(canvas, scene, case)[::-1], draw_errors(canvas, scene, case))
     return [rrb.Tabs(*views) for views in kinds if views]
 
@@ -116,7 +116,7 @@ def _draw_error(
 def draw_nees(
     canvas: Canvas, scene: Scene, case: str, *, legend: bool = True
 ) -> list[rrb.TimeSeriesView]:
-    """NEES of each estimator with the bounds of a single run; one plot per number of components."""
+    """Draw each estimator's NEES with the bounds of a single run; one plot per number of components."""
     found = [
         Squares(len(errors.components), "", errors.estimator, errors.time_ns, errors.nees)
         for errors in scene.errors_of(case)
@@ -126,7 +126,7 @@ def draw_nees(
 
 
 def draw_nis(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """NIS of each estimator, a point per measurement; one plot per set of measured components."""
+    """Draw each estimator's NIS, a point per measurement; one plot per set of measured components."""
     found = []
     for estimator, stream in scene.outputs_of(case, schemas.INNOVATION):
         innovations = innovations_of(gather([stream]))
@@ -152,7 +152,7 @@ def _draw_squares(
     *,
     legend: bool = True,
 ) -> list[rrb.TimeSeriesView]:
-    """Chi-square values of one run, and the band that holds 95 % of consistent ones.
+    """Draw chi-square values of one run, and the band that holds 95 % of consistent ones.
 
     Those above the panel are marks at its upper edge, and its title counts them. It ends above the band;
     where most values of every estimator are above that, the best one's set its range.
@@ -186,7 +186,7 @@ def _draw_squares(
 
 
 def _end_of(high: float, values: Sequence[Floats]) -> float:
-    """Where a panel of chi-square values ends whose band, below the legend, ends at `high`."""
+    """Find where a panel of chi-square values ends whose band, below the legend, ends at `high`."""
     room = min(LEGEND_MARGIN + SMALL_ENTRY * (1 + len(values)), SMALL_MOST)
     medians = [np.median(each[np.isfinite(each)]) for each in values if np.isfinite(each).any()]
     if not medians or min(medians) <= high:
@@ -250,7 +250,7 @@ def draw_components(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSer
 
 
 def below_legend(curves: Sequence[Floats]) -> tuple[float, float] | None:
-    """The range of a plot that leaves room for its legend above all curves; None where they are NaN."""
+    """Find a plot's range that leaves room for its legend above all curves; None where they are NaN."""
     values = np.concatenate([np.ravel(each) for each in curves] or [np.empty(0)])
     values = values[np.isfinite(values)]
     if not len(values):
@@ -271,7 +271,15 @@ def draw_curve(
     style: Style,
     most: int = DRAWN_ROWS,
 ) -> None:
-    """Draw one curve of a plot: values (n,) over time, at most so many of them, peaks kept."""
+    """Draw one curve of a plot.
+
+    Args:
+        canvas: what is drawn on.
+        plot, name, colour: of the curve.
+        time_ns, values: (n,), in order of time.
+        style: as a line or as points.
+        most: at most so many values, peaks kept.
+    """
     rows = thin_curve(time_ns, values, most)
     canvas.send(f"{plot}/{name}", time_ns[rows], rr.Scalars.columns(scalars=values[rows]))
     canvas.fix(f"{plot}/{name}", style(names=[name], colors=[colour]))
@@ -285,7 +293,7 @@ def plot_view(
     legend: bool = True,
     zoom_lock: bool = True,
 ) -> rrb.TimeSeriesView:
-    """A plot of everything below an entity, over the whole run; a stated range stays by default."""
+    """Plot everything below an entity, over the whole run; a stated range stays by default."""
     return rrb.TimeSeriesView(
         origin=escaped(entity),
         name=name,
@@ -296,7 +304,7 @@ def plot_view(
 
 
 def shown_unit(component: str) -> tuple[str, str, float]:
-    """Quantity, the unit to show it in, and the factor to that unit: angles are shown in degrees."""
+    """Return quantity, the unit to show it in, and the factor to that unit: angles are in degrees."""
     quantity, _, unit = component.rpartition("_")
     if not quantity:
         return component, "-", 1.0

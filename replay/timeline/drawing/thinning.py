@@ -103,7 +103,7 @@ class Thinned(Generic[Rows]):
         self._parts, self._count = [rows], len(self._time_ns(rows))
 
     def _stays(self, rows: Rows) -> NDArray[np.bool_]:
-        """Which rows are kept of their cells; of the widest one, which is all time, the last stamp's."""
+        """Tell which rows are kept of their cells; of the widest, all time, the last stamp's are."""
         time_ns = self._time_ns(rows)
         cell = time_ns >> self._shift
         kept = [np.flatnonzero(np.append(cell[1:] != cell[:-1], True)[: len(cell)])]
@@ -115,7 +115,7 @@ class Thinned(Generic[Rows]):
         return stays[stamp]
 
     def _is_first(self, rows: Rows) -> NDArray[np.bool_]:
-        """Which rows have the first stamp: others of it may have come in the block before."""
+        """Tell which rows have the first stamp: others of it may have come in the block before."""
         time_ns = self._time_ns(rows)
         return time_ns == time_ns[:1]
 
@@ -143,7 +143,7 @@ def thinned_errors(limit: int) -> Thinned[Errors]:
 
 
 def curves_of(stream: Stream) -> Iterator[tuple[Field, Floats]]:
-    """The fields of a stream that are curves over time, as (curves, n); no covariances, nothing wide."""
+    """Yield the fields that are curves over time, as (curves, n): no covariances, nothing wide."""
     for entry in stream.schema:
         if entry.kind in ("real", "vector") and not entry.name.startswith("covariance"):
             values = stream[entry.name].reshape(len(stream), -1 if len(stream) else 0).T
@@ -241,11 +241,11 @@ class Held:
     def blocks(
         self, topics: Sequence[str], order: Clock, block_messages: int
     ) -> Iterator[dict[str, Stream]]:
-        """Not only what is held."""
+        """Yield all there is, not only what is held."""
         return self.of.blocks(topics, order, block_messages)
 
     def whole(self) -> "Held":
-        """Itself."""
+        """Return itself."""
         return self
 
 

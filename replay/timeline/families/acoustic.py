@@ -61,7 +61,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _place(scene: Scene, sensor: int) -> Floats:
-    """Where a sensor stands (2,): by the truth, else by its first fix; NaN where it has none."""
+    """Find where a sensor stands (2,): by the truth, else by its first fix; NaN where it has none."""
     for truth in scene.truths_of(CASE):
         columns = [truth.components.index(name) for name in sensor_components(sensor)]
         return truth["state"][0, columns]
@@ -70,7 +70,7 @@ def _place(scene: Scene, sensor: int) -> Floats:
 
 
 def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
-    """As the detections' channels state it, else as usual."""
+    """Return the Mach angle as the detections' channels state it, else as usual."""
     for sensor in sensors:
         stated = scene.source.topics[f"/sensor{sensor}/detections"].metadata
         if "mach_number" in stated:
@@ -79,7 +79,7 @@ def _mach_angle_rad(scene: Scene, sensors: list[int]) -> float:
 
 
 def _draw_heard(canvas: Canvas, scene: Scene, sensors: list[int], length_m: float) -> Times:
-    """A ray for each direction of arrival, when all have heard the shot: the times of that."""
+    """Draw a ray for each direction of arrival, when all have heard the shot; return when that is."""
     detections, positions = (
         [gather([scene.read(f"/sensor{sensor}/{leaf}")]) for sensor in sensors]
         for leaf in ("detections", "position")
@@ -98,7 +98,7 @@ def _draw_heard(canvas: Canvas, scene: Scene, sensors: list[int], length_m: floa
 
 
 def _draw_estimates(canvas: Canvas, estimator: str, stroke: Stroke, stream: Stream, cone: Cone) -> None:
-    """The shooter's ellipse, and the shot where its direction is estimated."""
+    """Draw the shooter's ellipse, and the shot where its direction is estimated."""
     size = len(stream.components)
     covariances = stream["covariance"].reshape(-1, size, size)[:, :2, :2]
     outline = (stream["mean"][:, :2], covariances, stroke)
@@ -109,7 +109,7 @@ def _draw_estimates(canvas: Canvas, estimator: str, stroke: Stroke, stream: Stre
 def _draw_shot(
     canvas: Canvas, name: str, stroke: Stroke, stream: Stream, states: Floats, cone: Cone
 ) -> None:
-    """The bullet's way and the shockwave's cone behind it, where the trajectory is known."""
+    """Draw the bullet's way and the shockwave's cone behind it, where the trajectory is known."""
     if "trajectory_rad" not in stream.components or len(stream) == 0:
         return
     place, angle = states[:, :2], states[:, 2]

@@ -30,7 +30,7 @@ GOLDEN = 0.618034
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """Map and plane of each estimator in tabs, live counts, and a table of vessels."""
+    """Draw map and plane of each estimator in tabs, live counts, and a table of vessels."""
     turn_up(canvas)
     tracks = scene.outputs_of("", schemas.TRACK_ESTIMATE)
     boards = [_draw_board(canvas, scene, name, stream) for name, stream in tracks]
@@ -42,7 +42,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _draw_board(canvas: Canvas, scene: Scene, name: str, tracks: Stream | None) -> rrb.Container:
-    """The reports on the map and in the plane; white without tracks."""
+    """Draw the reports on the map and in the plane; white without tracks."""
     reports, geodetic = scene.read(REPORTS), scene.read(GEODETIC)
     numbers = np.zeros(len(reports), np.int64)
     if tracks is not None and len(tracks) == len(reports):
@@ -75,7 +75,7 @@ def track_colours(numbers: NDArray[np.int64]) -> NDArray[np.uint8]:
 
 
 def _draw_live(canvas: Canvas, scene: Scene, tracks: list[tuple[str, Stream]]) -> rrb.TimeSeriesView:
-    """How many tracks and vessels were heard within ten minutes."""
+    """Plot how many tracks and vessels were heard within ten minutes."""
     identity = scene.read(IDENTITY)
     curves = [("vessels", TRUTH, identity.publish_time_ns, identity["thing_id"])]
     for name, stream in tracks:
@@ -93,7 +93,7 @@ def _send_curve(canvas: Canvas, entity: str, time_ns: Times, values: NDArray) ->
 
 
 def _draw_table(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> rrb.TextDocumentView:
-    """Vessels with their shares, most reports first."""
+    """List vessels with their shares, most reports first."""
     output = Output(name, "", "track", gather([tracks]), [scene.source])
     lines = ["|MMSI|reports|share|tracks|switches|", "|--:|--:|--:|--:|--:|"]
     for table in track_tables(reports_of(output)):

@@ -29,7 +29,7 @@ UPDATES = 50
 
 
 def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
-    """A board for every subset of matchers that was fused; without estimates, the matchers' scores."""
+    """Draw a board for every subset of matchers that was fused; without estimates, all scores."""
     return draw_cases(scene, partial(_draw_case, canvas, scene))
 
 
@@ -46,7 +46,7 @@ def _draw_case(canvas: Canvas, scene: Scene, case: str) -> rrb.Container | rrb.V
 
 
 def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> rrb.Container:
-    """Genuine score and greatest impostor score of each probe, and how the scores so far are spread."""
+    """Draw genuine and greatest impostor score of each probe, and how the scores so far are spread."""
     fused, time_ns = fused_of(stream), stream.publish_time_ns
     root = entity_path("fusion", case, estimator)
     of_probe = "Log-likelihood ratio" if fused.is_ratio else "Fused score"
@@ -59,7 +59,7 @@ def _draw_fusion(canvas: Canvas, case: str, estimator: str, stream: Stream) -> r
 
 
 def _draw_errors(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """The share of wrong decisions so far of every fusion of a case."""
+    """Plot the share of wrong decisions so far of every fusion of a case."""
     plot = entity_path("errors", case)
     for estimator, stream in scene.outputs_of(case, schemas.SCORE_VECTOR):
         wrong, time_ns = _errors_so_far(fused_of(stream)), stream.publish_time_ns
@@ -87,13 +87,13 @@ def _draw_probes(canvas: Canvas, plot: str, fused: Fused, time_ns: Times) -> Non
 
 
 def _greatest_of_each_time(time_ns: Times, score: Floats) -> Times:
-    """The row of the greatest score of each distinct time."""
+    """Return the row of the greatest score of each distinct time."""
     order = np.lexsort((score, time_ns))
     return order[np.append(time_ns[order][1:] != time_ns[order][:-1], True)]
 
 
 def _errors_so_far(fused: Fused) -> Floats:
-    """Per cent of the comparisons so far that were decided wrongly: the mean of both classes' rates.
+    """Compute per cent of comparisons so far that were decided wrongly: the mean of both classes' rates.
 
     A fusion without a threshold is judged half-way between the medians of genuine and impostor scores.
     """
@@ -110,7 +110,7 @@ def _errors_so_far(fused: Fused) -> Floats:
 
 
 def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times) -> rrb.BarChartView:
-    """Two histograms of the scores so far, each of sum 1; what is off the scale is in the end bars."""
+    """Draw two histograms of scores so far, each of sum 1; what is off the scale is in the end bars."""
     low = np.quantile(fused.score[~fused.genuine], 0.001)
     high = np.median(fused.score[fused.genuine])
     edges = np.linspace(low, max(high, low + 1e-9), BINS + 1)
@@ -135,7 +135,7 @@ def _draw_distribution(canvas: Canvas, entity: str, fused: Fused, time_ns: Times
 
 
 def _draw_matchers(canvas: Canvas, scene: Scene, case: str) -> list[rrb.View]:
-    """The scores that the case's matchers gave each probe."""
+    """Draw the scores that the case's matchers gave each probe."""
     if TOPIC not in scene.source.topics:
         return []
     stream = scene.read(TOPIC)

@@ -55,7 +55,7 @@ class Track(NamedTuple):
 
 
 def _tracks(scene: Scene, case: str, width: int, rows: int) -> Iterator[Track]:
-    """The truth, then every estimate of this width, thinned to what is drawn."""
+    """Yield the truth, then every estimate of this width, thinned to what is drawn."""
     for stream in scene.truths_of(case):
         if stream["state"].shape[1] == width:
             yield _track("truth", TRUTH, stream, "state", rows)
@@ -81,7 +81,7 @@ def _track(name: str, colour: Colour, stream: Stream, field: str, rows: int) -> 
 def _draw_with(
     board: Callable[[Canvas, Scene, str], rrb.View], canvas: Canvas, scene: Scene
 ) -> rrb.Container | rrb.View:
-    """A board above the events of each case, its errors beside it."""
+    """Draw a board above the events of each case, its errors beside it."""
 
     def draw_case(case: str) -> rrb.Container:
         left = above_events(
@@ -93,7 +93,7 @@ def _draw_with(
 
 
 def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
-    """Where estimators that know the magnetic field of the place find it disturbed."""
+    """Yield where estimators that know the magnetic field of the place find it disturbed."""
     topic = f"/{case}/inertial".replace("//", "/")
     for estimator, stream in scene.outputs_of(case, schemas.GAUSSIAN_ESTIMATE):
         if topic in scene.source.topics and set(COMPONENTS) <= set(stream.components):
@@ -107,7 +107,7 @@ def _disturbed(scene: Scene, case: str) -> Iterator[Happened]:
 
 
 def _draw_orientation(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """Triads: the truth's in red, green and blue, an estimate's longer and in its own colour."""
+    """Draw triads: the truth's in red, green and blue, an estimate's longer and in its own colour."""
     root = entity_path("space", case)
     for number, track in enumerate(_tracks(scene, case, 4, 5000)):
         is_truth = track.name == "truth"
@@ -127,7 +127,15 @@ def draw_triads(
     length: float,
     radius: float,
 ) -> None:
-    """The axes x, y and z turned by each of quaternions (n, 4), w first."""
+    """Draw the axes x, y and z, turned, at each time.
+
+    Args:
+        canvas, entity: what is drawn on, and where.
+        time_ns: (n,).
+        quaternions: (n, 4), w first.
+        colours: of x, y and z.
+        length, radius: of the axes, in the unit of the scene.
+    """
     turned = rr.Transform3D.columns(quaternion=np.roll(quaternions, -1, axis=1))
     canvas.send(entity, time_ns, turned)
     labels = [f"{entity.rpartition('/')[2]} {axis}" for axis in "xyz"]
@@ -149,7 +157,7 @@ def space_view(root: str, name: str) -> rrb.Spatial3DView:
 
 
 def _draw_axis(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """The density of each estimate around the circle, and truth and measurement as lines through it."""
+    """Draw each estimate's density around the circle, truth and measurement as lines through it."""
     root = entity_path("axis", case)
     canvas.fix(root, rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
     angle = np.linspace(0.0, 2.0 * np.pi, OUTLINE_POINTS)
@@ -180,21 +188,21 @@ def _draw_axis(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
 def _draw_lines(
     canvas: Canvas, entity: str, time_ns: Times, ends: Floats, colour: Colour, radius_px: float
 ) -> None:
-    """A line from -end to end for each row of ends (n, 2)."""
+    """Draw a line from -end to end for each row of ends (n, 2)."""
     _draw_strips(canvas, entity, time_ns, np.stack([-ends, ends], axis=1), colour, radius_px)
 
 
 def _draw_strips(
     canvas: Canvas, entity: str, time_ns: Times, strips: Floats, colour: Colour, radius_px: float
 ) -> None:
-    """One strip (points, 2) per row of strips (n, points, 2)."""
+    """Draw one strip (points, 2) per row of strips (n, points, 2)."""
     canvas.send(entity, time_ns, rr.LineStrips2D.columns(strips=list(strips.astype(np.float32))))
     radii = rr.Radius.ui_points(radius_px)
     canvas.fix(entity, rr.LineStrips2D.from_fields(colors=[colour], radii=radii))
 
 
 def _draw_torus(canvas: Canvas, scene: Scene, case: str) -> rrb.View:
-    """The first estimator's density as a heat map, with its five samples sized by weight.
+    """Draw the first estimator's density as a heat map, with its five samples sized by weight.
 
     The others, truth and measurement are points. Heading 1 goes right, heading 2 up, from -pi to pi.
     """
@@ -251,7 +259,7 @@ def _draw_dots(
 
 
 def _on_map(headings_rad: Floats) -> Floats:
-    """Where headings (n, 2) are in the picture, in cells: x to the right, y down."""
+    """Find where headings (n, 2) are in the picture, in cells: x to the right, y down."""
     share = (headings_rad + np.pi) / (2.0 * np.pi) % 1.0
     return CELLS * np.stack([share[:, 0], 1.0 - share[:, 1]], axis=-1)
 

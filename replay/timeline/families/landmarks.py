@@ -71,7 +71,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def landmarks_of(scene: Scene) -> pd.DataFrame:
-    """Places (n, 2) by number; none where the log has no map, as that of estimates."""
+    """Return places (n, 2) by number; none where the log has no map, as that of estimates."""
     if "/landmarks" not in scene.source.topics:
         return pd.DataFrame(np.empty((0, 2)), index=np.empty(0, np.int64))
     stream = scene.read("/landmarks")
@@ -119,7 +119,7 @@ def _track(name: str, stroke: Stroke, stream: Stream, states: Floats) -> Track:
 
 
 def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
-    """Path, arrows and ellipses of a robot in a scene so wide; the entity of the path."""
+    """Draw path, arrows and ellipses of a robot in a scene so wide; return the entity of the path."""
     entity = f"{root}/{track.name}"
     draw_path(canvas, f"{entity}/path", track.time_ns, track.poses[:, :2], track.stroke)
     if np.isfinite(track.poses).all():
@@ -134,7 +134,7 @@ def draw_track(canvas: Canvas, root: str, track: Track, extent_m: float) -> str:
 def draw_sights(
     canvas: Canvas, scene: Scene, robot: str, tracks: list[Track], landmarks: pd.DataFrame
 ) -> None:
-    """Lines from the robot to the landmarks it sees; one that an estimator's gate kept out is red."""
+    """Draw lines from the robot to landmarks that it sees; what an estimator's gate kept out is red."""
     sensors = [
         scene.read(topic)
         for topic in scene.topics_near(robot)
@@ -152,7 +152,7 @@ def draw_sights(
 
 
 def _pairs(streams: list[Stream]) -> pd.MultiIndex:
-    """The distinct (time, target) of some streams, sorted."""
+    """Return the distinct (time, target) of some streams, sorted."""
     times = [stream.publish_time_ns for stream in streams]
     targets = [stream["target_id"].astype(np.int64) for stream in streams]
     none = [np.empty(0, np.int64)]
@@ -161,7 +161,7 @@ def _pairs(streams: list[Stream]) -> pd.MultiIndex:
 
 
 def _places_at(tracks: list[Track], time_ns: Times) -> Floats:
-    """Where the robot was (n, 2): by the truth, where that has none by the first estimate that has."""
+    """Find where the robot was (n, 2): by the truth, or by the first estimate that has one then."""
     places = np.full((len(time_ns), 2), np.nan)
     for track in tracks:
         row = np.searchsorted(track.time_ns, time_ns, side="right") - 1

@@ -75,7 +75,7 @@ class Body(NamedTuple):
 def draw_navigation(
     canvas: Canvas, scene: Scene, case: str, sensed: Sequence[Stream]
 ) -> list[rrb.Container]:
-    """A scene in space above plots of the state, where an estimate has a place and an orientation."""
+    """Draw a scene in space above plots of the state, where an estimate has place and orientation."""
     bodies = list(_bodies(scene, case))
     if all(body.deviations is None for body in bodies):
         return []
@@ -99,7 +99,7 @@ def draw_navigation(
 
 
 def _bodies(scene: Scene, case: str) -> Iterator[Body]:
-    """The truth where it has a place in space, and all estimates with an orientation too."""
+    """Yield the truth where it has a place in space, and all estimates with an orientation too."""
     for truth in scene.truths_of(case):
         if set(PLACE) <= set(truth.components):
             known = np.isfinite(truth["state"]).all(axis=1)
@@ -137,7 +137,7 @@ def _bodies(scene: Scene, case: str) -> Iterator[Body]:
 
 
 def _fixes_of(sensed: Sequence[Stream]) -> Iterator[tuple[str, Stream]]:
-    """Fixes in the plane, those that are latitude and longitude as well, where their plane is stated."""
+    """Yield fixes in the plane, also those of latitude and longitude where their plane is stated."""
     for stream in sensed:
         name = stream.topic.strip("/").replace("/", " ")
         schema = stream.schema.full_name
@@ -149,14 +149,14 @@ def _fixes_of(sensed: Sequence[Stream]) -> Iterator[tuple[str, Stream]]:
 
 
 def _silent(stream: Stream, end_ns: int) -> Times:
-    """Spans (n, 2) in which fixes are missed, that after the last one included."""
+    """Find spans (n, 2) in which fixes are missed, that after the last one included."""
     times = np.append(stream.publish_time_ns, end_ns)
     long = np.diff(times) > gap_limit_ns(stream.publish_time_ns)
     return np.stack([times[:-1][long], times[1:][long]], axis=1)
 
 
 def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
-    """Fixes as points, coloured by the standard deviation that they state."""
+    """Draw fixes as points, coloured by the standard deviation that they state."""
     rows = thin(stream.publish_time_ns)
     place = stream["position_m"][rows].astype(np.float32)
     colours = by_deviation(stream["covariance_m2"][rows], MUTED)
@@ -164,7 +164,7 @@ def _draw_fixes(canvas: Canvas, entity: str, stream: Stream) -> None:
 
 
 def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
-    """The whole path with its tube, red where fixes are silent, and the axes at the cursor."""
+    """Draw the whole path with its tube, red where fixes are silent, and the axes at the cursor."""
     place = body.columns(PLACE)
     thin_line = rr.Radius.ui_points(1.5)
     canvas.fix(f"{entity}/path", rr.LineStrips3D([place], colors=[body.colour], radii=thin_line))
@@ -188,7 +188,7 @@ def _draw_body(canvas: Canvas, entity: str, body: Body, outages: Times) -> None:
 
 
 def _draw_tube(canvas: Canvas, entity: str, place: Floats, covariance: Floats, colour: Colour) -> None:
-    """Ellipsoids of two standard deviations along the path; as wires, for a viewer may be in one."""
+    """Draw ellipsoids of two standard deviations along the path; as wires, as a viewer may be in one."""
     rows = np.unique(np.linspace(0, len(place) - 1, min(TUBE, len(place))).astype(int))
     reach = SIGMAS * np.sqrt(np.linalg.eigvalsh(covariance[rows])[:, -1].clip(0.0))
     kept = [0]
@@ -216,7 +216,7 @@ def _extent(place: Floats) -> float:
 
 
 def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
-    """The scene from south-west and above."""
+    """Show the scene from south-west and above."""
     place = np.concatenate([body.columns(PLACE) for body in bodies])
     centre, extent = np.median(place, axis=0), _extent(place)
     return rrb.Spatial3DView(
@@ -229,7 +229,7 @@ def _space(root: str, bodies: Sequence[Body]) -> rrb.Spatial3DView:
 
 
 def _groups(bodies: Sequence[Body]) -> Iterator[tuple[str, str, list[str]]]:
-    """What is plotted together: a name, a title, components."""
+    """Yield what is plotted together: a name, a title, components."""
     names = dict.fromkeys(name for body in bodies for name in body.names)
     if set(VELOCITY) <= set(names):
         yield "velocity", "Velocity (m/s)", list(VELOCITY)
@@ -249,7 +249,7 @@ def _draw_group(
     components: Sequence[str],
     outages: Times,
 ) -> rrb.TimeSeriesView:
-    """Some components of all bodies, biases with their bands, and shades where fixes are silent."""
+    """Plot some components of all bodies, biases with their bands, shades where fixes are silent."""
     plot, largest = entity_path("plots", case, "motion", name), 0.0
     for body in bodies:
         colours = cycle(PALETTE) if len(bodies) == 1 else cycle([body.colour])
@@ -269,7 +269,7 @@ def _draw_group(
 
 
 def _curve(body: Body, component: str) -> tuple[Floats, Floats | None] | None:
-    """A component's values (n,) and standard deviations (n,), in the unit that is shown."""
+    """Return a component's values (n,) and standard deviations (n,), in the unit that is shown."""
     if component in ANGLES:
         if not set(ORIENTATION) <= set(body.names):
             return None
@@ -296,7 +296,7 @@ def _draw_band(
 
 
 def _draw_shades(canvas: Canvas, entity: str, outages: Times, extent: float) -> None:
-    """The whole height where fixes are silent; between outages there is nothing."""
+    """Shade the whole height where fixes are silent; between outages there is nothing."""
     if not len(outages):
         return
     # a NaN after each outage ends its shade

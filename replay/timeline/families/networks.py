@@ -67,7 +67,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _draw_nees(canvas: Canvas, scene: Scene, case: str, *, legend: bool) -> list[rrb.TimeSeriesView]:
-    """The plots of one node."""
+    """Draw the plots of one node."""
     views = draw_nees(canvas, scene, case, legend=legend)
     for view in views:
         view.name = f"{case}: {view.name}"
@@ -75,7 +75,7 @@ def _draw_nees(canvas: Canvas, scene: Scene, case: str, *, legend: bool) -> list
 
 
 def _nodes(scene: Scene, links: Stream) -> NDArray[np.int64]:
-    """The numbers (n,) of all nodes that sense, send or hear."""
+    """Return the numbers (n,) of all nodes that sense, send or hear."""
     parts = [topic.removeprefix("/node").partition("/") for topic in scene.source.topics]
     sensing = [int(number) for number, _, leaf in parts if leaf == "sensor" and number.isdigit()]
     numbers = np.concatenate([links["sender_id"], links["receiver_id"], sensing])
@@ -83,7 +83,7 @@ def _nodes(scene: Scene, links: Stream) -> NDArray[np.int64]:
 
 
 def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.Spatial2DView:
-    """Nodes on a circle, links as lines, and the messages of the moment on them."""
+    """Draw nodes on a circle, links as lines, and the messages of the moment on them."""
     angle = 0.5 * np.pi - 2.0 * np.pi * np.arange(len(nodes)) / max(len(nodes), 1)
     places = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     draw_points(canvas, f"{GRAPH}/nodes", nodes, places)
@@ -111,7 +111,7 @@ def _draw_graph(canvas: Canvas, links: Stream, nodes: NDArray[np.int64]) -> rrb.
 
 
 def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
-    """For each estimator the way of the truth and of all nodes, and below it their errors."""
+    """Draw for each estimator the way of the truth and of all nodes, and below it their errors."""
     truth, shown = f"{ROOT}/truth", [np.empty((0, 2))]
     for stream in scene.truths_of(""):
         places = stream["state"][:, [stream.components.index(name) for name in PLACE]]
@@ -140,7 +140,7 @@ def _draw_maps(canvas: Canvas, scene: Scene) -> rrb.Tabs | rrb.Spatial2DView:
 
 
 def _draw_way(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> str:
-    """The way of one node's estimates; returns its entity."""
+    """Draw the way of one node's estimates; returns its entity."""
     stroke = Stroke(scene.colour(errors.estimator))
     for name, stream in scene.outputs_of(errors.case, schemas.GAUSSIAN_ESTIMATE):
         # what a node sent is a Gaussian too, without a truth to be judged by
@@ -151,7 +151,7 @@ def _draw_way(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> str:
 
 
 def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> float:
-    """One node's error of the position, the truth in the middle; returns how far to show."""
+    """Draw one node's error of the position, the truth in the middle; returns how far to show."""
     stroke, entity = Stroke(scene.colour(errors.estimator)), f"{root}/{errors.case}"
     columns = [errors.components.index(name) for name in PLACE]
     error, covariance = errors.error[:, columns], errors.covariance[:, columns][:, :, columns]
@@ -165,7 +165,7 @@ def _draw_error(canvas: Canvas, scene: Scene, root: str, errors: Errors) -> floa
 
 
 def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLogView]:
-    """What happened to estimators, sensors and messages, in one list."""
+    """List what happened to estimators, sensors and messages."""
     happened = [draw_events(canvas, scene, case) for case in scene.cases[: PLOTTED_NODES + 1]]
     times, first = np.unique(links.publish_time_ns, return_index=True)
     texts = [_line_of(links.take(rows)) for rows in np.split(np.arange(len(links)), first)[1:]]
@@ -176,7 +176,7 @@ def _draw_events(canvas: Canvas, scene: Scene, links: Stream) -> list[rrb.TextLo
 
 
 def _line_of(sent: Stream) -> str:
-    """The messages that are sent at one time, as a line."""
+    """Write the messages that are sent at one time as a line."""
     ways = [f"{a}>{b}" for a, b in zip(sent["sender_id"], sent["receiver_id"], strict=True)]
     late_s = (sent["arrival_time_ns"] - sent.publish_time_ns) * 1e-9
     parts = [f"{len(sent)} messages sent"]

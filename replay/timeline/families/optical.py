@@ -70,7 +70,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _sensors(scene: Scene) -> Iterator[Sensor]:
-    """The sensors of the log whose place and attitude it holds."""
+    """Yield the sensors of the log whose place and attitude it holds."""
     for topic in scene.source.topics:
         number = re.fullmatch(r"/sensor(\d+)/line_of_sight", topic)
         if number is None:
@@ -86,7 +86,7 @@ def _sensors(scene: Scene) -> Iterator[Sensor]:
 
 
 def _targets(scene: Scene) -> Floats:
-    """The true places (n, 3) of all targets."""
+    """Return the true places (n, 3) of all targets."""
     for truth in scene.truths_of(""):
         names = [name for name in truth.components if name.startswith("target_")]
         columns = [truth.components.index(name) for name in names]
@@ -95,14 +95,14 @@ def _targets(scene: Scene) -> Floats:
 
 
 def _draw_points(canvas: Canvas, name: str, places: Floats, colour: Colour) -> None:
-    """Fixed points (n, 3), numbered from 1."""
+    """Draw fixed points (n, 3), numbered from 1."""
     labels = [f"{name.removesuffix('s')} {number + 1}" for number in range(len(places))]
     radii = rr.Radius.ui_points(5.0)
     canvas.fix(f"{ROOT}/{name}", rr.Points3D(places, labels=labels, colors=[colour], radii=radii))
 
 
 def _draw_measured(canvas: Canvas, sensors: list[Sensor], length_m: float) -> None:
-    """The lines of sight as they come in, biases and all."""
+    """Draw the lines of sight as they come in, biases and all."""
     for sensor in sensors:
         rays = _rays(sensor, sensor.sights, np.zeros(3), length_m)
         times_ns = sensor.sights.publish_time_ns
@@ -110,7 +110,7 @@ def _draw_measured(canvas: Canvas, sensors: list[Sensor], length_m: float) -> No
 
 
 def _rays(sensor: Sensor, sights: Stream, bias: Floats, length_m: float) -> Floats:
-    """Lines (n, 2, 3) from the sensor along what it saw, biases (3,) or (n, 3) taken out."""
+    """Return lines (n, 2, 3) from the sensor along what it saw, biases (3,) or (n, 3) taken out."""
     attitude = np.broadcast_to(sensor.attitude + bias, (len(sights), 3)).T
     unit = np.stack(direction(sights["azimuth_rad"], sights["elevation_rad"], attitude), axis=1)
     return np.stack([np.broadcast_to(sensor.place, unit.shape), sensor.place + length_m * unit], axis=1)
@@ -119,7 +119,7 @@ def _rays(sensor: Sensor, sights: Stream, bias: Floats, length_m: float) -> Floa
 def _draw_rays(
     canvas: Canvas, name: str, shown_ns: Times, time_ns: Times, rays: Floats, colour: Colour
 ) -> None:
-    """Rays (n, 2, 3), each at its time, which is one of those at which some are shown; both sorted."""
+    """Draw rays (n, 2, 3), each at its time, which is one of those when some are shown; both sorted."""
     times = np.unique(shown_ns)
     sizes = np.bincount(np.searchsorted(times, time_ns), minlength=len(times))
     columns = rr.LineStrips3D.columns(strips=rays.astype(np.float32))
@@ -136,7 +136,7 @@ def _draw_estimates(
     sensors: list[Sensor],
     extent: float,
 ) -> float:
-    """Targets' ellipsoids and corrected lines of sight; returns how far the former are magnified."""
+    """Draw targets' ellipsoids and corrected lines of sight; returns how much the former are larger."""
     components, times_ns = stream.components, stream.publish_time_ns
     count = sum(name.startswith("target_") for name in components) // 3
     covariances = stream["covariance"].reshape(len(stream), len(components), -1)
@@ -168,7 +168,7 @@ def _draw_estimates(
 
 
 def _ellipsoids(covariances: Floats) -> tuple[Floats, NDArray[np.float64]]:
-    """Half axes (n, 3) and orientations (n, 4) of what holds Gaussians (n, 3, 3) with 95 %."""
+    """Return half axes (n, 3) and orientations (n, 4) of what holds Gaussians (n, 3, 3) with 95 %."""
     variances, axes = np.linalg.eigh(covariances)
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     half_axes = np.sqrt(chi2.ppf(0.95, 3) * np.maximum(variances, 0.0))

@@ -65,7 +65,7 @@ def _draw_robot(canvas: Canvas, scene: Scene, robot: str) -> rrb.Container | rrb
 def draw_sets(
     canvas: Canvas, scene: Scene, case: str, root: str
 ) -> tuple[Floats, list[rrb.TimeSeriesView]]:
-    """The sets of a case; two corners (2, 2) of where most of them are, and the plot of their areas."""
+    """Draw a case's sets; two corners (2, 2) of where most of them are, and the plot of their areas."""
     plot, corners = entity_path("plots", case, "area"), []
     for estimator, sizes in scene.outputs_of(case, schemas.ESTIMATE_SIZE):
         topic = "/" + entity_path("estimates", estimator, case, "set")

@@ -83,7 +83,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
-    """What moves with a known position: targets with a truth, and sensors."""
+    """Yield what moves with a known position: targets with a truth, and sensors."""
     for topic in scene.source.topics.values():
         if topic.schema_name == schemas.TRUTH_STATE.full_name:
             yield topic.name, read_vectors(scene.read(topic.name), "state", PLANE), Stroke(TRUTH, 1.5)
@@ -92,14 +92,14 @@ def _ways(scene: Scene) -> Iterator[tuple[str, Floats, Stroke]]:
 
 
 def _legend(scene: Scene) -> dict[str, Colour]:
-    """The colours of what moves with a known position."""
+    """Return the colours of what moves with a known position."""
     schemas_of = {topic.schema_name for topic in scene.source.topics.values()}
     known = {"truth": (schemas.TRUTH_STATE, TRUTH), "sensors": (schemas.POSITION_FIX, MUTED)}
     return {name: colour for name, (of, colour) in known.items() if of.full_name in schemas_of}
 
 
 def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
-    """The detections of every sensor, scan by scan; returns the colours by sensor."""
+    """Draw the detections of every sensor, scan by scan; returns the colours by sensor."""
     colours: dict[str, Colour] = {}
     scans = [each for each in scene.source.topics.values() if each.name.endswith("/scan")]
     for number, topic in enumerate(scans):
@@ -126,13 +126,13 @@ def _draw_scans(canvas: Canvas, scene: Scene) -> dict[str, Colour]:
 
 
 def _own_places(scene: Scene, scan: Stream) -> Floats:
-    """Where the sensor is at its scans, (n, 2)."""
+    """Find where the sensor is at its scans, (n, 2)."""
     topic = scan.metadata.get(ORIGIN, "")
     return places_of_sensor(scan, scene.read(topic) if topic in scene.source.topics else None)
 
 
 def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
-    """The ways of all tracks and their 95 % ellipses; returns the entities of the ways."""
+    """Draw the ways of all tracks and their 95 % ellipses; returns the entities of the ways."""
     place, covariance = read_vectors(tracks, "mean", PLANE), covariances_of(tracks, PLANE)
     numbers = tracks["track_id"].astype(np.int64)
     ways = []
@@ -150,7 +150,7 @@ def _draw_tracks(canvas: Canvas, root: str, tracks: Stream) -> list[str]:
 
 
 def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) -> None:
-    """Lines from tracks to the detections of places that are theirs, in the tracks' colours."""
+    """Draw lines from tracks to the detections of places that are theirs, in the tracks' colours."""
     for estimator, associations in scene.outputs_of("", schemas.ASSOCIATION):
         sensors = associations.metadata["sensors"].split(",") if estimator == name else []
         for number, sensor in enumerate(sensors):
@@ -179,7 +179,7 @@ class Joined(NamedTuple):
 
 
 def _joined(scan: Stream, seen: Stream) -> Joined:
-    """Each chain of detections of a scan that are near each other as its mean, by its first one.
+    """Take each chain of near detections of a scan as its mean, by its first one.
 
     How near is stated on the channel of the scans; see
     `replay.inference.association.scanning.join_near`.
@@ -203,7 +203,7 @@ def _joined(scan: Stream, seen: Stream) -> Joined:
 
 
 def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np.bool_]]:
-    """Where the associations' tracks are then (n, 2), and of which of them that is known."""
+    """Find where the associations' tracks are then (n, 2), and of which of them that is known."""
     keys = [
         np.stack([stream.publish_time_ns, stream["track_id"].astype(np.int64)], axis=1)
         for stream in (tracks, associations)
@@ -217,7 +217,7 @@ def _places_of(tracks: Stream, associations: Stream) -> tuple[Floats, NDArray[np
 
 
 def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
-    """When tracks of a tracker are confirmed, and when they end."""
+    """Yield when tracks of a tracker are confirmed, and when they end."""
     numbers, times = tracks["track_id"].astype(np.int64), tracks.publish_time_ns
     scans_ns = dict(scene.outputs_of("", schemas.ESTIMATE_SIZE))[name].publish_time_ns
     for number in np.unique(numbers):
@@ -229,7 +229,7 @@ def _life(scene: Scene, name: str, tracks: Stream) -> Iterator[Happened]:
 
 
 def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happened]:
-    """When a target goes on with another track than before."""
+    """Yield when a target goes on with another track than before."""
     for target, track in enumerate(errors.track, start=1):
         followed = np.flatnonzero(track != NONE)
         for row in np.flatnonzero(np.diff(track[followed])):
@@ -239,7 +239,7 @@ def _switches(name: str, at_ns: Integers, errors: TrackErrors) -> Iterator[Happe
 
 
 def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers, dict[str, TrackErrors]]:
-    """By tracker its errors at instants; none where the log has nothing to judge by."""
+    """Return by tracker its errors at instants; none where the log has nothing to judge by."""
     try:
         judged = instants_of(scene.source)
     except BadInput:
@@ -254,7 +254,7 @@ def _errors(scene: Scene, trackers: list[tuple[str, Stream]]) -> tuple[Integers,
 def _draw_gospa(
     canvas: Canvas, scene: Scene, at_ns: Integers, errors: Mapping[str, TrackErrors]
 ) -> rrb.TimeSeriesView:
-    """GOSPA at the instants."""
+    """Plot GOSPA at the instants."""
     for name, of_tracker in errors.items():
         draw_curve(canvas, "plots/gospa", name, scene.colour(name), at_ns, of_tracker.gospa, LINE)
     extent = below_legend([of_tracker.gospa for of_tracker in errors.values()])
@@ -262,7 +262,7 @@ def _draw_gospa(
 
 
 def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
-    """How many tracks there are."""
+    """Plot how many tracks there are."""
     drawn = []
     for name, sizes in scene.outputs_of("", schemas.ESTIMATE_SIZE):
         counts = sizes["elements"].astype(float)
@@ -274,7 +274,7 @@ def _draw_counts(canvas: Canvas, scene: Scene) -> rrb.TimeSeriesView:
 def _draw_existence(
     canvas: Canvas, scene: Scene, trackers: list[tuple[str, Stream]]
 ) -> rrb.TimeSeriesView:
-    """How probable it is that each track of the first tracker exists."""
+    """Plot how probable it is that each track of the first tracker exists."""
     existence = dict(scene.outputs_of("", schemas.EXISTENCE))
     for name, tracks in trackers[:1]:
         numbers = tracks["track_id"].astype(np.int64)

@@ -121,7 +121,7 @@ def draw(canvas: Canvas, scene: Scene) -> rrb.Container | rrb.View:
 
 
 def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """NEES of a case, named by it."""
+    """Plot NEES of a case, named by it."""
     views = draw_nees(canvas, scene, case)
     for view in views:
         view.name = f"NEES of {case}"
@@ -129,7 +129,7 @@ def _nees(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
 
 
 def _own(canvas: Canvas, scene: Scene, case: str) -> list[rrb.TimeSeriesView]:
-    """Mode probabilities and effective particles of a case, named by it."""
+    """Plot mode probabilities and effective particles of a case, named by it."""
     views = [*draw_modes(canvas, scene, case), *draw_effective(canvas, scene, case)]
     for view in views:
         view.name = f"{view.name}, {case}"
@@ -146,7 +146,7 @@ def _truths(scene: Scene) -> Vehicles:
 
 
 def _tracks(scene: Scene, name: str, vehicles: Vehicles) -> Floats:
-    """An estimator's places (steps, vehicles, 2) at the truth's stamps, NaN where there is none."""
+    """Return an estimator's places (steps, vehicles, 2) at the truth's stamps, NaN where it has none."""
     topics = [f"/estimates/{name}/vehicle{n + 1}/state" for n in range(vehicles.number)]
     found = [scene.outputs[topic] for topic in topics if topic in scene.outputs]
     found = [stream for stream in found if set(PLANE) <= set(stream.components)]
@@ -164,7 +164,7 @@ def _points(scene: Scene, topic: str) -> Points:
 
 
 def _registered(scene: Scene) -> list[tuple[str, Points]]:
-    """The infrastructure sensor's detections, placed by each estimator that finds its pose."""
+    """Return the infrastructure sensor's detections, placed by each estimator that finds its pose."""
     raw = _points(scene, "/infrastructure/detection")
     found = []
     for name, stream in scene.outputs_of("infrastructure", schemas.GAUSSIAN_ESTIMATE):
@@ -179,7 +179,7 @@ def _registered(scene: Scene) -> list[tuple[str, Points]]:
 
 
 def _links(scene: Scene) -> tuple[Times, Floats, NDArray[np.int64]]:
-    """Lines (n, 2, 2) from predicted places to the fixes associated with them, and their vehicles.
+    """Return lines (n, 2, 2) from predicted places to associated fixes, and their vehicles.
 
     Of the first estimator that says which detections it took.
     """
@@ -201,7 +201,7 @@ def _links(scene: Scene) -> tuple[Times, Floats, NDArray[np.int64]]:
 
 
 def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]) -> None:
-    """Paths of truth and estimators, fixes without identity, and registered detections."""
+    """Draw paths of truth and estimators, fixes without identity, and registered detections."""
     root = f"{ROOT}/map"
     for n in range(vehicles.number):
         stroke = Stroke(TRUTH, 2.5)
@@ -219,7 +219,7 @@ def _draw_map(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str
 
 
 def _draw_close(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]) -> None:
-    """Everything about each vehicle's true place, the vehicles side by side."""
+    """Draw everything about each vehicle's true place, the vehicles side by side."""
     corners = CELL_M * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
     centres = np.stack([CELL_M * np.arange(vehicles.number), np.zeros(vehicles.number)], axis=1)
     frames = rr.LineStrips2D(
@@ -239,7 +239,7 @@ def _draw_close(canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[s
     canvas.fix(f"{CLOSE}/truth", truth)
 
     def near(points: Points) -> Points:
-        """Points in the cells of all vehicles they are near to."""
+        """Return points in the cells of all vehicles they are near to."""
         apart = points.places[:, None] - vehicles.places[vehicles.rows(points.time_ns)]
         row, cell = np.nonzero(np.abs(apart).max(axis=2, initial=0.0) < SHOWN_M)
         return Points(points.time_ns[row], apart[row, cell] + centres[cell])
@@ -278,7 +278,7 @@ def _draw_ellipse(
     stream: Stream,
     centre: Floats,
 ) -> None:
-    """An estimate's 95 % ellipse about its vehicle's true place."""
+    """Draw an estimate's 95 % ellipse about its vehicle's true place."""
     place = read_vectors(stream, "mean", PLANE)
     apart = place - vehicles.places[vehicles.rows(stream.publish_time_ns), n]
     covariance = covariances_of(stream, PLANE)
@@ -294,7 +294,7 @@ def _draw_ellipse(
 
 
 def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
-    """The fixes by latitude and longitude, where there are some."""
+    """Draw the fixes by latitude and longitude, where there are some."""
     topics = [topic for topic in scene.source.topics if topic.endswith("/geodetic_fix")]
     fixes = [stream for topic in topics if len(stream := scene.read(topic))]
     for stream in fixes:
@@ -306,7 +306,7 @@ def _geodetic_views(canvas: Canvas, scene: Scene) -> list[rrb.MapView]:
 def _draw_errors(
     canvas: Canvas, scene: Scene, vehicles: Vehicles, tracks: dict[str, Floats]
 ) -> list[rrb.TimeSeriesView]:
-    """All vehicles' error together, labels as they are, and GOSPA, which sees none."""
+    """Plot all vehicles' error together, labels as they are, and GOSPA, which sees none."""
     for name, places in tracks.items():
         known = np.isfinite(places).all(axis=(1, 2))
         there, truths = places[known], vehicles.places[known]

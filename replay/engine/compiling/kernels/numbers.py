@@ -28,7 +28,7 @@ class Number(NamedTuple):
 
     @property
     def type(self) -> str:
-        """Name LLVM's type."""
+        """Name its type as LLVM does."""
         return WHOLE if self.kind == WORD else self.kind
 
 
