@@ -247,7 +247,12 @@ def _in_order(ragged: Ragged, order: Clock) -> Events:
 
 
 def last_of_equals(offsets: NDArray[np.int64], *columns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell whether a row (n,) is the last of its run, or the next one differs in one of the columns."""
+    """Tell whether a row (n,) is the last of its run, or the next one differs in one of the columns.
+
+    Args:
+        offsets: (runs + 1,), where the rows of each run begin.
+        columns: (n,) each.
+    """
     is_last = np.zeros(len(columns[0]), bool)
     for column in columns:
         is_last[:-1] |= column[1:] != column[:-1]
