@@ -16,7 +16,7 @@ _RENAMED = {"Told": "Diagnostics"}  # names of the release before
 
 
 def _names() -> dict[str, tuple[str, str]]:
-    """For each public name its module, and what it is called there."""
+    """Return for each public name its module, and what it is called there."""
     stub = ast.parse((_HERE / "__init__.pyi").read_text(encoding="utf-8"))
     return {
         alias.asname or alias.name: (node.module or "", alias.name)

@@ -41,7 +41,7 @@ class Expressions(Scope):
     """Represents one function while its expressions are lowered."""
 
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
-        """`yes if condition else no`."""
+        """Lower `yes if condition else no`."""
         raise NotImplementedError
 
     # --- expressions ---

@@ -288,7 +288,7 @@ class _Lowering(Frame):
         self.begin(after)
 
     def chosen(self, condition: Number, yes: ast.expr, no: ast.expr) -> Any:
-        """`yes if condition else no`, of which one is computed."""
+        """Lower `yes if condition else no`, of which one is computed."""
         labels, after, before = (
             (self.label("then"), self.label("else")),
             self.label("after"),
