@@ -148,8 +148,9 @@ def move(mean: Floats, covariance: Floats, density: float, duration_s: float) ->
     """Predict with constant velocity, in place.
 
     Args:
-        mean, covariance: (n,), positions in m, then velocities; (n, n).
-        density, duration_s: of the acceleration's noise; how long.
+        mean, covariance: (n,), positions in m, then velocities in m/s; (n, n).
+        density: power spectral density of the acceleration, in m^2/s^3.
+        duration_s: how long.
     """
     predict_constant_velocity(
         mean, covariance, duration_s, (1, len(mean) // 2), noise_moments(density, duration_s)

@@ -269,7 +269,7 @@ def thin_curve(time_ns: Times, values: Floats, rows: int = DRAWN_ROWS) -> NDArra
 
     Args:
         time_ns, values: (n,), in order of time.
-        rows: how many at most, about.
+        rows: how many at most.
     """
     if len(time_ns) <= rows:
         return np.arange(len(time_ns))
