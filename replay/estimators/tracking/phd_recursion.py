@@ -169,7 +169,7 @@ def add_detected(
         run: which.
         parents: how many components there are.
         place: of the detection, (2,), in m.
-        mixture: before the scan.
+        mixture: as predicted, its weights before survival.
         settings: of the filter.
         work: with what `prepare` filled of each component; its components are appended to.
         end: how many of these there are.

@@ -172,7 +172,7 @@ def _draw_associations(canvas: Canvas, scene: Scene, name: str, tracks: Stream) 
 
 
 class Joined(NamedTuple):
-    """The detections of a sensor as trackers take them: by row of the scan, relative to the sensor."""
+    """Holds a sensor's detections as trackers take them: by row of the scan, relative to the sensor."""
 
     scan: Integers
     place: Floats
