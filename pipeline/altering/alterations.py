@@ -59,7 +59,15 @@ def _scaled(field: str, entry: int | None, stream: Stream, factor: float) -> Str
 
 
 def mixed(field: str, matrix: NDArray[np.float64]) -> Callable[[Stream], Stream]:
-    """A vector is multiplied by a matrix, as where a sensor's axes are not at right angles."""
+    """Make the alteration that multiplies a vector by a matrix, as where axes are not at right angles.
+
+    Args:
+        field: a vector of three components.
+        matrix: (3, 3), from the left.
+
+    Returns:
+        A function of a stream, which returns the altered one.
+    """
     return lambda stream: _with(stream, **{field: stream[field] @ matrix.T})
 
 
@@ -148,7 +156,15 @@ def _permuted(field: str, order: tuple[int, ...], stream: Stream, _: float) -> S
 
 
 def heading_turned(stream: Stream, angle: float | NDArray[np.float64]) -> Stream:
-    """Orientations, or those of a Gaussian estimate, are turned about the vertical by angles in rad."""
+    """Turn the orientations of a stream, or those of a Gaussian estimate, about the vertical.
+
+    Args:
+        stream: n messages with a quaternion, or with means that hold one.
+        angle: in rad, anticlockwise from above: one, or (n,), one for each message.
+
+    Returns:
+        The altered stream.
+    """
     half = 0.5 * np.asarray(angle, float)
     about = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
     if "quaternion" in stream.columns:

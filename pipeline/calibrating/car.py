@@ -96,7 +96,19 @@ def drive(
     errors: Floats = TRUTH,
     steps: Steps = STEPS,
 ) -> Measured:
-    """Drive, with errors (7,) as `TRUTH` has them; without noise where there is no seed."""
+    """Simulate a drive of the car, and what its sensors measure.
+
+    Args:
+        seed: of the noise and of the first pose; without one there is no noise, and the car starts at
+            zero.
+        motion: gives speeds in m/s and turn rates in rad/s at times (n,) in s.
+        duration_s: how long it drives.
+        errors: (7,), what is wrong with the sensors, as `TRUTH` has it.
+        steps: how often each sensor measures.
+
+    Returns:
+        What was measured, with its stamps.
+    """
     step_s = steps.odometry_s
     n, m = round(duration_s / step_s), round(duration_s / steps.fix_s) - 1
     fix_s = steps.fix_s * (2.0 + np.arange(m))

@@ -51,7 +51,14 @@ class Gain(NamedTuple):
 
 
 def gain(known: Floats, added: Floats) -> Gain:
-    """Return what an information (m, m), in useful units, adds to what is known (m, m).
+    """Compute what the information of a manoeuvre adds to what is known.
+
+    Args:
+        known: (m, m), in useful units.
+        added: (m, m), in useful units; both together are positive definite.
+
+    Returns:
+        The information gained, and the standard deviations (m,) that are left.
 
     >>> found = gain(np.diag([4.0, 1.0]), np.diag([0.0, 3.0]))
     >>> round(found.nats, 3), found.sigmas.tolist()

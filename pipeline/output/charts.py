@@ -172,7 +172,17 @@ def curve(
 def path(
     label: str, points: NDArray[np.float64], style: Style = "line", *, reference: bool = False
 ) -> Series:
-    """Points (n, 2) over the plane."""
+    """Return a series of points in the plane.
+
+    Args:
+        label: its name in the legend.
+        points: (n, 2), x and y.
+        style: how it is drawn.
+        reference: whether it is what others are compared with.
+
+    Returns:
+        The series, for `Panel.series`.
+    """
     return curve(label, points[:, 0], points[:, 1], style, reference=reference)
 
 
@@ -193,13 +203,32 @@ def band(label: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, reference
 
 
 def level(label: str, x: ArrayLike, y: float) -> Series:
-    """Return a value that others are seen against, from end to end."""
+    """Return a value that others are compared with, from end to end.
+
+    Args:
+        label: its name in the legend.
+        x: (n,), numbers or names; only the first and the last count.
+        y: the value.
+
+    Returns:
+        The series, for `Panel.series`.
+    """
     ends = np.asarray(x)[[0, -1]]
     return curve(label, ends, [y, y], reference=True)
 
 
 def interval(label: str, x: ArrayLike, low: float, high: float) -> Band:
-    """Draw one range that others are seen against, from end to end."""
+    """Return one range that others are compared with, from end to end.
+
+    Args:
+        label: its name in the legend.
+        x: (n,), numbers or names; only the first and the last count.
+        low: its lower end.
+        high: its upper end.
+
+    Returns:
+        The band, for `Panel.bands`.
+    """
     ends = np.asarray(x)[[0, -1]]
     return band(label, ends, [low, low], [high, high], reference=True)
 

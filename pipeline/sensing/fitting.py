@@ -148,7 +148,15 @@ def _objective(samples: Samples, free: Sequence[str]) -> Objective:
 
 
 def of_point(free: Sequence[str], point: Floats) -> Terms:
-    """Return the terms whose free numbers have these logarithms."""
+    """Return the terms whose free numbers have these logarithms.
+
+    Args:
+        free: the names of the p numbers, as fields of `Terms`.
+        point: (p,), their natural logarithms.
+
+    Returns:
+        The terms; all other numbers are as `Terms` has them by default.
+    """
     return Terms(**dict(zip(free, np.exp(point).tolist(), strict=True)))
 
 

@@ -100,7 +100,15 @@ def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
 
 
 def at_rest(values: Floats, step_s: float) -> MemorySource:
-    """Values (n,) as the turn rate of a log, in `TURN`."""
+    """Make a log whose turn rate `TURN` has these values.
+
+    Args:
+        values: (n,), in rad/s.
+        step_s: the time between two of them.
+
+    Returns:
+        The log, which begins at time 0.
+    """
     stream = make_stream(
         TURN.partition(".")[0],
         schemas.ODOMETRY,

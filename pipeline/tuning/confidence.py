@@ -76,7 +76,15 @@ class SearchOutcome(NamedTuple):
 
 
 def confidence(places: Sequence[int], curvature: Floats) -> Confidence:
-    """Compute what a curvature (m, m) tells of the parameters at these places."""
+    """Compute what a curvature tells of the parameters.
+
+    Args:
+        places: (m,), the places of these parameters among all k.
+        curvature: (m, m), the second derivatives of the cost, by coordinates.
+
+    Returns:
+        The covariance, with infinite variances of what the cost does not rise along.
+    """
     values, vectors = np.linalg.eigh(curvature)
     rises = values > 0.0
     covariance = (vectors / np.where(rises, values, np.inf)) @ vectors.T
@@ -178,7 +186,17 @@ class Profile(NamedTuple):
 def profiles(
     cost: Cost, coordinates: Coordinates, point: Floats, confidence: Confidence
 ) -> list[Profile]:
-    """The profiles of all parameters that have a standard error, about the point (k,) of least cost."""
+    """Compute the profiles of all parameters that have a standard error.
+
+    Args:
+        cost: minus the log-likelihood, by values (n, k).
+        coordinates: what was searched over.
+        point: (k,), the coordinates of the least cost.
+        confidence: by the curvature there.
+
+    Returns:
+        A profile for each such parameter, over `PROFILE_POINTS` values.
+    """
     found = []
     for index, place in enumerate(confidence.places):
         error, free = confidence.errors[index], coordinates.free[place]

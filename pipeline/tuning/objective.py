@@ -380,7 +380,13 @@ def _as_noted(opened: Initialized, *_: Any) -> Initialized:
 
 
 def with_values(settings: Mapping[str, Any], names: Sequence[str], values: Floats) -> dict[str, Any]:
-    """Settings with these values (k,) of parameters by their full names."""
+    """Return settings in which parameters have other values.
+
+    Args:
+        settings: they stay as they are.
+        names: the parameters, by their full names.
+        values: (k,), what these become.
+    """
     pairs = zip(names, values.tolist(), strict=True)
     return reduce(merge, (nested(name, value) for name, value in pairs), dict(settings))
 

@@ -163,11 +163,20 @@ def least_of_grid(cost: Cost, coordinates: Coordinates, points: int) -> Floats:
 def least(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
 ) -> tuple[Floats, bool]:
-    """Find where the cost is least (k,), from a start (k,) on, and whether the search came to its end.
+    """Find where the cost is least.
 
-    In coordinates. A descent from far off can end in another minimum than the least, such as one in
-    which two modes have changed their parts. So it begins, and ends, where no change of a single
-    parameter by one of `FACTORS` costs less.
+    A descent from far off can end in another minimum than the least, such as one in which two modes have
+    changed their parts. So it begins, and ends, where no change of a single parameter by one of
+    `FACTORS` costs less.
+
+    Args:
+        cost: what values (n, k) cost.
+        coordinates: what is searched over.
+        start: (k,), in coordinates.
+        is_smooth: whether the cost has a gradient, so that the search may follow it.
+
+    Returns:
+        Where the cost is least (k,), in coordinates, and whether the search came to its end.
     """
     point = _scanned(cost, coordinates, start)
     while True:
@@ -249,9 +258,16 @@ def _minimum(
 
 
 def curvature(cost: Cost, coordinates: Coordinates, point: Floats, places: Sequence[int]) -> Floats:
-    """Return the second derivatives (m, m) of the cost at a point (k,), by m of its coordinates.
+    """Compute the second derivatives of the cost at a point.
 
-    They are not finite where the cost beside the point is not.
+    Args:
+        cost: what values (n, k) cost.
+        coordinates: what is searched over.
+        point: (k,), in coordinates.
+        places: by which m of the k coordinates.
+
+    Returns:
+        (m, m), by coordinates; not finite where the cost beside the point is not.
     """
     m, h = len(places), CURVATURE_STEP
     along = h * np.eye(len(point))[list(places)]

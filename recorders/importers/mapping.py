@@ -337,9 +337,14 @@ def _turned_back(quaternion: NDArray, turn: Rotation) -> NDArray:
 
 
 def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Return which messages (n,) lack a number that they must have, or have none at all.
+    """Find the messages that lack a number that they must have, or have none at all.
 
-    `columns` may be without some fields.
+    Args:
+        schema: of the messages.
+        columns: by field, (n,) or (n, width) each; some fields may be missing.
+
+    Returns:
+        (n,), whether a message is such.
     """
     size = len(next(iter(columns.values())))
     lacks, finite = np.zeros(size, bool), []
@@ -357,9 +362,17 @@ def not_finite(schema: Schema, columns: Mapping[str, NDArray]) -> NDArray[np.boo
 
 
 def checked(where: str, field: str, column: NDArray) -> NDArray:
-    """A column's values; raises BadInput, which begins with `where`, for such as nothing can mean.
+    """Return a column's values; where one may be missing, infinite ones become NaN.
 
-    Where a value may be missing, infinite ones become NaN.
+    Args:
+        where: what a message begins with.
+        field: the schema's.
+        column: (n,) or (n, width), in the field's unit.
+
+    Returns:
+        The same shape; quaternions are scaled to unit length.
+
+    Raises BadInput for values that nothing can mean.
     """
     limit = {"latitude_deg": 90.0, "longitude_deg": 180.0}.get(field)
     if limit is not None and len(column) and np.abs(column).max() > limit:

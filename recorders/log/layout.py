@@ -63,7 +63,15 @@ class Layout:
 
 
 def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
-    """Return the schema's columns, copied out of records; an empty vector has shape (n, 0)."""
+    """Copy the schema's columns out of records.
+
+    Args:
+        schema: of the records.
+        records: (n,), as of `Layout.parse`.
+
+    Returns:
+        By field, (n,) or (n, width); an empty vector has shape (n, 0).
+    """
     return {
         field.name: np.ascontiguousarray(records[field.name])
         if field.name in (records.dtype.names or ())
@@ -73,7 +81,15 @@ def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """Every run of `size` bytes of `data` as one opaque item, without a copy: gathers and scatters."""
+    """View every run of some bytes as one opaque item, without a copy: gathers and scatters.
+
+    Args:
+        data: (n,), the bytes.
+        size: how many make an item.
+
+    Returns:
+        (n - size + 1,), the items that begin at each byte.
+    """
     return np.ndarray((len(data) - size + 1,), _opaque(size), data.data, strides=(1,))
 
 

@@ -169,7 +169,19 @@ def stream_of(
     metadata: Mapping[str, str] | None = None,
     allow_nan: bool = False,
 ) -> Stream:
-    """Make a stream as `make_stream` does, of all columns by name; `allow_nan` lets NaN stand in any."""
+    """Make a stream as `make_stream` does, of all columns by name.
+
+    Args:
+        topic: its name.
+        schema: of its messages.
+        publish_time_ns: (n,), when the quantity was measured.
+        given: by field, (n,), or (n, width) for a vector; one that may be absent need not be given.
+        log_time_ns: (n,), when it reached the recorder; by default when it was measured.
+        metadata: what the channel states, as text.
+        allow_nan: whether any column may hold NaN.
+
+    Raises BadInput as `make_stream` does.
+    """
     published = _as_column(topic, "publish_time_ns", publish_time_ns)
     logged = published if log_time_ns is None else _as_column(topic, "log_time_ns", log_time_ns)
     # an empty vector is as good as an absent one
@@ -202,7 +214,15 @@ def computed_stream(
     columns: Mapping[str, NDArray],
     metadata: Mapping[str, str],
 ) -> Stream:
-    """Make a stream of columns that a kernel filled as the schema says, which nobody needs to check."""
+    """Make a stream of columns that a kernel filled as the schema says, which nobody needs to check.
+
+    Args:
+        topic: its name.
+        schema: of its messages.
+        time_ns: (n,), both of its clocks.
+        columns: by field, (n,) or (n, width).
+        metadata: what the channel states, as text.
+    """
     return Stream(topic, schema, time_ns, time_ns, columns, np.arange(len(time_ns)), metadata)
 
 

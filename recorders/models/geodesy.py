@@ -25,7 +25,15 @@ def earth_centred(
 
 
 def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[np.float64]:
-    """Return east, north and up at places (...,) as rows (..., 3, 3), in earth-centred axes."""
+    """Compute the directions east, north and up at places on WGS 84, in earth-centred axes.
+
+    Args:
+        latitude_deg: (...).
+        longitude_deg: (...).
+
+    Returns:
+        (..., 3, 3), unit vectors as rows.
+    """
     latitude, longitude = np.radians(latitude_deg), np.radians(longitude_deg)
     zero = np.zeros_like(latitude)
     rows = (

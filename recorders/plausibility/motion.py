@@ -54,7 +54,12 @@ class Slope(NamedTuple):
 
 
 def slope(x: Floats, y: Floats) -> Slope:
-    """Return the slope of y (k,) on x (k,) through zero, over windows where both are known."""
+    """Compute the slope of y on x through zero, over windows where both are known.
+
+    Args:
+        x: (k,), NaN where it is not known.
+        y: (k,), as x.
+    """
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     xx, xy, yy = x @ x, x @ y, y @ y
@@ -67,7 +72,16 @@ def slope(x: Floats, y: Floats) -> Slope:
 
 
 def turn_between(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """By what angle a rate says that one turns in windows."""
+    """Compute by what angle a turn rate says that one turns in windows.
+
+    Args:
+        source: the turn rate in rad/s.
+        begin_s: (k,), where the windows begin.
+        end_s: (k,), where they end.
+
+    Returns:
+        (k,), in rad; NaN beyond the rate's stamps.
+    """
     return source.integral(end_s) - source.integral(begin_s)
 
 
@@ -259,7 +273,15 @@ class Motion:
 
 
 def heading_at(orientation: Series, times_s: Floats) -> Floats:
-    """Headings (k,) in rad at other times, not wrapped; NaN beyond the first and the last."""
+    """Interpolate headings at other times.
+
+    Args:
+        orientation: quaternions (n, 4).
+        times_s: (k,), the other times.
+
+    Returns:
+        (k,), in rad, not wrapped; NaN beyond the first and the last.
+    """
     angle = np.unwrap(heading(orientation.values))
     return np.interp(times_s, orientation.times_s, angle, left=np.nan, right=np.nan)
 

@@ -45,7 +45,15 @@ def noise_of(places: Floats) -> float:
 
 
 def pairs(times_s: Floats, span_s: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows of stamps that are a span apart, or a step where the steps are longer."""
+    """Find the pairs of stamps that are a span apart, or a step where the steps are longer.
+
+    Args:
+        times_s: (n,), ascending.
+        span_s: the span.
+
+    Returns:
+        The rows of the first and of the second stamps, (k,) each with k at most `MOST`.
+    """
     step_s = float(np.median(np.diff(times_s)))
     later = np.searchsorted(times_s, times_s + max(span_s, step_s) - 1e-6)
     first = np.flatnonzero(later < len(times_s))
@@ -64,7 +72,16 @@ def chords(fixes: Series, span_s: float) -> Windows:
 
 
 def travelled(source: Series, begin_s: Floats, end_s: Floats) -> Floats:
-    """Return how far a speed or velocity says that one comes in windows, forward or not."""
+    """Compute how far a speed or velocity says that one comes in windows, forward or not.
+
+    Args:
+        source: the speed or velocity in m/s.
+        begin_s: (k,), where the windows begin.
+        end_s: (k,), where they end.
+
+    Returns:
+        (k,), in m, none negative; NaN beyond the source's stamps.
+    """
     moved = source.integral(end_s) - source.integral(begin_s)
     return np.abs(moved) if source.values.ndim == 1 else np.linalg.norm(moved, axis=-1)
 

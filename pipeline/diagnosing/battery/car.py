@@ -56,7 +56,17 @@ class Car(NamedTuple):
 
 
 def arcs(heading_rad: Floats, speed_mps: Floats, turn_radps: Floats, duration_s: Floats) -> Floats:
-    """By how much poses (n, 3) change along exact arcs."""
+    """Compute how poses change along exact arcs.
+
+    Args:
+        heading_rad: (n,), before each step.
+        speed_mps: (n,), forward.
+        turn_radps: (n,), anticlockwise.
+        duration_s: (n,), of each step.
+
+    Returns:
+        (n, 3), what is added to x and y in m, and to the heading in rad.
+    """
     turned = turn_radps * duration_s
     chord = speed_mps * duration_s * np.sinc(0.5 * turned / np.pi)
     about = heading_rad + 0.5 * turned

@@ -212,7 +212,16 @@ def _found(genuine: Decisions, impostors: Decisions) -> dict[str, float]:
 
 
 def fixed_number(ratios: Floats, rates: Rates, rng: np.random.Generator) -> float:
-    """The least number of independent probes whose summed ratios hold both rates; NaN for none."""
+    """Find the least number of independent probes whose summed ratios hold both rates of error.
+
+    Args:
+        ratios: (users, users), log-likelihood ratios by probe and gallery entry.
+        rates: the rates to hold.
+        rng: draws the probes.
+
+    Returns:
+        The number; NaN where `FIXED_PROBES` are not enough.
+    """
     drawn = Drawn(ratios, np.arange(len(ratios)))
     same, other = np.zeros(IMPOSTORS), np.zeros(IMPOSTORS)
     for number in range(1, FIXED_PROBES + 1):
@@ -265,9 +274,17 @@ def watched(
 def labelled(
     drawn: Drawn, label: Floats, least: float, count: int, rng: np.random.Generator
 ) -> Labelled:
-    """About so many probes, half of them of the person; those that the others leave open are left out.
+    """Draw probes and label them by the other matchers; those that these leave open are left out.
 
-    `label` (users, users) is the summed ratio of the other matchers.
+    Args:
+        drawn: the matcher's ratios, and the users.
+        label: (users, users), the summed log-likelihood ratios of the other matchers.
+        least: beyond this such a ratio, of either sign, is a label.
+        count: how many are drawn, about half of them of the person.
+        rng: draws them.
+
+    Returns:
+        The probes that have a label.
     """
     probe, gallery = drawn.impostors(count, rng)
     probe = np.where(rng.random(count) < 0.5, gallery, probe)

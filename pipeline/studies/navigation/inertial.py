@@ -58,7 +58,16 @@ def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.Dat
 
 
 def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return what the last message before each stamp says; the topic speaks at every change."""
+    """Tell at which stamps a trial is marked as movement; the topic speaks at every change.
+
+    Args:
+        source: the log.
+        case: the trial, which begins the topic's name.
+        time_ns: (n,), the stamps.
+
+    Returns:
+        (n,), what the last message at or before each stamp says; False before the first.
+    """
     stream = source.read([f"/{case}/movement"])[f"/{case}/movement"]
     row = np.searchsorted(stream.publish_time_ns, time_ns, side="right") - 1
     return (row >= 0) & (stream["value"][row.clip(0), 0] != 0.0)

@@ -163,14 +163,30 @@ def errors_of(replayed: Replayed, trial: str, case: str) -> Iterator[dict[str, A
 
 
 def same_stamps(time_ns: Integers, wanted_ns: Integers) -> tuple[Integers, Any]:
-    """Return the rows (n,) of stamps that are wanted (n,), and which of these there are."""
+    """Find the rows of wanted stamps.
+
+    Args:
+        time_ns: (m,), ascending.
+        wanted_ns: (n,).
+
+    Returns:
+        Rows (n,) of `time_ns`, and (n,) whether the wanted stamp is there; only then its row counts.
+    """
     row = np.searchsorted(time_ns, wanted_ns).clip(0, max(len(time_ns) - 1, 0))
     known = time_ns[row] == wanted_ns if len(time_ns) else np.zeros(len(wanted_ns), bool)
     return row, known
 
 
 def error_angles(estimate: Floats, truth: Floats) -> ErrorAngles:
-    """The whole angle from the true orientations (n, 4) to the estimated ones, and its two parts."""
+    """Compute the angle between the true orientation and the estimated one, and its two parts.
+
+    Args:
+        estimate: (n, 4), quaternions from the body's axes to the earth's.
+        truth: (n, 4), as those.
+
+    Returns:
+        The whole angle, and the parts heading and inclination, (n,) each in rad, none negative.
+    """
     w, x, y, z = np.abs(compose(estimate, conjugate(truth)).T)
     return ErrorAngles(
         2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), w),

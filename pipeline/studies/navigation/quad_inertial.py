@@ -341,7 +341,17 @@ def fused_poses(units: Sequence[Stream]) -> tuple[Integers, Floats]:
 
 
 def pose_errors(flight: Flight, time_ns: Integers, pose: Floats, late_ns: int) -> dict[str, float]:
-    """RMSE at the stamps of the truth from `late_ns` on."""
+    """Compute the RMSE of a flight's poses at the stamps of the truth.
+
+    Args:
+        flight: has the truth.
+        time_ns: (m,), the stamps of the poses.
+        pose: (m, 10), position in m, velocity in m/s, orientation as a quaternion.
+        late_ns: stamps before are left out.
+
+    Returns:
+        By name: of position, horizontal position, velocity, and heading in deg.
+    """
     _, own, true = np.intersect1d(time_ns, flight.time_ns, return_indices=True)
     late = flight.time_ns[true] >= late_ns
     estimate, truth = pose[own[late]], flight.state[true[late]]

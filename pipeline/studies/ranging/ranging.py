@@ -119,7 +119,12 @@ def outcome_of(found: list[Replayed], rows: list[dict[str, Any]]) -> Outcome:
 
 
 def errors_chart(errors: Mapping[str, tuple[Integers, Floats]], label: str) -> Chart:
-    """Errors of every estimator (n,) over time, of one recording."""
+    """Draw every estimator's errors over time, of one recording.
+
+    Args:
+        errors: by estimator stamps in ns and errors, (n,) each.
+        label: of the axis of the errors, with their unit.
+    """
     begin_ns = min(int(time_ns[0]) for time_ns, _ in errors.values() if len(time_ns))
     panel = Panel(x=Axis(label="time (s)"), y=Axis(label=label, log=True))
     for name, (time_ns, error) in errors.items():

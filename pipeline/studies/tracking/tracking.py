@@ -52,11 +52,18 @@ def sets_of(outputs: Mapping[str, Ragged], label: str, run: int) -> tuple[Stream
 
 
 def figures_of(tracked: Sequence[TracksAt], truths: Floats) -> dict[str, float]:
-    """Return what the tracks of a run are worth, tracked at the instants of the truths (targets, k, 2).
+    """Compute what the tracks of a run are worth.
 
     Figures of whole tracks leave out those that are never within the cutoff of a target: a track's
-    length is the time from its first to its last instant, and trajectory GOSPA is divided by the root
-    of the number of instants, so that it is as large as GOSPA.
+    length is the time from its first to its last instant, and trajectory GOSPA is divided by the root of
+    the number of instants, so that it is as large as GOSPA.
+
+    Args:
+        tracked: the tracks at k instants.
+        truths: (targets, k, 2), where the targets are at these, in m; NaN where one is not there.
+
+    Returns:
+        The figures by name.
     """
     tracks = as_trajectories(tracked)
     away = np.linalg.norm(tracks[:, None] - truths[None], axis=3)

@@ -124,7 +124,16 @@ class Messages:
 def by_size(
     data: NDArray[np.uint8], begins: NDArray[np.int64], lengths: NDArray[np.int64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
-    """The bytes (k, size) of the messages (n,) within `data`, by size, and which of the n each is."""
+    """Yield the bytes of messages, those of one size together.
+
+    Args:
+        data: holds all of them.
+        begins: (n,), at which byte of `data` each message begins.
+        lengths: (n,), how many bytes each has.
+
+    Yields:
+        Which k of the n messages have a size (k,), and their bytes (k, size).
+    """
     for size in np.unique(lengths).tolist():
         which = np.flatnonzero(lengths == size)
         if size:

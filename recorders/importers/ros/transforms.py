@@ -51,7 +51,11 @@ class Transforms:
 def transforms_of(
     messages: Messages, log_time_ns: NDArray[np.int64]
 ) -> Iterator[tuple[Pair, Transforms]]:
-    """Yield the transforms in messages (n,), by parent and child.
+    """Yield the transforms in messages, by parent and child.
+
+    Args:
+        messages: n of them.
+        log_time_ns: (n,), the stamps of the recorder.
 
     Raises BadInput where a quaternion is not of unit length.
     """
@@ -169,7 +173,15 @@ class Chain:
 
 
 def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
-    """Transforms at other stamps (n,), which lie within those of the given ones."""
+    """Interpolate transforms at other stamps, linearly and along the shortest rotation.
+
+    Args:
+        given: transforms in the order of their stamps.
+        stamp_ns: (n,), within those of the given ones.
+
+    Returns:
+        n transforms; their other stamps and their rows have no meaning.
+    """
     last = len(given) - 1
     after = np.clip(np.searchsorted(given.stamp_ns, stamp_ns), 0, last)
     before = np.maximum(after - (given.stamp_ns[after] > stamp_ns), 0)

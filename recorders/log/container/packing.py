@@ -22,10 +22,12 @@ class Chunk(NamedTuple):
 
 
 def chunks_of(parts: Sequence[NDArray[np.void]], chunk_bytes: int) -> Iterator[Chunk]:
-    """Merge the message records of several channels into chunks of about `chunk_bytes`.
+    """Merge the message records of several channels into chunks.
 
-    Each part holds one channel's records as of `Layout.build`, in log-time order; ties keep the order
-    given.
+    Args:
+        parts: one channel's records each, as of `Layout.build`, in log-time order; ties keep the order
+            given.
+        chunk_bytes: about how large a chunk is.
     """
     lengths = [len(part) for part in parts]
     log_times = np.concatenate([part["mcap log_time"] for part in parts])
