@@ -27,17 +27,17 @@ NAMES = (
 
 
 def rich(time_s: Floats) -> tuple[Floats, Floats]:
-    """Speed and turn rate that determine everything."""
+    """Return a speed and a turn rate that determine everything."""
     return 8.0 + 3.0 * np.sin(0.4 * time_s), 0.25 * np.sin(0.21 * time_s) + 0.15 * np.sin(0.53 * time_s)
 
 
 def straight(time_s: Floats) -> tuple[Floats, Floats]:
-    """Straight on at 8 m/s."""
+    """Drive straight on at 8 m/s."""
     return np.full_like(time_s, SPEED_MPS), 0.0 * time_s
 
 
 def changing_speed(time_s: Floats) -> tuple[Floats, Floats]:
-    """Straight on, now slower and now faster."""
+    """Drive straight on, now slower and now faster."""
     return SPEED_MPS + 4.0 * np.sin(0.4 * time_s), 0.0 * time_s
 
 
@@ -47,7 +47,7 @@ def circle(time_s: Floats) -> tuple[Floats, Floats]:
 
 
 def circles(time_s: Floats) -> tuple[Floats, Floats]:
-    """Such circles to the left and to the right, in turn."""
+    """Drive such circles to the left and to the right, in turn."""
     is_left = time_s // CIRCLE_S % 2 == 0
     return np.full_like(time_s, SPEED_MPS), np.where(is_left, 0.4, -0.4)
 

@@ -253,7 +253,7 @@ def _places(values: ArrayLike) -> Places:
 
 
 def _numbers(values: ArrayLike) -> Numbers:
-    """Numbers as JSON has them, to seven digits, which no screen resolves; NaN and infinity are null."""
+    """Write numbers as JSON has them, to seven digits, as no screen shows more; NaN becomes null."""
     array = np.asarray(values, dtype=float)
     return [float(f"{value:.7g}") if np.isfinite(value) else None for value in array.tolist()]
 
@@ -285,7 +285,7 @@ def draw(chart: Chart) -> "Figure":
 
 
 def _height_in(panel: Panel) -> float:
-    """How high a panel is: of a plane with limits as high as these ask for."""
+    """Choose how high a panel is: of a plane with limits as high as these ask for."""
     if panel.plane and panel.x.limits and panel.y.limits:
         wide, high = panel.x.limits[1] - panel.x.limits[0], panel.y.limits[1] - panel.y.limits[0]
         return min(4.5, 7.0 * high / wide + 0.9)
@@ -326,12 +326,12 @@ def _draw_panel(axes: "Axes", panel: Panel, colours: dict[str, str]) -> None:
 
 
 def _known(values: Places) -> list[Any]:
-    """Values as matplotlib has them: NaN where there is none."""
+    """Return values as matplotlib has them: NaN where there is none."""
     return [math.nan if value is None else value for value in values]
 
 
 def show_names_as_they_are(figure: "Figure") -> None:
-    """Titles, labels and stated ticks hold names from logs: a dollar sign in them begins no formula."""
+    """Keep a dollar sign in titles, labels and ticks from beginning a formula: names hold some."""
     from matplotlib.ticker import FixedFormatter, FuncFormatter
 
     legends = [*figure.legends, *filter(None, (axes.get_legend() for axes in figure.axes))]

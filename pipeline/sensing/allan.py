@@ -36,7 +36,7 @@ def multiples_of(count: int) -> Integers:
 
 
 def _stride(multiple: int, count: int) -> int:
-    """Every how many differences are looked at: neighbours of long windows are nearly the same."""
+    """Return every how many differences are looked at: neighbours of long windows are alike."""
     return max(1, multiple // _A_WINDOW) if count > _FULL else 1
 
 

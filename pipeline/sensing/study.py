@@ -66,7 +66,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def _looked_at(seed: int) -> dict[str, Any]:
-    """Of one unit what is found, and which intervals hold the truth."""
+    """Find one unit's noise, and which intervals hold the truth."""
     values = unit(seed, SIZE, TERMS, STEP_S)
     [column] = noise(at_rest(values, STEP_S), TURN).columns
     low, high = interval(column.curve.deviations, column.degrees)
@@ -83,7 +83,7 @@ def _looked_at(seed: int) -> dict[str, Any]:
 
 
 def unit(seed: int, size: int, terms: Terms, step_s: float) -> Floats:
-    """Samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
+    """Draw samples (size,) of one column: white noise, walk, Gauss-Markov noise, quantised angle.
 
     A seed draws the same numbers for all terms, whichever there are.
     """

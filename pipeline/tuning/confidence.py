@@ -42,7 +42,7 @@ class Confidence(NamedTuple):
 
     @property
     def correlation(self) -> Floats:
-        """(m, m); NaN where a variance is infinite."""
+        """Return the correlations (m, m); NaN where a variance is infinite."""
         with np.errstate(invalid="ignore"):
             return self.covariance / np.outer(self.errors, self.errors)
 
@@ -115,7 +115,7 @@ def unknown(confidence: Confidence, coordinates: Coordinates) -> list[int]:
 
 
 def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Floats, float]]:
-    """The directions (m,), of length one, along which the cost hardly rises, and its curvature there.
+    """Yield the unit directions (m,) along which the cost hardly rises, and its curvature there.
 
     By the eigenvalues of the curvature in useful units: two standard errors that are useful, a factor of
     2.7, or `UNIT` standard errors that a parameter without a useful one has alone.
@@ -134,18 +134,18 @@ def _weak(confidence: Confidence, coordinates: Coordinates) -> Iterator[tuple[Fl
 
 
 def _involved(direction: Floats) -> list[int]:
-    """The places of a direction (m,) that count, the first most."""
+    """Return the places of a direction (m,) that count, the first most."""
     order = np.argsort(-np.abs(direction)).tolist()
     return [place for place in order if abs(direction[place]) > INVOLVED]
 
 
 def _factor(value: float) -> float:
-    """Within what factor a positive parameter is known that alone has this curvature."""
+    """Compute within what factor a positive parameter is known that alone has this curvature."""
     return float(np.exp(min(QUANTILE / np.sqrt(max(value, 1e-12)), 700.0)))
 
 
 def _in_words(direction: Floats, value: float, free: Sequence[Free]) -> str:
-    """What it means that the cost has only this curvature along a direction (m,) of length one."""
+    """Say what it means that the cost has only this curvature along a unit direction (m,)."""
     names = [each.name for each in free]
     first, *others = _involved(direction)
     if not others and free[first].useful:

@@ -112,7 +112,7 @@ def _innovations(objective: Objective, values: Floats, run: Run) -> dict[str, St
 
 
 def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | None) -> Floats:
-    """The difference of innovations, message by message, by the covariances of those between (n m,).
+    """Compute a difference of innovations by message, by the covariances of those between (n m,).
 
     A delay changes the order among topics, never within one.
     """
@@ -129,7 +129,7 @@ def _whitened_difference(here: Stream, ahead: Stream | None, behind: Stream | No
 
 
 def _sparse(directions: Floats) -> Floats:
-    """The same span (d, m) by directions of as few parameters each as elimination leaves."""
+    """Span the same (d, m) by directions of as few parameters each as elimination leaves."""
     rows = directions.copy()
     for number in range(len(rows)):
         rest = np.abs(rows[number:])

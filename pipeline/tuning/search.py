@@ -128,7 +128,7 @@ def coordinates_of(cost: Cost, free: Sequence[Free]) -> Coordinates:
 
 
 def _unit(near: Callable[[Sequence[float]], Floats], each: Free) -> tuple[float, Floats]:
-    """UNIT standard errors of one parameter alone, by the curvature about the start; the last costs."""
+    """Find UNIT standard errors of one parameter alone, by the curvature about the start, and costs."""
     step = 1e-3 * max(abs(each.start), 1.0)
     for _ in range(LOOKS):  # the cost is no parabola: look closer, or further
         costs = near([-step, 0.0, step])
@@ -187,7 +187,7 @@ def least(
 
 
 def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
-    """A point (k,) from which no change of one positive parameter costs less: the start, or another."""
+    """Find a point (k,) from which no change of one positive parameter costs less."""
     low, high = coordinates.bounds
     changes = np.concatenate(
         [
@@ -210,7 +210,7 @@ def _scanned(cost: Cost, coordinates: Coordinates, start: Floats) -> Floats:
 def _minimum(
     cost: Cost, coordinates: Coordinates, start: Floats, *, is_smooth: bool
 ) -> tuple[Floats, bool]:
-    """The minimum (k,) that the cost falls to from a start (k,), and whether the search came to its end.
+    """Find the minimum (k,) that the cost falls to from a start (k,), and whether the search converged.
 
     In coordinates; by L-BFGS-B where the cost is smooth, else by Nelder and Mead's simplex.
     """

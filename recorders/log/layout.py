@@ -56,7 +56,7 @@ class Layout:
         return records
 
     def parse(self, data: NDArray[np.uint8], offsets: NDArray[np.int64]) -> NDArray[np.void] | None:
-        """The message records (n,) at `offsets` of a chunk; None where one is laid out differently."""
+        """Read the message records (n,) at `offsets` of a chunk; None where one is laid out unlike."""
         if not agree(data, offsets, self.pattern):
             return None
         return windows(data, self.dtype.itemsize)[offsets].view(self.dtype)
@@ -81,7 +81,7 @@ def columns_of(schema: Schema, records: NDArray[np.void]) -> dict[str, NDArray]:
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """View every run of some bytes as one opaque item, without a copy: gathers and scatters.
+    """View every run of some bytes as one opaque item, without a copy, to gather and scatter them.
 
     Args:
         data: (n,), the bytes.
@@ -125,7 +125,7 @@ def _layout(schema: Schema, widths: tuple[int, ...]) -> Layout:
 
 
 def _prefix(number: int, field: Field, width: int) -> bytes:
-    """The tag, and for a vector the length in bytes, that stand before a field's value."""
+    """Write the tag, and for a vector the length in bytes, that stand before a field's value."""
     tag = _varint(number << 3 | _WIRE_TYPES[field.kind])
     return tag + _varint(width * field.dtype.itemsize) if field.kind == "vector" else tag
 

@@ -92,7 +92,7 @@ def words_of(data: NDArray[np.uint8]) -> NDArray[np.uint64]:
 
 
 def loop_for(loop: Callable[..., Any], size: int) -> Callable[..., Any]:
-    """The loop to go through so many bytes with."""
+    """Return the loop to go through so many bytes with."""
     _left["plain"] -= size
     if _left["plain"] >= 0 and "numba" not in sys.modules:
         return np.errstate(over="ignore")(loop)

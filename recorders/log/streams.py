@@ -56,7 +56,7 @@ class Stream:
         return len(self.publish_time_ns)
 
     def __getitem__(self, name: str) -> NDArray:
-        """The column of one field."""
+        """Return the column of one field."""
         return self.columns[name]
 
     @property
@@ -105,7 +105,7 @@ class Stream:
         return pl.from_arrow(self.arrow())
 
     def _flat(self) -> dict[str, NDArray]:
-        """Columns with one axis, by name."""
+        """Return columns with one axis, by name."""
         columns = {"publish_time_ns": self.publish_time_ns, "log_time_ns": self.log_time_ns}
         for name, column in self.columns.items():
             if column.ndim == 1:
@@ -227,7 +227,7 @@ def computed_stream(
 
 
 def _as_column(topic: str, name: str, values: ArrayLike, kind: Kind = "time_ns") -> NDArray:
-    """The values as an array of this type, which must be able to keep every one of them."""
+    """Make an array of this type, which must be able to keep every one of the values."""
     dtype, axes = NUMPY_TYPES[kind], 1 + (kind == "vector")
     if isinstance(values, np.ndarray) and values.dtype == dtype and values.ndim == axes:
         return values

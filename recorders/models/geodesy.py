@@ -51,7 +51,7 @@ def tangent_axes(latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> NDArray[n
 def out_of_tangent_plane(
     place_m: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """Latitude, longitude (deg) and height (m) of a place (east, north) in the plane at the origin.
+    """Compute latitude, longitude (deg) and height (m) of a place (east, north) in the plane.
 
     Bowring's formula, Survey Review 23, 1976: exact to less than a micrometre near the ground.
     """
@@ -80,7 +80,7 @@ def out_of_tangent_plane(
 def into_tangent_plane(
     place_deg: Components, origin_deg: Components
 ) -> tuple[Component, Component, Component]:
-    """East, north and up (m) of a place as it is seen from the origin.
+    """Compute east, north and up (m) of a place as it is seen from the origin.
 
     Both are latitude and longitude in deg and, where it is not 0, the height above the ellipsoid in m.
     """

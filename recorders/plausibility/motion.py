@@ -48,7 +48,7 @@ class Slope(NamedTuple):
 
     @property
     def sign(self) -> int:
-        """1 or -1, or 0 where the two are not alike."""
+        """Return 1 or -1, or 0 where the two are not alike."""
         is_clear = self.windows >= FEWEST and abs(self.likeness) > ALIKE
         return int(np.sign(self.value)) if is_clear else 0
 
@@ -104,7 +104,7 @@ class Motion:
 
     @cached_property
     def speed_lags(self) -> list[Lag]:
-        """Of speeds and velocities, beside places."""
+        """Return the lags of speeds and velocities, beside places."""
         if self.places is None or (windows := distances(self.places, 1.0)) is None:
             return []
         return list(self._lags(windows, self.places.topic))
@@ -117,7 +117,7 @@ class Motion:
 
     @cached_property
     def turn_lags(self) -> list[Lag]:
-        """Of turn rates, beside courses."""
+        """Return the lags of turn rates, beside courses."""
         if self.courses is None:
             return []
         windows = turned(self.courses, 1.0)
@@ -156,7 +156,7 @@ class Motion:
         return {topic: each_s - usual_s for topic, each_s in late_s.items()}
 
     def _goes_where_it_points(self, lag: Lag) -> bool:
-        """Whether forces in the body's axes are those of its course: then course is heading."""
+        """Tell whether forces in the body's axes are those of its course: then course is heading."""
         for force in self.body.forces:
             if force.topic == lag.source:
                 found = self.forces(force.moved(-lag.timing.lag_s))
@@ -185,7 +185,7 @@ class Motion:
         return source.moved(self.delays_s.get(source.topic, 0.0))
 
     def likened(self, source: Series) -> Series:
-        """A turn rate on the clock by which it is most like the course, be that a delay or not."""
+        """Return a turn rate on the clock by which it is most like the course, be it a delay or not."""
         aligned = self.aligned(source)
         for each in self.turn_lags:
             if each.source == source.topic and source.topic not in self.gains:
@@ -232,7 +232,7 @@ class Motion:
         return slope(windows.values, end - begin)
 
     def heading_offsets(self, orientation: Series) -> Floats:
-        """By how much headings exceed the course where the body moves clearly (k,), backwards too."""
+        """Return by how much headings (k,) exceed the course where the body moves clearly, also back."""
         if self.courses is None:
             return np.empty(0)
         course = self.timed(self.courses)
@@ -244,7 +244,7 @@ class Motion:
         return wrapped(offsets[np.isfinite(offsets)])
 
     def forces(self, force: Series) -> "Forces | None":
-        """How horizontal forces fit the changes of the velocity; None where these tell nothing."""
+        """Compute how horizontal forces fit changes of the velocity; None where these tell nothing."""
         if not self.body.velocities or self.courses is None:
             return None
         velocity = self.body.velocities[0]
@@ -298,13 +298,13 @@ class Forces(NamedTuple):
 
 
 def _hold_s(source: Series) -> float:
-    """What may be how a topic is meant: half a step held, or the mean of the step before."""
+    """Return what may be how a topic is meant: half a step held, or the mean of the step before."""
     step_s = float(np.median(np.diff(source.times_s)))
     return step_s if source.values.ndim > 1 else 0.5 * step_s
 
 
 def _sure_lag_s(lag: Timing) -> float:
-    """The lag where it is one; a clock that gains has none."""
+    """Return the lag where it is one; a clock that gains has none."""
     is_lag = abs(lag.lag_s) > max(LEAST_LAG_S, lag.tolerance_s)
     is_sure = lag.evidence > SURE and abs(lag.likeness) > ALIKE and not lag.gain
     return lag.lag_s if is_lag and is_sure else 0.0

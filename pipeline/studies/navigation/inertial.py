@@ -41,7 +41,7 @@ def study(experiment: Experiment, setting: Setting) -> Outcome:
 
 
 def movement_table(found: Sequence[Errors], sources: Sequence[Source]) -> pd.DataFrame:
-    """One row per trial and estimator: total RMSE over movement (deg), how many samples that are."""
+    """Tabulate by trial and estimator the total RMSE over movement (deg), and how many samples."""
     rows = []
     for errors in found:
         moving = np.concatenate(
@@ -74,7 +74,7 @@ def is_moving(source: Source, case: str, time_ns: NDArray[np.int64]) -> NDArray[
 
 
 def trials_figure(trials: pd.DataFrame) -> Figure:
-    """Total RMSE over movement of every trial and estimator; on a logarithmic axis."""
+    """Draw the total RMSE over movement of every trial and estimator on a logarithmic axis."""
     figure = Figure(figsize=(8, 1.5 + 0.5 * trials["trial"].nunique()), layout="constrained")
     axes = figure.subplots()
     table = trials.pivot_table(index="trial", columns="estimator", values="movement_rmse_deg")

@@ -146,7 +146,7 @@ def held_out(angles: Floats, options: Options, setting: Setting) -> pd.DataFrame
 
 
 def _count_of(angles: Floats, options: Options) -> int:
-    """How many wrapped normals are most likely on stretches that they were not fitted to."""
+    """Find how many wrapped normals are most likely on stretches that they were not fitted to."""
     stretches = np.array_split(np.arange(len(angles)), 3)
     scores = []
     for count in range(1, options.most_components + 1):
@@ -252,7 +252,7 @@ def _model(parameters: Mapping[str, float]) -> HeadingModel:
 
 
 def _measured(wind: Floats) -> Floats:
-    """Every hour but the first: the direction is measured, its turn is not."""
+    """Return every hour but the first as measurements: of the direction, not of its turn."""
     return np.stack([wind[1:], np.full(len(wind) - 1, np.nan)], axis=1)
 
 
@@ -346,7 +346,7 @@ def persistence(wind: Floats, half: int) -> dict[str, Prediction]:
 
 
 def _chart(table: pd.DataFrame, half: int) -> Chart:
-    """How much more was said of the later hours than persistence says, summed up."""
+    """Draw how much more was said of the later hours than persistence says, summed up."""
     wide = table.pivot_table(index="hour", columns="predictor", values="log_density").loc[half:]
     gains = wide.sub(wide["persistence"], axis=0).cumsum()
     panel = Panel(x=Axis(label="hour"), y=Axis(label="log density above persistence, summed"))
@@ -356,7 +356,7 @@ def _chart(table: pd.DataFrame, half: int) -> Chart:
 
 
 def _estimates(name: str, time_ns: Integers, predicted: WrappedNormal) -> Ragged:
-    """A filter's predictions of every hour but the first, as estimates."""
+    """Return a filter's predictions of every hour but the first, as estimates."""
     angles: Components = {"direction_rad": "angle", "turn_rad": "angle"}
     stream = state_stream(f"/estimates/{name}/state", time_ns[1:], angles, None, *predicted)
     return Ragged(stream, np.array([0, len(stream)]))

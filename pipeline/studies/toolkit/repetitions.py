@@ -64,7 +64,7 @@ class Interval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float], probability: float = 0.95) -> Interval:
-    """The mean of independent values, and its interval by Student's distribution; NaN for one value."""
+    """Compute the mean of independent values, and Student's interval of it; NaN for one value."""
     count, mean = len(values), float(np.mean(values))
     if count < 2:
         return Interval(mean, np.nan, np.nan)
@@ -116,14 +116,14 @@ def worst_deviation(printed: Floats, squared: Floats, runs: int) -> tuple[float,
 
 
 def share_holds(share: float, independent: int, expected: float = 0.95) -> bool:
-    """Whether a share of `independent` trials is, within two standard errors, at least as expected."""
+    """Tell whether a share of so many trials is, within two standard errors, at least as expected."""
     return share >= expected - 2.0 * np.sqrt(expected * (1.0 - expected) / independent)
 
 
 def groups(
     values: Sequence[Sequence[float]], labels: Sequence[str], names: Sequence[str], axis: str
 ) -> tuple[Axis, list[Series]]:
-    """Values side by side in named groups: an axis of groups, and a series per place in the group."""
+    """Draw values side by side in named groups: an axis of groups, and a series per place in them."""
     size = max(len(group) for group in values)
     series = []
     for place in range(size):

@@ -85,7 +85,7 @@ def table_of(
     runs: Mapping[str, Judged],
     delay_s: float = 0.0,
 ) -> pd.DataFrame:
-    """One row per estimator and run, by name; what was told later than `delay_s` before is not known."""
+    """Tabulate by estimator and run; what was told later than `delay_s` before is not known."""
     rows = []
     for label in labels:
         for run, (name, at) in enumerate(runs.items()):
@@ -112,7 +112,7 @@ def nis_metrics(innovations: Sequence[Innovations]) -> dict[str, float]:
 def measure_changes(
     table: pd.DataFrame, pairs: Sequence[tuple[str, str]], outcome: Outcome, case: str = ""
 ) -> None:
-    """By how much the figures of one estimator are above those of another, of pairs that were run."""
+    """Measure by how much figures of one estimator exceed those of another, of pairs that were run."""
     for label, other in pairs:
         if {label, other} <= set(table["estimator"]):
             for quantity in [name for name in COMPARED if name in table]:
@@ -122,6 +122,6 @@ def measure_changes(
 
 
 def difference(table: pd.DataFrame, quantity: str, label: str, other: str) -> Interval:
-    """By how much a quantity of one estimator is above that of another, over the runs."""
+    """Compute by how much a quantity of one estimator is above that of another, over the runs."""
     by_run: Any = table.pivot_table(quantity, "run", "estimator", dropna=False, sort=False)
     return mean_interval((by_run[label] - by_run[other]).tolist())

@@ -85,7 +85,7 @@ class Case(NamedTuple):
 
 
 def truths_of(sources: Sequence[Source]) -> tuple[NDArray[np.int64], Floats]:
-    """The stamps (runs, steps) after the start, and the true places (runs, steps, vehicles, 2)."""
+    """Read the stamps (runs, steps) after the start, and true places (runs, steps, vehicles, 2)."""
     numbers = vehicle_numbers(sources[0].topics)
     topics = [f"/vehicle{number}/truth" for number in numbers]
     read = [source.read(topics) for source in sources]
@@ -131,7 +131,7 @@ def score(estimates: Floats, truths: Floats) -> Scores:
 
 
 def _scores(fixed: Floats, assigned: Floats, gospa_m: Floats) -> Scores:
-    """Of squared errors and GOSPA by run and step."""
+    """Sum up squared errors and GOSPA by run and step."""
     failed = int(np.isnan(assigned).any(axis=1).sum())
     return Scores(total_error(fixed), total_error(assigned), fixed, assigned, gospa_m, failed)
 

@@ -83,7 +83,7 @@ def _frame(name: bytes) -> str:
 
 
 def join(parts: Sequence[Transforms]) -> Transforms:
-    """Parts in the order of their stamps."""
+    """Join parts in the order of their stamps."""
     joined = Transforms(
         np.concatenate([part.stamp_ns for part in parts]),
         np.concatenate([part.log_time_ns for part in parts]),
@@ -157,7 +157,7 @@ class Chain:
         return self._product({}, Transforms(zero, zero, zero, np.zeros((1, 3)), np.zeros((1, 4))))
 
     def _product(self, moving: Mapping[Pair, Transforms], wanted: Transforms) -> Transforms:
-        """The chain's transforms one after another, at the wanted stamps."""
+        """Compose the chain's transforms one after another, at the wanted stamps."""
         position = np.zeros((len(wanted), 3))
         orientation = np.tile([1.0, 0.0, 0.0, 0.0], (len(wanted), 1))
         for link, is_forward in self._links:
@@ -199,7 +199,7 @@ def interpolated(given: Transforms, stamp_ns: NDArray[np.int64]) -> Transforms:
 
 
 def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
-    """The links from one frame to the other, and whether each is gone along or against its direction."""
+    """Find the links from one frame to the other, and whether each is taken in its direction."""
     above = {child: parent for parent, child in links}
     parent, child = pair
     for frame in pair:
@@ -221,7 +221,7 @@ def _path(pair: Pair, links: Sequence[Pair]) -> list[tuple[Pair, bool]]:
 
 
 def _ancestors(frame: str, above: Mapping[str, str]) -> list[str]:
-    """The frame, its parent, and so on to the root."""
+    """List the frame, its parent, and so on to the root."""
     found = [frame]
     while (parent := above.get(found[-1])) is not None and parent not in found:
         found.append(parent)
