@@ -51,7 +51,7 @@ def _object_of(entry: EntryPoint) -> Any:
 
 @contextmanager
 def foreign_code(what: str) -> Iterator[None]:
-    """Run registered code: what it raises becomes one sentence that says whose code it was.
+    """Guard calls of registered code: what it raises becomes one sentence that says whose code it was.
 
     Bad input, a lack of memory or disk, and interrupts go through as they are.
     """

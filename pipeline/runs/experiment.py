@@ -273,7 +273,7 @@ def _found(patterns: Sequence[str], folder: Path, where: str) -> list[str]:
 
 
 def _given(experiment: Experiment, data: Path | None) -> list[Path]:
-    """Find the files that an experiment imports, or the folders of these, or the logs it replays."""
+    """List the files that an experiment imports, those of its folder of data, or the logs it replays."""
     if data is None or experiment.logs is not None:
         return experiment.files
     return sorted(path for path in data.rglob("*") if path.is_file()) if data.is_dir() else [data]

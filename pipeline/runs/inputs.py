@@ -61,7 +61,7 @@ class Recording(Parameters):
     sha256: str = ""
 
     def digest_of(self, files: Sequence[Path]) -> str:
-        """Hash those of this recording's files, decompressed and sorted; "" without any file."""
+        """Compute SHA-256 of those of the files that are this recording's, decompressed; "" for none."""
         digests = sorted(_digest(path) for path in files if path.match(self.files))
         return hashlib.sha256("".join(digests).encode()).hexdigest() if digests else ""
 

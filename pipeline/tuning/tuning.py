@@ -364,7 +364,7 @@ def _confidence_at(
 def _row_of_fold(
     number: int, left_out: Objective, rest: Objective, free: Sequence[Free], grid: int
 ) -> dict[str, Any]:
-    """Tell what all other logs give, and what the logs of a fold cost with that."""
+    """Return what all other logs give, and what the logs of a fold cost with that."""
     found = _settled(rest, free, grid)
     start = np.array([each.start for each in free])
     costs = left_out(np.array([start, found.optimum]))

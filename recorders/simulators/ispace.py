@@ -193,7 +193,7 @@ def _link_events(
     times_s: NDArray[np.float64],
     rng: np.random.Generator,
 ) -> Stream:
-    """Make every node send on every link at every step; lost messages have the time of their loss."""
+    """Simulate the messages of every link at every step; lost ones have the time of their loss."""
     sender, receiver = np.tile(links, (len(times_s), 1)).T
     sent_s = np.repeat(times_s, len(links))
     delay_s = parameters.delay_s + parameters.delay_jitter_s * rng.exponential(size=len(sent_s))

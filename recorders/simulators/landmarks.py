@@ -184,7 +184,7 @@ def _robot_streams(
 
 
 def _fix_streams(topic: str, receiver: Fixes, robot: Drive, rng: np.random.Generator) -> list[Stream]:
-    """Make positions in the plane or on earth with their covariance, and when there were none."""
+    """Simulate positions in the plane or on earth with their covariance, and when there were none."""
     if receiver.rate_hz == 0:
         return []
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / receiver.rate_hz)
@@ -233,7 +233,7 @@ def _look(
     targets: Mapping[int, Drive | NDArray[np.float64]],
     rng: np.random.Generator,
 ) -> Sightings:
-    """See everything in range and view at the sensor's rate, less dropouts and outages."""
+    """Look at everything in range and view at the sensor's rate, less dropouts and outages."""
     times_s = np.arange(0, robot.times_s[-1] + 1e-9, 1.0 / sensor.rate_hz)
     outages_s, dead = _dead(sensor, times_s, robot.times_s[-1], rng)
     pose = robot.pose_at(times_s)

@@ -183,7 +183,7 @@ def _truth(course: Course, times_s: Floats, clocks_s: Floats) -> Stream:
 
 
 def _fixes(course: Course, times_s: Floats, sigma_m: float | None, rng: np.random.Generator) -> Stream:
-    """Make where the first target says that it is: a topic without messages where it does not."""
+    """Simulate where the first target says that it is: a topic without messages where it does not."""
     rows, known_m = (course.rows(times_s), sigma_m) if sigma_m else (np.empty(0, np.int64), 1.0)
     return make_stream(
         "/target1/fix",
@@ -202,7 +202,7 @@ def _sightings(
     course: Course,
     rng: np.random.Generator,
 ) -> Stream:
-    """Make one sensor's lines of sight with its poses, stamped by its own clock."""
+    """Simulate one sensor's lines of sight with its poses, stamped by its own clock."""
     places, to_world = _poses(parameters, number, times_s)
     rows, seen = course.rows(times_s), np.arange(len(times_s)) % TARGETS
     offset = course.targets[rows, seen, :3] - places

@@ -83,7 +83,7 @@ def simulate(parameters: NavigationParameters, rng: np.random.Generator) -> Reco
 
 
 def _path(parameters: NavigationParameters, rng: np.random.Generator) -> Path:
-    """Lay a spline through the way-points, at rest first, and the attitude that goes with it."""
+    """Compute the spline through the way-points, at rest first, and the attitude that goes with it."""
     points = np.array(parameters.way_points_m, float).reshape(-1, 3)
     if not len(points):
         points = _random_points(parameters, rng)
@@ -207,7 +207,7 @@ def _rounded(values: Floats, quantum: float) -> Floats:
 
 
 def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
-    """Make the fixes and velocities of the receiver's antenna, and the outages."""
+    """Simulate the fixes and velocities of the receiver's antenna, and the outages."""
     gnss, origin = parameters.gnss, _origin(parameters)
     lever = np.array(gnss.lever_m)
 
@@ -259,7 +259,7 @@ def _gnss(parameters: NavigationParameters, path: Path, rng: np.random.Generator
 
 
 def _carried(parameters: NavigationParameters, path: Path, rng: np.random.Generator) -> list[Stream]:
-    """Make what wheels, compass and barometer say, of those that are on board."""
+    """Simulate what wheels, compass and barometer say, of those that are on board."""
     carried, streams = parameters.carried, []
 
     def times(rate_hz: float) -> Floats:

@@ -174,7 +174,7 @@ def _heard(
 
 
 def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
-    """Make what all sensors tell, in the order of arrival."""
+    """Compute what all sensors tell, in the order of arrival."""
     noise, medium = parameters.noise, parameters.medium
     shot, sensor = np.nonzero(heard.is_heard)
     order = np.argsort(heard.arrival_s[shot, sensor], kind="stable")
@@ -199,7 +199,7 @@ def _reports(parameters: ShotSequenceParameters, heard: Heard) -> Stream:
 
 
 def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -> Stream:
-    """Make what one sensor hears, a message for each shot that it does not miss."""
+    """Return what one sensor hears, a message for each shot that it does not miss."""
     shots = np.flatnonzero(heard.is_heard[:, number - 1])
     of_sensor = shots, number - 1
     return make_stream(
@@ -215,7 +215,7 @@ def _detections(parameters: ShotSequenceParameters, number: int, heard: Heard) -
 
 
 def _fix(parameters: ShotSequenceParameters, number: int, place: Floats) -> Stream:
-    """Make where a sensor was surveyed to be."""
+    """State where a sensor was surveyed to be."""
     return make_stream(
         f"/sensor{number}/position",
         schemas.POSITION_FIX,

@@ -299,7 +299,7 @@ def _fix_streams(
     is_received: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> list[Stream]:
-    """Make every vehicle's fixes, in the plane and as latitude and longitude."""
+    """Simulate every vehicle's fixes, in the plane and as latitude and longitude."""
     covariance = (parameters.fix.variance_m2 * np.eye(2)).reshape(1, 4)
     streams = []
     for index in range(fixes.shape[1]):

@@ -195,7 +195,7 @@ def bound_of(parameters: AcousticParameters, settings: Mapping[str, Any], label:
 
 
 def truth_of(parameters: AcousticParameters) -> tuple[Floats, Floats, Floats]:
-    """Read shooter (1, 2), trajectory (1,) and sensors (sensors, 2)."""
+    """Return the shooter (1, 2) in m, the trajectory (1,) in rad, and the sensors (sensors, 2) in m."""
     return (
         np.array([parameters.shooter_position_m]),
         np.radians([parameters.trajectory_deg]),
@@ -204,7 +204,7 @@ def truth_of(parameters: AcousticParameters) -> tuple[Floats, Floats, Floats]:
 
 
 def _heard(sources: list[MemorySource]) -> Detections:
-    """Read what all sensors heard of all shots."""
+    """Gather what all sensors heard of all shots."""
     numbers = range(1, len([topic for topic in sources[0].topics if topic.endswith("/detections")]) + 1)
     streams = [
         [gather([source.streams[f"/sensor{n}/{leaf}"] for source in sources]) for n in numbers]

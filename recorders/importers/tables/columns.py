@@ -116,7 +116,7 @@ _WRITTEN = {
 
 
 def parted(name: str) -> tuple[str, str]:
-    """Part a name, in lower case with underlines, from its unit in brackets or at its end.
+    """Split a name, in lower case with underlines, from its unit, in brackets or at its end.
 
     >>> parted("Höhe [ft]"), parted("speed_kmh")
     (('altitude', 'ft'), ('speed', 'km/h'))
