@@ -59,6 +59,9 @@ def slope(x: Floats, y: Floats) -> Slope:
     Args:
         x: (k,), NaN where it is not known.
         y: (k,), as x.
+
+    Returns:
+        The slope; its value is NaN where fewer than `FEWEST` windows are known, or x or y is zero.
     """
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]

@@ -284,6 +284,9 @@ def predict(wind: Floats, run: Filter, parameters: Mapping[str, float]) -> Predi
         wind: (hours,), directions in rad.
         run: the filter.
         parameters: its coupling and sigmas, by name.
+
+    Returns:
+        The log densities and the errors in rad, (hours - 1,) each.
     """
     next_ = predicted_by(wind, run, parameters)
     variance = next_.covariance[:, 0, 0] + parameters["measurement_sigma_rad"] ** 2
@@ -304,6 +307,9 @@ def predict_on_grid(wind: Floats, parameters: Mapping[str, float], cells: int) -
         wind: (hours,), directions in rad.
         parameters: coupling and sigmas, by name.
         cells: of the grid, per angle.
+
+    Returns:
+        The log densities and the errors in rad, (hours - 1,) each.
     """
     measured = _measured(wind)
     prior = wrapped_normal.density(WrappedNormal(np.array([wind[0], 0.0]), _PRIOR), torus_grid(cells))
