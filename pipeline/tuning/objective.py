@@ -48,10 +48,9 @@ class Run(NamedTuple):
     Attributes:
         ensemble: it alone.
         name: what it is called.
-        begun: by the name of what is estimated how it begins, where the log does not say so. Where it
-            began depended on the values, the likelihoods of different measurements would be compared.
-        starts: from where likelihoods are compared, in place of `begun`, and the log once for each part
-            of these.
+        begun: how what is estimated begins, by its name, where the log does not say so; see `begin`.
+        starts: from where likelihoods are compared, in place of `begun`.
+        parts: the log once for each part of `starts`.
     """
 
     ensemble: Ensemble[MemorySource]
@@ -247,8 +246,8 @@ class Objective:
     def begin(self, start: Floats) -> None:
         """Note what every log tells at the start (k,), and where filters begin there: so it stays.
 
-        Raises BadInput where a run fails there, the log lacks what is minimised, or the estimator
-        cannot go to other processes that are to work.
+        Else likelihoods of different measurements would be compared. Raises BadInput where a run fails,
+        a log lacks what is minimised, or the estimator cannot go to other processes.
         """
         if self.pool is not None:
             try:
